@@ -215,7 +215,10 @@ class Agent:
         heard: Sequence[Mapping[str, Any]],
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:
-        """Return the chat messages before the answer mode changes them; arguments as in `chats`."""
+        """Return the chat messages that `chats` begins with, before the answer mode changes them.
+
+        Arguments are those of `chats`.
+        """
         return sent_messages(
             self.image, self.prompt.render(graph, actions, heard, words, self.answer in BARE)
         )
@@ -254,7 +257,7 @@ def in_mode(
     actions: Sequence[str],
     words: Mapping[str, str],
 ) -> tuple[Mapping[str, str], ...]:
-    """Return a prompt's chat messages with the question of an answer mode.
+    """Return a prompt's chat messages with the question of the answer mode `answer`.
 
     In `readout`, the examples answer by a letter, too, and the question is for one. In `decision`,
     what the chat says of the scene stays, and the scenario's `words` ask. Other modes change

@@ -20,10 +20,11 @@ def intents_of(
     answers: Sequence[list[Answer | None]],
     width: int = 1,
 ) -> Intents:
-    """Return the answers of n scenes as arrays of at least `width` vehicles.
+    """Return the answers of n scenes as arrays `(n, ...)` of at least `width` vehicles.
 
-    `answers` has the ego's first, then the helpers' in order of `Scene.viewers`; None for one that
-    was not asked yet. An answer that is missing or did not parse is a row of NaN.
+    `answers` has for each scene the ego's first, then the helpers' in order of `Scene.viewers`;
+    None for one that was not asked yet. An answer that is missing or did not parse is a row of NaN.
+    `latency` says how long each answer took.
     """
     width = max([width, *[len(row) for row in answers]])
     unknown = (math.nan,) * len(spec.actions)
@@ -63,9 +64,10 @@ def intents_of(
 
 
 def models_of(spec: Spec, scene: Scene, width: int) -> list[int]:
-    """Return for each vehicle in a scene the place whose model answers for it, up to `width`.
+    """Return for each vehicle in a scene the number that says whose model answers for it.
 
-    Places are those of `Latency.speed`: 0 is the ego's model. The order is that of `Scene.viewers`.
+    0 is the ego's model; from 1 on, the helpers' models take turns (`Latency.speed`). The order is
+    that of `Scene.viewers`. If these are fewer than `width` vehicles, the rest have their index.
     """
     there = range(len(scene.viewers))
     places = [scene.place(n) for n in there] if spec.helpers else [*there]

@@ -151,8 +151,8 @@ def _or_unset(value: T | None) -> T | UnsetType:
 class Asker:
     """Ask models for the answers that a run still lacks, and give answers as arrays.
 
-    It is the `Ask` of a walk through scenes. A question that got no answer is never kept, so that
-    it is asked again when the work goes on.
+    At each decision point the loop `walk.walk` gets the vehicles' intents from it (`walk.Ask`). A
+    question that got no answer is never kept, so that it is asked again when the work goes on.
 
     Attributes:
         spec: the evaluation.
@@ -177,8 +177,8 @@ class Asker:
 
         `kept` is the file of the answers so far; `answers` need not be asked for. `progress` gets
         the number of new answers, those kept by a stopped run included; `more` that of requests
-        before they are made. Who `checks_kept` has a kept answer only once its question is asked
-        here, and with the prompt that it answers.
+        before they are made. With `checks_kept`, an answer of the file counts only once its
+        question is asked here, and UserError is raised if it answers another prompt.
         """
         self.spec, self._backend, self.latency = spec, backend, latency
         self._kept = KeptAnswers(kept) if kept else None
@@ -388,7 +388,10 @@ class Asker:
     def helpers(
         self, scenes: Sequence[Scene], wanted: Bools, question: Question = PLAIN
     ) -> Intents:
-        """Ask the helpers marked in `wanted`, `(n, H)`; return the intents of scenes with any."""
+        """Ask the helpers marked in `wanted`, `(n, H)`: n scenes, H helpers.
+
+        Returns the intents of the scenes in which a helper is marked.
+        """
         scenes, places = wanted_in(scenes, wanted)
         self._ask_at(scenes, places, question)
         return self.laid_out(scenes, question, 1 + wanted.shape[1])

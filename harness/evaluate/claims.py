@@ -20,7 +20,10 @@ NEGLIGIBLE_M = 0.01  # how far a simplified line of the map may be off
 
 
 def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
-    """Return what helpers claim in n scenes, `(n, ...)`, and what the ego's sensors say of it."""
+    """Return what helpers claim in n scenes, and what the ego's sensors say of it.
+
+    Arrays are `(n, ...)`, with NaN where a scene has fewer helpers than another.
+    """
     road, p = scenario.road(), scenario.parameters
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     xy_m = np.full((n, 1 + helpers, 2), np.nan)

@@ -19,9 +19,10 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     """Return how many requests an evaluation would make, and how long and dear its prompts are.
 
     The dict has the settings, `requests`, `requests_by_role`, `scenes`, `prompt_tokens` by role
-    (None if no tokenizer is found) and, if a card has a price, `cost` by model, with the longest
-    answers. Who asks a helper depends on answers, so numbers of helpers' requests and fusion calls
-    are the most possible unless all are asked. `cost` has no fusion calls and no repair turns.
+    (None if no tokenizer is found) and, if a card has a price, `cost` by model, with answers as
+    long as they may be. Tokens are counted by the file `tokenizer`; None takes the ego's. Who asks
+    a helper depends on answers, so numbers of helpers' requests and fusion calls are the most
+    possible unless all are asked. `cost` has no fusion calls and no repair turns.
     """
     tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}

@@ -77,7 +77,7 @@ class FrozenSource:
         return self.dataset.episodes
 
     def stopped(self, looks: Looks) -> "FrozenSource":
-        """Return this source cut to the episodes after which a run stopped by its rule."""
+        """Return this source of a run that stopped: with its episodes up to the last of `looks`."""
         numbers, selection = self.dataset.episodes[: looks.at[-1]], self.selection
         if len(numbers) < looks.layouts:
             selection = replace(selection, limit=len(numbers))
@@ -90,8 +90,10 @@ class FrozenSource:
     def layouts(self, n_asked: int) -> list[Layout]:
         """Return how hard each layout is, of those asked and of others that might have been asked.
 
-        The first `n_asked` are the source's own episodes. The list is empty if there are no others,
-        or too few were asked to correct anything.
+        That is the success of reference policies in it, by which a run's success is corrected where
+        the layouts asked are harder than the others. The first `n_asked` are the source's own
+        episodes. The list is empty if there are no others, or too few were asked to correct
+        anything.
         """
         if n_asked < LEAST:
             return []
@@ -108,7 +110,10 @@ class FrozenSource:
         ]
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
-        """Yield the first decision point of each of up to `most` episodes, with all graphs."""
+        """Yield the first decision point of each of up to `most` episodes.
+
+        It has the scene graphs of all vehicles, also with `ego_alone`.
+        """
         forest = self.dataset.forest
         for root in forest.root[:most].tolist():
             yield from self.dataset.scenes([forest.ids[root]])

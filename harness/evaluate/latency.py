@@ -34,6 +34,7 @@ def chosen_latency(
     """Return the latency that `--latency` chooses for agents, the ego's first; None to measure it.
 
     Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
+    `backends` are those of the agents, in their order.
     """
     if choice not in (None, *NAMES):
         return declared(choice)
@@ -117,9 +118,10 @@ def inference_s(
 ) -> Floats:
     """Return the seconds in which each vehicle's answer is ready, `(n, 1+H)`, NaN without one.
 
-    `places` say whose model answers, as in `Latency.speed`: with one model for all, only the role
-    counts. A repair turn takes the time of one more answer. An answer's own declared delay
-    (`slow_s`) is added.
+    `answers` has for each of n scenes those of the ego and of H helpers. `places`, alike, say whose
+    model answers: 0 is the ego's, and helpers' models take turns (`Latency.speed`). If one model
+    answers for all, only the role counts. A repair turn takes the time of one more answer. An
+    answer's own declared delay (`slow_s`) is added.
     """
     shape = len(answers), len(answers[0]) if answers else 0
     seconds, turns, slow = np.full((3, *shape), np.nan)
@@ -138,7 +140,8 @@ def inference_s(
 def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int]) -> Floats:
     """Return the seconds of K fusion calls, `(K,)`, counted as in `inference_s`.
 
-    A vehicle with a helper's model takes as long as for any other answer.
+    `places` say whose model answers, 0 the ego's. A vehicle with a helper's model takes as long as
+    for any other answer.
     """
     if latency.speeds:
         return np.array([latency.answer_s(n, a) for n, a in zip(places, answers, strict=True)])
@@ -148,7 +151,7 @@ def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int])
 
 
 def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
-    """Return percentiles by role of the seconds that answers took, with intervals.
+    """Return for each role the percentiles of the seconds that answers took, with intervals.
 
     Only answers that were timed and came at the first attempt count.
     """

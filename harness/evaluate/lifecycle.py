@@ -72,7 +72,9 @@ def begin(
 ) -> RunStart:
     """Return the record of a run that begins, or `run_start` if it resumes.
 
-    Raises UserError if the run was begun with a model of another identity.
+    `identity` and `latency` are those of the models opened now; `shard` is the part of a run, such
+    as `1/3`, empty for all of it. Raises UserError if the run was begun with a model of another
+    identity.
     """
     if run_start is None:
         return RunStart(
@@ -126,7 +128,8 @@ def _stopped(spec: Spec, looks: Looks | None) -> Spec:
 def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
     """Return the record of a stopped run in a folder; None if there is none.
 
-    Raises UserError if it is a run with other settings.
+    `shard` is the part of the run, such as `1/3`, empty for all of it. Raises UserError if it is a
+    run with other settings.
     """
     run_start = work.begun(out, RunStart)
     if run_start:

@@ -99,7 +99,7 @@ class LiveSource:
         )
 
     def stopped(self, looks: Looks) -> "LiveSource":
-        """Return this source cut to the episodes after which a run stopped by its rule."""
+        """Return this source of a run that stopped: with its episodes up to the last of `looks`."""
         return replace(self, episodes=looks.at[-1], until=self.until and self.until.after(looks))
 
     def settings(self) -> DriveSettings:
@@ -277,7 +277,8 @@ class LiveWorld(SceneWorld):
     def columns(self) -> dict[str, Any]:
         """Return columns, in decision order, of when each decision took effect, and of conflicts.
 
-        By name: `acts_at_s`, `acted`, and the least TTC and PET until the agent's next decision.
+        By name: `acts_at_s`, the time in s at which it takes effect, `acted`, and the least time to
+        collision and post-encroachment time in s until the agent's next decision.
         """
         ttc_s = np.array([decision.ttc_s for decision in self._decisions])
         pet_s = np.array([decision.pet_s for decision in self._decisions])
@@ -292,10 +293,12 @@ class LiveWorld(SceneWorld):
 
 
 def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episode]:
-    """Return the record of each ended episode, one for each trajectory and course.
+    """Return the record of each ended episode, one for each course of each trajectory.
 
-    A success is late if it takes too long against a full-view driver whose decisions act after the
-    lag. Where several agents decide nobody is late: no such driver exists for all of them together.
+    A trajectory is a simulated world, a course an episode of it under one condition and channel
+    seed. A success is late if it takes too long against a full-view driver whose decisions act
+    after the lag. Where several agents decide nobody is late: no such driver exists for all of them
+    together.
     """
     if agent_share(scenario):
         alone_s = alone(scenario, list(dict.fromkeys(t.world.seed for t in trajectories)))

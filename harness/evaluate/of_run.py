@@ -77,7 +77,10 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
 
 
 def check_prompts(run: Run, spec: Spec) -> None:
-    """Raise UserError if a prompt's files here differ from those that the run was made with."""
+    """Raise UserError if a prompt's files here differ from those that the run was made with.
+
+    `spec` is the run's evaluation, with the prompts that are installed here (`spec_of`).
+    """
     agent_records = (run.manifest.agent(0), *run.manifest.helpers)
     for agent, each in zip(spec.agents, agent_records, strict=True):
         if agent.prompt.sha256 != each["prompt"]["sha256"]:

@@ -21,9 +21,10 @@ MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
 def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
-    """Return how much of the scenario's regions the ego of each scene sees, `(n, ...)`.
+    """Return what share of R regions the egos of n scenes do not see; arrays are `(n, ...)`.
 
-    It also says what helpers would add. On a road with fewer regions than others, the rest counts
+    Regions are the road's sectors: where a danger may come from. It also says what helpers would
+    add. On a road with fewer regions than others, the rest counts
     as seen.
     """
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1

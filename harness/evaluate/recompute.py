@@ -60,9 +60,9 @@ REPLAY = "replay"  # the engine of stored answers
 
 
 class Held:
-    """A backend that asks a rule, and counts its answers that differ from those a run states.
+    """A backend that asks a rule-based model, and counts its answers that a run states otherwise.
 
-    Identity and latency are the run's.
+    `wrong` is that count. Identity and latency are the run's.
     """
 
     def __init__(self, rule: Backend, kept: Kept) -> None:
@@ -111,12 +111,12 @@ def differences(
 ) -> tuple[list[str], list[str]]:
     """Compute a run of frozen scenes again, in an empty folder, and compare.
 
-    Returns sentences on what its tables say otherwise, and on which columns it lacks, as a run by
-    older rules may.
+    Returns two lists of sentences: what the run's tables say otherwise than the new ones, and which
+    columns it lacks, as a run by older rules may.
 
     Args:
         run: the run, which is not changed.
-        dataset: its own.
+        dataset: the dataset that the run is of.
         out: the folder, which is written.
         progress: called with the number of answers that were read again.
 

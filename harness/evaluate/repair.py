@@ -36,7 +36,10 @@ def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
 def repair_request(
     request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, str]
 ) -> Request:
-    """Return the request of the repair turn: the chat so far, the answer, and what was wrong."""
+    """Return the request of the repair turn: the chat so far, the answer, and what was wrong.
+
+    The prompt's template words the last; `words` are the scenario's, which templates take by name.
+    """
     correction = prompt.repair(
         request.role, as_text(answer.detail)[:ERROR_CHARS], request.actions, words
     )

@@ -33,8 +33,8 @@ def requests(
 ) -> Iterator[Request]:
     """Yield what vehicles in scenes are asked, the ego's request first in each scene.
 
-    With another than the ordinary `question`, only helpers are asked. With `places`, only vehicles
-    at these places in each scene, the ego at 0.
+    With another `question` than the ordinary one, what to do as they see it, only helpers are
+    asked. With `places`, only vehicles at these places in each scene, the ego at 0.
     """
     agents, actions = spec.agents, spec.actions
     privileged, sees = (
@@ -131,9 +131,10 @@ def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 def heard_sets(
     scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites
 ) -> Iterator[tuple[Scene, list[str]]]:
-    """Yield the ego's scene and the messages' keys of each set of messages, by code.
+    """Yield for each code the ego's scene and the keys of the messages that it heard.
 
-    `codes` are those of `fusion.codes_of`, for these scenes in their order.
+    `codes`, `(K,)`, are those of `fusion.codes_of`, for these scenes in their order; `rewrites`
+    says how the messages are shown, which their keys (`fusion.key_of`) state.
     """
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():

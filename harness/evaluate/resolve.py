@@ -63,7 +63,7 @@ def _of_replayed(ego: Agent, settings: Settings) -> Timer | None:
 
 
 def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
-    """Return the selected episodes of a dataset, given by name or folder.
+    """Return the episodes of a dataset, given by name or folder, that `world` selects.
 
     Raises UserError if there is no such dataset, or the selection is not allowed.
     """
@@ -77,8 +77,9 @@ def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
 def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
     """Return the layouts to drive in closed loop, by default those of the shipped dataset.
 
-    Raises UserError if an episode or seed is out of range or mixed with those of another purpose,
-    or if the scenario is an environment that cannot be driven.
+    `scenario` is a name, in place of that in `world`. Raises UserError if an episode or seed is out
+    of range or mixed with those of another purpose, or if the scenario is an environment that
+    cannot be driven.
     """
     # A base install evaluates without the simulator.
     from harness.evaluate.live_world import LiveSource
@@ -183,8 +184,9 @@ def points(
 ) -> tuple[OperatingPoint, ...]:
     """Return the operating points of conditions, each once, and their controls and attacks.
 
-    Each control and attack is added to every condition with a channel, as a condition of its own.
-    Raises UserError for an unknown name.
+    Each control (which replaces what helpers say) and attack (by which some of them lie) is added
+    to every condition with a channel, as a condition of its own. Raises UserError for an unknown
+    name.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
     settings_by_control = {**NO_MESSAGES, **control_settings()} if controls else {}

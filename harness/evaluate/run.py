@@ -642,8 +642,8 @@ def read_or_evaluate(
 ) -> folder.Run:
     """Return the run in a folder, which `evaluate` makes first unless it is finished.
 
-    For studies of several runs. Raises UserError if a finished one is another evaluation, or states
-    answers that its texts do not say; else as `evaluate`.
+    For studies of several runs; arguments are those of `evaluate`. Raises UserError if a finished
+    one is another evaluation, or states answers that its texts do not say; else as `evaluate`.
     """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         finished(spec, out)

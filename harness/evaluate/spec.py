@@ -82,7 +82,7 @@ class Source(Protocol):
         ...
 
     def stopped(self, looks: Looks) -> "Source":
-        """Return this source cut to the episodes after which a run stopped by its rule."""
+        """Return this source of a run that stopped: with its episodes up to the last of `looks`."""
         ...
 
     @property

@@ -26,7 +26,8 @@ def busy_ratio(point: OperatingPoint) -> float:
 def columns(decided: Decided[Any]) -> dict[str, Any]:
     """Return the numeric columns of the decision table for n decisions of one condition.
 
-    Arrays are `(n,)`, by column name; NaN where unknown.
+    Arrays are `(n,)`, by column name, such as `messages`, `triggered`, `entropy_nats` and
+    `latency_ms`; NaN where unknown.
     """
     c, point = decided.result, decided.point
     anybody = any_of(c.on_time)
@@ -132,7 +133,10 @@ def table(
 
 
 def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
-    """Return one table of several of the same episodes under different seeds, sorted as `table`."""
+    """Return one table of several, which have the same episodes under different channel seeds.
+
+    It is sorted as `table` sorts; `points` are the conditions, in the order of the rows.
+    """
     if len(tables) == 1:
         return tables[0]
     whole = Decisions.concat(tables)

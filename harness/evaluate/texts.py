@@ -73,7 +73,10 @@ def refuse_other_kept(
 
 
 def same(name: str, stated_answer: Answer, here: Answer | Parsed) -> bool:
-    """Return whether a stated and a newly parsed answer agree in a field of `OF_TEXTS`."""
+    """Return whether a stated and a newly parsed answer have the same value in the field `name`.
+
+    It is one of `OF_TEXTS`, what is read in a text; numbers are compared up to rounding.
+    """
     a, b = getattr(stated_answer, name), getattr(here, name)
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(map(close, a, b))

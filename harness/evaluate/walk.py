@@ -177,13 +177,16 @@ class Ask(Protocol[AskedPoint]):
     def helpers(
         self, points: Sequence[AskedPoint], /, wanted: Bools, question: Question = PLAIN
     ) -> Intents:
-        """Ask the helpers marked in `wanted`, `(n, H)`; return the intents of points with any."""
+        """Ask the helpers marked in `wanted`, `(n, H)`: n points, H helpers.
+
+        Returns the intents of the points in which a helper is marked.
+        """
         ...
 
     def fusion_call(
         self, points: Sequence[AskedPoint], /, codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return the ego's answers to sets of messages, by their codes (`codes_of`), `(K,)`.
+        """Return the ego's answers to K sets of messages, by their codes (`codes_of`), `(K,)`.
 
         `rewrites` says how the messages are shown.
         """
@@ -403,7 +406,7 @@ class Memory:
         self._state: dict[tuple[int, int], Floats] = {}
 
     def recall(self, due: Due) -> Floats | None:
-        """Return the rule's state for n decisions, `(n, K)`; None at the first step."""
+        """Return the rule's state for n decisions, K numbers each, `(n, K)`; None at the first."""
         return np.array([self._state[place] for place in due.episodes]) if self._state else None
 
     def keep(self, due: Due, state: Floats) -> None:
