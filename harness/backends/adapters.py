@@ -78,14 +78,20 @@ def find_adapter(card: Card) -> Path | None:
 
 
 def find_tensors(folder: Path, subject: str) -> Path:
-    """Return the safetensors file of an adapter's folder. Raises UserError if there is none."""
+    """Return the safetensors file of an adapter's folder.
+
+    `subject` names the model in messages. Raises UserError if there is none.
+    """
     if not (file := folder / TENSORS).is_file():
         raise UserError(f"{subject}: its adapter in {printable(folder)} has no file {TENSORS}")
     return file
 
 
 def foreign(subject: str, file: Path, reason: str) -> UserError:
-    """Return the error for an adapter in `file` that does not fit its model, for `reason`."""
+    """Return the error for an adapter in `file` that does not fit its model, for `reason`.
+
+    `subject` names the model in messages.
+    """
     return UserError(
         f"{subject}: {printable(file)} is no adapter of this model: {reason}; give the adapter "
         "that was trained on it"

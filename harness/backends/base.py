@@ -92,6 +92,7 @@ class Request:
 
     @property
     def bare(self) -> bool:
+        """Whether its answer is a distribution and no text: a read-out, or of a typed question."""
         return self.answer in BARE
 
     @property

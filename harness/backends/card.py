@@ -82,7 +82,8 @@ class Failures:
     """Hold the shares of a rule's answers that are spoilt on purpose, drawn for each request.
 
     For the engine `proxy`, to test parsing and repair. A text is spoilt in one way at most; any
-    answer may be slow as well.
+    answer may be slow as well. The comments say what parsing makes of such a text: an intent is
+    recovered, or it fails with a status.
     """
 
     fence: Share = 0.0  # the answer is in a code fence. Recovered.

@@ -31,8 +31,8 @@ class AveragedReadOut:
 def average_orders(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> AveragedReadOut:
     """Return a read-out, the probabilities of one letter an action, averaged over cyclic orders.
 
-    `letters_p`, `(orders, A)`, has the letters' probabilities with the list of actions in each
-    order of `harness.prompts.readout.cyclic`; the first order is that of `actions`.
+    `letters_p`, `(orders, A)`, has the probabilities of the A letters with the list of A actions in
+    each order of `harness.prompts.readout.cyclic`; the first order is that of `actions`.
     """
     p: Floats = np.array(letters_p, dtype=float)
     mass = p.sum(axis=1)

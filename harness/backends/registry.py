@@ -221,7 +221,10 @@ def import_object(place: str) -> Any:
 
 
 def engine_answer(card: "Card", place: str) -> Any:
-    """Return what a function of a card's engine at `module:name` says of the card."""
+    """Return what a function of the card's engine returns for the card.
+
+    `place` is where the function is, `module:name`, as the engine's registration has it.
+    """
     with worded(f"engine {printable(card.engine)}", built_in=card.engine in BUILT_IN):
         return import_object(place)(card)
 

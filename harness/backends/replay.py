@@ -183,7 +183,11 @@ class Replay:
 
 
 class LacksAnswer(UserError):
-    """A run has no answer to a question that is asked by what it states."""
+    """The error of a run that has no answer to a question which its own record says was asked.
+
+    `question` is the id of the request; `otherwise` counts the run's answers that the rule-based
+    model here gives otherwise.
+    """
 
     def __init__(self, run: Path, question: str) -> None:
         super().__init__(f"{printable(run)} holds no answer for {question}")

@@ -92,6 +92,7 @@ class Fields:
 
     @property
     def changed(self) -> Mapping[str, str | bool]:
+        """The fields that are left out (false) or renamed (the new name), by their usual name."""
         return {name: alias for name, alias in vars(self).items() if alias is not True}
 
     def applied(self, body: Mapping[str, Any]) -> dict[str, Any]:

@@ -95,7 +95,10 @@ def start(shape: Shape) -> Point:
 
 
 def filled(shape: Shape, place: int) -> str:
-    """Return an example of an answer: each choice is the one at `place`, and texts are empty."""
+    """Return an example of an answer of a form (`Shape`).
+
+    Of the options of each choice it has the one at index `place`; texts are empty.
+    """
     text, point = "", Branch("", start(shape)).then
     while point:
         branch = point.branches[place]
@@ -114,7 +117,10 @@ def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
 
 
 class Ask(NamedTuple):
-    """Hold a decision of the model: `forced` ids to append, then sorted ids to choose from."""
+    """Hold a choice that the model makes while it fills in an answer.
+
+    `forced` are the token ids of fixed text to append first, `among` the sorted ids to choose from.
+    """
 
     forced: list[int]
     among: Sequence[int]
@@ -136,7 +142,7 @@ class Leg(NamedTuple):
 
 
 class Skeleton:
-    """Hold the tokens of all answers of a form, for one tokenizer.
+    """Hold the tokens of all constrained answers of a form (`Shape`), for one tokenizer.
 
     Answers follow a line break, as in every chat template. Raises UserError if the tokenizer cannot
     tell choices apart.

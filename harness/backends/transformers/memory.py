@@ -18,9 +18,9 @@ MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grou
 
 
 def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
-    """Return one key-value cache with the rows of several, in `order`; these are emptied.
+    """Return one key-value cache with the rows of several, which are emptied.
 
-    Short rows end in zeros.
+    Row n is row `order[n]` of all their rows, one cache after the other. Short rows end in zeros.
     """
     columns = max(cache.get_seq_length() for cache in caches)
     for layers in zip(*(cache.layers for cache in caches), strict=True):
@@ -56,7 +56,7 @@ class Prefixes:
         self._kept: list[Prefix] = []
 
     def longest(self, ids: list[int], but: Sequence[int] = ()) -> Prefix:
-        """Return the longest kept beginning of `ids`; `NOTHING` if below `LEAST_TOKENS` tokens.
+        """Return the longest kept beginning of `ids`; an empty one if below `LEAST_TOKENS` tokens.
 
         `but` is a whole prompt that is ignored although it was read before.
         """

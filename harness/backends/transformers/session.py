@@ -220,7 +220,12 @@ class Rows:
 
     @classmethod
     def join(cls, parts: Sequence[tuple[Sequence[int], "Rows"]], positions: Any) -> "Rows":
-        """Return the sequences of several sessions as one, each at its given index."""
+        """Return the sequences of several sessions as one session.
+
+        A part has the indices of its sequences in the whole, and its session. `positions` has the
+        positions of each prompt's tokens, in the order of the whole; None if they are
+        consecutive.
+        """
         if len(parts) == 1:
             return parts[0][1]
         order = torch.tensor([place for piece, _ in parts for place in piece]).argsort()
