@@ -64,7 +64,8 @@ class Rule(Protocol):
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
         """Return the rule's memory before the first step of a batch of episodes, `(*batch, K)`.
 
-        There are `helpers` helpers and `actions` actions in each.
+        It is K numbers an episode, as many as the rule likes. There are `helpers` helpers and
+        `actions` actions in each.
         """
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
@@ -131,7 +132,8 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
     """Return the weighted mean of intents, `(..., A)` (paper Eq. 1; opinion pool of Stone 1961).
 
     Args:
-        p: intents, `(..., 1+H, A)`. Rows of weight 0 may hold anything, NaN included.
+        p: intents of the ego and H helpers over A actions, `(..., 1+H, A)`. Rows of weight 0 may
+            hold anything, NaN included.
         weights: weight of each vehicle, `(..., 1+H)`, summing to 1.
     """
     row_weights = weights[..., None]
@@ -141,8 +143,9 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
 def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
     """Return the weighted geometric mean of intents, scaled to sum to 1, `(..., A)` (Genest 1984).
 
-    Arguments as in `linear_pool`. A probability below `floor` counts as `floor`, so that one
-    rounded 0 is no veto.
+    `p` are intents, `(..., 1+H, A)`: the ego's, those of H helpers, over A actions. `weights`,
+    `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose row may hold anything. A
+    probability below `floor` counts as `floor`, so that one rounded 0 is no veto.
     """
     row_weights = weights[..., None]
     logs = np.log(np.maximum(np.where(row_weights > 0, p, 1.0), floor))
@@ -153,9 +156,10 @@ def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
 def median(p: Floats, weights: Floats) -> Floats:
     """Return the weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
 
-    Arguments as in `linear_pool`. If exactly half of the weight lies on either side, it is the mean
-    of the two values in the middle. If all medians are 0, as where each vehicle is sure of another
-    action, the linear pool replaces them.
+    `p` are intents, `(..., 1+H, A)`: the ego's, those of H helpers, over A actions. `weights`,
+    `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose row may hold anything. If exactly
+    half of the weight lies on either side, it is the mean of the two values in the middle. If all
+    medians are 0, as where each vehicle is sure of another action, the linear pool replaces them.
     """
     values, below = _sorted(p, weights)
     low = _pick(values, below >= 0.5 - 1e-12)
@@ -166,8 +170,10 @@ def median(p: Floats, weights: Floats) -> Floats:
 def trimmed_mean(p: Floats, weights: Floats) -> Floats:
     """Return the weighted trimmed mean of each action's probability, scaled to sum to 1.
 
-    The result is `(..., A)`; arguments are as in `linear_pool`. The lowest and the highest quarter
-    of the weight are left out: more than the linear pool leaves out, and less than the median.
+    The result is `(..., A)`. `p` are intents, `(..., 1+H, A)`: the ego's, those of H helpers, over
+    A actions. `weights`, `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose row may
+    hold anything. The lowest and the highest quarter of the weight are left out: more than the
+    linear pool leaves out, and less than the median.
     """
     values, below = _sorted(p, weights)
     inside = np.clip(below, 0.25, 0.75)

@@ -75,7 +75,7 @@ class Content:
     plans.
     """
 
-    holds: frozenset[str]  # some of the kinds above
+    holds: frozenset[str]  # what it holds, some of `KINDS`
     needs: tuple[str, ...] = ()  # what it needs of the world, some of `NEEDS`
     call: Call | None = None  # second question to the ego's model; None without one
 
@@ -123,7 +123,10 @@ class Contents(Plugins[Content]):
     """Hold all contents of messages by name, those of installed packages included."""
 
     def check(self, name: str, plugin: Content) -> None:
-        """Raise ValueError if a package's content contradicts itself, as in `holds` and `needs`."""
+        """Raise ValueError if the content `plugin` of a package contradicts itself.
+
+        Such as one that holds a plan and something beside it. `name` is the content's.
+        """
         if not NAME.fullmatch(name) or name == WHOLE:
             raise ValueError("its name is no plain word")
         if name in _own_calls():

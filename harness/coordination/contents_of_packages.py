@@ -51,8 +51,9 @@ def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
 def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
     """Return `intents` with `valid` true only for helpers that can send the point's content.
 
-    As `Content.able`. Of a package's content only `valid`, helpers' inference times and `unasked`
-    may change; raises UserError if it fails or changes anything else.
+    `senders`, `(n, H)`, has the row of the decision that each helper makes itself at this time, -1
+    for none; needed where messages hold plans. Of a package's content only `valid`, helpers'
+    inference times and `unasked` may change; raises UserError if it fails or changes anything else.
     """
     content = point.content
     if CONTENTS.is_ours(point.ask.content):
@@ -100,7 +101,8 @@ def graphs(
 ) -> Sequence[SceneGraph | None]:
     """Return the scene graph that a second question shows the ego in each case; None keeps its own.
 
-    As `Call.graphs`. Raises UserError if a package's call fails or returns another vehicle's graph.
+    A case has what one ego sees and has heard; all egos are of `scenario`. Raises UserError if a
+    package's call fails or returns another vehicle's graph.
     """
     if is_ours(call):
         return call.graphs(scenario, cases)
@@ -117,7 +119,8 @@ def graphs(
 def words(call: Call, evidence: str) -> str:
     """Return one helper's free text (`evidence`) as the line that the ego's prompt shows.
 
-    As `Call.words`. Raises UserError if a package's call fails or its line is too long.
+    `call` is the second question to the ego's model that shows it. Raises UserError if a package's
+    call fails or its line is too long.
     """
     if is_ours(call):
         return call.words(evidence)

@@ -94,8 +94,9 @@ def coordinate(
     """Play decisions `(...)` under one operating point, from asking helpers to the ego's action.
 
     `intents` has up to H helpers and A actions in each decision; `draws` are the channel's random
-    numbers. `fusion` is needed where the point makes a fusion call, its rule has memory, or ties
-    are drawn. Raises UserError if a package's plug-in fails.
+    numbers. `fusion` is needed where the point makes a fusion call (the ego's model answers once
+    more, with what it has heard), its rule has memory, or ties are drawn. Raises UserError if a
+    package's plug-in fails.
     """
     return fuse(point, exchange(point, intents, draws), intents, fusion)
 

@@ -19,20 +19,20 @@ Held = Literal["intent", "objects", "request"]
 
 @runtime_checkable
 class Encoding(Protocol):
-    """The sizes of messages by a standard."""
+    """Describe how a standard encodes messages, by how large they become."""
 
     def packet_bits(self, holds: Held, headers: bool, **counts: Floats | float) -> Floats:
         """Return the bits of messages, 0 where none is sent.
 
         Args:
-            holds: what they hold.
+            holds: what they are: an `intent` with its words, a list of `objects`, or a `request`.
             headers: whether those of network and transport count.
             counts: how much they hold: `actions` and `text_bytes` of an intent, `objects` that are
                 listed, `helpers` whom a request asks.
         """
 
     def beacon_bytes(self, rate_hz: float) -> int:
-        """Return the mean size of a vehicle's beacons at so many a second."""
+        """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second."""
 
 
 ENCODINGS = Shipped[Encoding]("swarmdrive.encodings", Encoding, {})  # those beside `json`
@@ -42,7 +42,8 @@ SAYS = '{"from":"v2","says":""}'  # what compact JSON puts around words
 def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """Return the size in bits of each helper's message with its intent and its words, `(..., H)`.
 
-    `headers` adds those of network and transport, except under `json`.
+    `encoding` is `json` or one of `ENCODINGS`. `headers` adds those of network and transport,
+    except under `json`.
     """
     if encoding == JSON:
         return intents.payload_bits
@@ -56,7 +57,8 @@ def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """Return the size in bits of each helper's message with its words alone, `(..., H)`.
 
-    `headers` adds those of network and transport, except under `json`.
+    `encoding` is `json` or one of `ENCODINGS`. `headers` adds those of network and transport,
+    except under `json`.
     """
     if encoding == JSON:
         return 8 * (len(SAYS) + _text_bytes(intents))
@@ -67,8 +69,8 @@ def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """Return the size in bits of each helper's list of detected objects, `(..., H)`.
 
-    `intents` must have `objects` and `object_bits`. `headers` adds those of network and transport,
-    except under `json`.
+    `encoding` is `json` or one of `ENCODINGS`. `intents` must have `objects` and `object_bits`.
+    `headers` adds those of network and transport, except under `json`.
     """
     assert intents.object_bits is not None
     assert intents.objects is not None
@@ -79,7 +81,10 @@ def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 
 
 def request_bits(encoding: str, helpers: int, headers: bool) -> float:
-    """Return the size in bits of a request to `helpers` vehicles, by an encoding but `json`."""
+    """Return the size in bits of a request to `helpers` vehicles.
+
+    `encoding` is one of `ENCODINGS`. `headers` adds those of network and transport.
+    """
     return float(ENCODINGS[encoding].packet_bits("request", headers, helpers=helpers))
 
 

@@ -50,7 +50,9 @@ from harness.radio.wrapped import broadcast, delivered, heard_s, is_ours
 class Exchange:
     """Hold who was asked, what was sent and who was heard in each decision.
 
-    Made by `exchange`. Times are seconds from the start of the decision.
+    Made by `exchange`. Times are seconds from the start of the decision. Shapes are of decisions
+    `(...)` with H helpers and A actions. A unit is an antenna beside the road, which may ask the
+    helpers for the ego and fuse what they reply.
     """
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`

@@ -148,7 +148,10 @@ def _changes_messages(text: str) -> bool:
 
 @cache
 def questions() -> Mapping[str, Question]:
-    """Return the questions that helpers may be asked, by name; the ordinary one has the name ""."""
+    """Return the questions that helpers may be asked, by name.
+
+    The ordinary one, what the ego should do as the helper sees it, has the name "".
+    """
     others = chain(*(kind.questions for kind in more_parts().values()))
     return {"": PLAIN, **{question.name: question for question in others}}
 
@@ -185,7 +188,9 @@ AS_SENT = Rewrites()
 class OperatingPoint:
     """Hold the settings of one condition: all that a decision depends on besides scene and model.
 
-    Settings are grouped in parts, and also have flat names. Raises UserError if they contradict.
+    Settings are grouped in parts: `radio`, `ask` (whom, and when), `fusion` and `cloud`, and those
+    of extensions. Each also has a flat name, without its part's, such as `tau_nats`, by which it
+    stands in records and conditions. Raises UserError if they contradict.
     """
 
     name: str  # in reports
@@ -253,9 +258,10 @@ class OperatingPoint:
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
-        """Return the operating point `name` with some flat settings; others have their defaults.
+        """Return the operating point `name` with some settings, by flat name; else with defaults.
 
-        Raises UserError for an unknown channel profile, or a value that is not allowed.
+        `profile` is its channel profile; None gives it no radio. Raises UserError for an unknown
+        channel profile, or a value that is not allowed.
         """
         return cls(name).changed(profile=profile, **settings)
 
@@ -612,7 +618,12 @@ class OperatingPoint:
     ) -> "tuple[SentIntents, Exchange]":
         """Return what is sent and heard after all that vehicles tell each other before they act.
 
-        As `Part.again`, by each part that ships, in turn.
+        Each part that ships may add to it in turn (`Part.again`), as further rounds do.
+
+        Args:
+            sent: what n decisions' vehicles have sent so far.
+            heard: the exchange of that.
+            decide: returns the decisions by an exchange and the intents known after it.
         """
         for part in self.more:
             if is_ours_part(part):

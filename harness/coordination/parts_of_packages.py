@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
-    """Return why a part cannot be played in a run; None if it can."""
+    """Return why a part cannot be used under `point` in `run`, in one line; None if it can."""
     if is_ours(part):
         return part.obstacle(point, run)
     with worded_part(part):
@@ -71,7 +71,10 @@ def prepared(part: Part, intents: Intents) -> Intents:
 
 @dataclass(frozen=True)
 class SpeakerOfPart:
-    """The door to a package's speaker: nothing of the ego's is another's to say."""
+    """Check what a package's speaker sends in place of what vehicles intend.
+
+    Raises UserError if it changes the ego's own intent, place or time, or sends no distributions.
+    """
 
     part: Part  # whose it is
     speaker: Speaker
@@ -95,7 +98,7 @@ class SpeakerOfPart:
 
 
 def speaker_of(part: Part) -> Speaker | None:
-    """Return what says to the channel what vehicles intend; None if they do."""
+    """Return the part's speaker, which decides what helpers send; None if they send the truth."""
     with worded_part(part):
         speaker = part.speaker()
     if speaker is None or is_ours(part):
@@ -106,7 +109,8 @@ def speaker_of(part: Part) -> Speaker | None:
 def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
     """Return for each of n decisions the index of the decision whose helpers it hears, `(n,)`.
 
-    As `Part.sources`. Raises UserError if a package's part fails or returns no valid indices.
+    `episode` and `seed`, `(n,)`, have each decision's episode number and seed of draws. Raises
+    UserError if a package's part fails or returns no valid indices.
     """
     if is_ours(part):
         return part.sources(episode, seed)
@@ -121,7 +125,9 @@ def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
 def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floats:
     """Return the policies, `(..., A)`, to use instead of those that a fusion call answered.
 
-    As `Part.after_call`. Raises UserError if a package's part fails or returns no distributions.
+    `fused` are the call's answers, `(..., A)`, NaN where one failed; `intents` those of the ego and
+    H helpers, `(..., 1+H, A)`; `heard` says who was heard in time, `(..., H)`. Raises UserError if
+    a package's part fails or returns no distributions.
     """
     if is_ours(part):
         return part.after_call(fused, intents, heard)
@@ -132,7 +138,10 @@ def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floa
 
 @dataclass(frozen=True)
 class ChangeOfPart:
-    """The door to what a package's part does to messages."""
+    """Check how a package's part changes messages before a fusion call shows them.
+
+    Raises UserError if it fails, or returns what is no such message or scene graph.
+    """
 
     what: str  # the part, in messages
     change: Change
@@ -166,7 +175,7 @@ class ChangeOfPart:
 
 
 def change_by(kind: type[Part], text: str) -> Change | None:
-    """Return what a kind of part does to a message by a text; None if it is no such text."""
+    """Return the change of messages that `text` names, by a kind of part; None if it has none."""
     what = PACKAGES_PARTS.get(kind)
     if what is None:
         return kind.change(text)
@@ -176,7 +185,10 @@ def change_by(kind: type[Part], text: str) -> Change | None:
 
 
 def shown_graph(question: Question, graph: SceneGraph) -> SceneGraph:
-    """Return the scene graph that a question shows of a helper's own."""
+    """Return the scene graph that a question puts into a helper's prompt, given the helper's own.
+
+    Raises UserError if a package's question fails or returns another vehicle's graph.
+    """
     for kind, what in PACKAGES_PARTS.items():
         if question in kind.questions:
             with worded(what):

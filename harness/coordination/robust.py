@@ -25,17 +25,18 @@ SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite if a message is the median 
 class Heads(Pool):
     """A consensus rule that pools with equal weights, and that no single helper can turn.
 
-    The pool is overruled by the mean intent of a majority that the ego is in, of all voices but
-    one.
+    If all vehicles but at most one, the ego among them, have the same likeliest action and the pool
+    has another, the mean intent of these vehicles replaces it.
     """
 
     by_distance: ClassVar[bool] = False
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the pool with equal weights of all heard, or the majority's mean if it departs.
+        """Return the pool with equal weights of all heard, or a majority's mean intent.
 
-        The mean is of the intents of those in the majority, which is of all voices but one, at
-        least two.
+        The latter where the pool's likeliest action is another than that of a majority: all but at
+        most one of the vehicles heard, the ego among them, at least two. `state` is passed on
+        unchanged.
         """
         voices = messages.weights > 0
         heads = np.sum(voices, axis=-1)
@@ -111,8 +112,8 @@ def centred_clipping(p: Floats, weights: Floats) -> Floats:
     """Return the ego's intent, moved `CLIP_ROUNDS` times by the weighted mean of clipped steps.
 
     A step leads to another vehicle's intent and is at most `CLIP` long (L2); the result is `(...,
-    A)`. From Karimireddy, He and Jaggi (2021), but starting from the ego's intent. Arguments as in
-    `geometric_median`.
+    A)`. From Karimireddy, He and Jaggi (2021), but starting from the ego's intent. `p` are intents,
+    `(..., 1+H, A)`; `weights`, `(..., 1+H)`, are 0 for a helper not heard.
     """
     centre = p[..., 0, :]
     for _ in range(CLIP_ROUNDS):

@@ -17,7 +17,10 @@ from harness.core.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Outlook:
-    """Hold how much of the scenario's R regions the ego sees, and what helpers would add to it."""
+    """Hold how much of the scenario's R regions the ego sees, and what helpers would add to it.
+
+    Regions are the road's sectors: where a danger may come from.
+    """
 
     unseen: Floats  # share of each region that the ego does not see, `(..., R)`
     # share of each region that a helper sees and the ego does not, `(..., H, R)`. It follows from
@@ -84,7 +87,11 @@ class Schedule(Protocol):
 
 @dataclass(frozen=True)
 class Formula:
-    """Make a schedule of a function of `ScheduleInputs` that returns `(..., H)` or `(..., 1)`."""
+    """Make a schedule of a function of `ScheduleInputs` that returns `(..., H)` or `(..., 1)`.
+
+    The function `formula` says what asking each helper is worth. The ego asks above `threshold`
+    (`Schedule.threshold`), and `needs` names the optional inputs that the function reads.
+    """
 
     formula: Callable[[ScheduleInputs], Floats]
     threshold: float | None = None
