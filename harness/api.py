@@ -36,9 +36,10 @@ HEADLINE = {  # metrics of a run's own table, by their heads
 
 
 class Run(Tables):
-    """A finished run, with its tables as data frames.
+    """A finished run, with its tables as data frames, such as `decisions`, `answers` and `summary`.
 
-    A notebook shows its headline and a row for each condition.
+    `path` is its folder, `config` the content of its `run.json`. A notebook shows its headline and
+    a row for each condition.
     """
 
     def decision(self, scene: str, viewer: str | None = None) -> "DecisionPoint":
@@ -297,7 +298,8 @@ def load(run: str | PathLike[str]) -> Run:
 def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
     """Return the runs and studies in a folder as rows, newest first.
 
-    The columns are those of `harness run ls`.
+    The columns are those of `harness run ls`, such as `name`, `kind`, `state`, `date`, `model` and
+    `success`, from 0 to 1.
 
     Raises:
         UserError: there is no such folder.
@@ -313,6 +315,10 @@ def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Compa
     """Return the comparison of run B with run A.
 
     It is on the episodes, conditions and seeds that both have.
+
+    Args:
+        a: the run that is compared with: its folder, or a loaded run.
+        b: the run that is compared, likewise.
 
     Raises:
         UserError: one is no finished run, or they have nothing to be paired by.
