@@ -188,7 +188,7 @@ def merge(
                 work.same(out, whole.settings, stopped.settings)
             with work.working(out, whole) as place:
                 shards.collect(parts, place)
-        scenario = scenarios.stated(config["scenario"], config["parameters"])
+        scenario = scenarios.of_manifest(config["scenario"], config["parameters"])
         count, seed = config["episodes"], config["seed"]
         return build(scenario, out, count, seed, workers, progress, audits, more)
 

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from harness.dataset.schema import Branching, Danger, Edge, End, Record, scene_id
 from harness.world import lockstep
-from harness.world.beacons import known
+from harness.world.beacons import state_by_beacon
 from harness.world.conflict_measures import rounded
 from harness.world.drivers import DRIVERS, choices
 from harness.world.perception.graph import scene_graphs, truth_graphs
@@ -175,7 +175,7 @@ def _record(
     """Return the record of a decision point, with distances to the conflict zone at `zone_m`."""
     ego_id, *helpers = graphs
     ego = state.vehicle(ego_id)
-    known_states = {name: known(state, name, ego_id) for name in graphs}
+    known_states = {name: state_by_beacon(state, name, ego_id) for name in graphs}
     return Record(
         scene=scene_id(episode, state),
         episode=episode,

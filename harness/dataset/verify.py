@@ -110,7 +110,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
 
 def scenario_of(manifest: Manifest) -> Scenario:
     """Return the scenario of a manifest, with the manifest's parameters."""
-    return scenarios.stated(manifest.scenario, manifest.parameters)
+    return scenarios.of_manifest(manifest.scenario, manifest.parameters)
 
 
 def check(path: Path) -> list[str]:

@@ -12,7 +12,7 @@ import shapely
 from harness.coordination.claims import Claims
 from harness.core.arrays import Floats
 from harness.dataset.load import Scene
-from harness.world.beacons import known
+from harness.world.beacons import state_by_beacon
 from harness.world.road import Road
 from harness.world.scenario import Scenario
 
@@ -46,7 +46,7 @@ def _claims(road: Road, scene: Scene) -> tuple[Floats, Floats, Floats]:
     """
     if (notes := scene.notes.get("claims")) is None:
         state, (ego, *names) = scene.state, scene.viewers
-        helpers = [known(state, name, ego) for name in names]
+        helpers = [state_by_beacon(state, name, ego) for name in names]
         nodes = {node.id: node for node in scene.graphs[ego].nodes}
         cos, sin = math.cos(state.ego.heading_rad), math.sin(state.ego.heading_rad)
         zone_x, zone_y = road.zone_m

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from harness.coordination.scheduling import Outlook
 from harness.core.arrays import Bools, Floats
 from harness.dataset.load import Scene, by_seat
-from harness.world.beacons import known
+from harness.world.beacons import state_by_beacon
 from harness.world.perception.rays import blocked_by
 from harness.world.road import Road
 from harness.world.scenario import Scenario
@@ -44,7 +44,7 @@ def _outlook(road: Road, scene: Scene) -> Outlook:
     """Return a scene's outlook; kept with the immutable scene."""
     if (kept := scene.notes.get("outlook")) is None:
         graph, state = scene.graphs[scene.viewers[0]], scene.state
-        helpers = [known(state, name, state.ego.id) for name in scene.viewers[1:]]
+        helpers = [state_by_beacon(state, name, state.ego.id) for name in scene.viewers[1:]]
         as_known = _as_known(state, graph.nodes, helpers)
         # What the ego sees is decided by where occluders truly are, and not by where it measures
         # them.

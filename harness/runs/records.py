@@ -491,7 +491,7 @@ class ClosedLoop(
         name: str = self.scenario["name"]
         with suppress(UserError):
             if scenarios.is_here(name):
-                return scenarios.title(scenarios.stated(name, self.scenario["parameters"]))
+                return scenarios.title(scenarios.of_manifest(name, self.scenario["parameters"]))
         return name
 
 
@@ -598,7 +598,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
         assert isinstance(self.world, ClosedLoop)
         record = self.world.scenario
         try:
-            return scenarios.stated(record["name"], record["parameters"])
+            return scenarios.of_manifest(record["name"], record["parameters"])
         except UserError as error:
             raise UserError(f"run.json of {printable(self.name)}: {error}") from None
 

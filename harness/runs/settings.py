@@ -751,7 +751,7 @@ def _as_driven(settings: Settings, run: Path) -> Settings:
     world = run_of(run).manifest.world
     if not isinstance(world, ClosedLoop) or world.scenario["name"] != name:
         return settings
-    its = scenarios.stated(name, world.scenario["parameters"])
+    its = scenarios.of_manifest(name, world.scenario["parameters"])
     scenes = [f"{key}={getattr(its.parameters, key)}" for key in missing if key in its.dials]
     return changed(
         settings, {"scenario": f"{name}:{','.join([*([typed] if typed else []), *scenes])}"}

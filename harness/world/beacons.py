@@ -66,7 +66,7 @@ def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
     )
 
 
-def known(state: WorldState, sender: str, receiver: str) -> VehicleState:
+def state_by_beacon(state: WorldState, sender: str, receiver: str) -> VehicleState:
     """Return the sender's state as the receiver estimates it from the last beacon that it has.
 
     The true state if it has none, as under perfect knowledge or of itself.
@@ -213,7 +213,7 @@ def _sent(
     `links` selects the values of `loss` for its receivers.
     """
     phase, errors, uniforms = _draws(p, seed, sender, receivers)
-    every, lead = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
+    every, shift = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
 
     def sent(number: int, frame: int, heard_by: tuple[str, ...] = ()) -> Beacon:
         x, y, heading, speed = (poses[frame - first_frame] + errors[number]).tolist()
@@ -229,8 +229,8 @@ def _sent(
         return tuple(r for r, there in zip(receivers, crosses.tolist(), strict=True) if there)
 
     checks = list[tuple[int, int]]()  # number and frame, the last first
-    number = math.ceil((first_frame + len(poses) + lead) / every - phase)
-    while number >= 0 and (frame := math.floor((number + phase) * every) - lead) >= first_frame:
+    number = math.ceil((first_frame + len(poses) + shift) / every - phase)
+    while number >= 0 and (frame := math.floor((number + phase) * every) - shift) >= first_frame:
         if frame < first_frame + len(poses):
             checks.append((number, frame))
         number -= 1
@@ -316,9 +316,9 @@ def _draws(
     and draws for receivers, (R, n).
     """
     n = math.ceil((_lead_frames(p) / p.simulation_hz + p.time_limit_s) * p.beacon_hz) + 2
-    own = noise.generator("beacons", seed, sender)
-    phase = float(own.random())
+    generator = noise.generator("beacons", seed, sender)
+    phase = float(generator.random())
     sizes = [p.beacon_noise_m, p.beacon_noise_m, p.beacon_noise_rad, p.beacon_noise_mps]
-    errors = own.standard_normal((n, 4)) * sizes
+    errors = generator.standard_normal((n, 4)) * sizes
     draws = [noise.uniforms((n,), "beacons", seed, sender, receiver) for receiver in receivers]
     return phase, errors, np.array(draws).reshape(-1, n)

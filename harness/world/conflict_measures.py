@@ -216,12 +216,12 @@ def _lower_ttc(
     may &= (dx * vx + dy * vy < 0) | (apart <= reach * reach)
     may &= apart <= (reach + np.minimum(ttc_s, HORIZON_S)[worlds, None] * np.sqrt(squared)) ** 2
     rows, others = np.nonzero(may)
-    own, others = worlds[rows], others + 1
+    world_of_row, others = worlds[rows], others + 1
     times_s = times_to_collision(
-        poses[rows, 0], sizes_m[own, 0], poses[rows, others], sizes_m[own, others]
+        poses[rows, 0], sizes_m[world_of_row, 0], poses[rows, others], sizes_m[world_of_row, others]
     )
     within = times_s <= HORIZON_S
-    np.minimum.at(ttc_s, own[within], times_s[within])
+    np.minimum.at(ttc_s, world_of_row[within], times_s[within])
 
 
 def _boxes(x: Floats, y: Floats, cos: Floats, sin: Floats, sizes_m: Floats) -> Floats:
@@ -288,5 +288,5 @@ def _lower_lag(
         np.minimum.at(lag, worlds[pairs[apart_m <= 0]], behind[apart_m <= 0])
         # Nothing nearer in time than it takes to come this far can overlap.
         behind += np.fmax(1.0, apart_m // step_m[pairs]).clip(1, passed.shape[1]).astype(int)
-        going = (apart_m > 0) & (behind < lag[worlds[pairs]])
-        pairs, moment, row, behind = pairs[going], moment[going], row[going], behind[going]
+        is_open = (apart_m > 0) & (behind < lag[worlds[pairs]])
+        pairs, moment, row, behind = pairs[is_open], moment[is_open], row[is_open], behind[is_open]

@@ -46,18 +46,18 @@ def choose(
 
 
 def choices(
-    scenario: Scenario, asked: Sequence[tuple[str, SceneGraph | None, SceneGraph | None]]
+    scenario: Scenario, requests: Sequence[tuple[str, SceneGraph | None, SceneGraph | None]]
 ) -> list[str]:
     """Return the meta-action of each driver that is asked, as `choose` does for one.
 
-    Each of `asked` has a driver's name, or that of an action that is always taken, the ego's graph
-    and the true graph. Raises ValueError if a driver was not given the graph that it reads.
+    Each of `requests` has a driver's name, or that of an action that is always taken, the ego's
+    graph and the true graph. Raises ValueError if a driver was not given the graph that it reads.
     """
     always = {**{action: action for action in scenario.actions}, **ALWAYS}
     planned = iter(
-        plans(scenario, [_read(scenario, *each) for each in asked if each[0] not in always])
+        plans(scenario, [_read(scenario, *each) for each in requests if each[0] not in always])
     )
-    return [always.get(driver) or next(planned) for driver, *_ in asked]
+    return [always.get(driver) or next(planned) for driver, *_ in requests]
 
 
 def constant(scenario: Scenario) -> str | None:

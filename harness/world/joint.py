@@ -199,19 +199,19 @@ def _options(layout: Layout, worlds: Sequence[Rehearsal], frames: int) -> Option
     return Options([worlds[k].taken for k in order], arrives_s[order], poses, sizes_m, hz)
 
 
-def _courses(going: list[Rehearsal]) -> list[Rehearsal]:
+def _courses(rehearsals: list[Rehearsal]) -> list[Rehearsal]:
     """Return a world for each course that the actions of agents can lead to,
     until each is decided.
     """
-    p, ended = going[0].scenario.parameters, list[Rehearsal]()
+    p, ended = rehearsals[0].scenario.parameters, list[Rehearsal]()
     for step in range(p.decisions):
-        lockstep.advance(going, [p.due_frame(step) + p.lag_frames] * len(going))
-        ended += [each for each in going if each.ended]
-        going = [part for each in going if not each.ended for part in each.parts(step)]
-        lockstep.advance(going, [p.due_frame(step + 1)] * len(going))
-        ended += [each for each in going if each.ended]
-        going = [each for each in going if not each.ended]
-    return ended + going
+        lockstep.advance(rehearsals, [p.due_frame(step) + p.lag_frames] * len(rehearsals))
+        ended += [each for each in rehearsals if each.ended]
+        rehearsals = [part for each in rehearsals if not each.ended for part in each.parts(step)]
+        lockstep.advance(rehearsals, [p.due_frame(step + 1)] * len(rehearsals))
+        ended += [each for each in rehearsals if each.ended]
+        rehearsals = [each for each in rehearsals if not each.ended]
+    return ended + rehearsals
 
 
 def _drive_on(worlds: Sequence[Rehearsal], until_frames: Sequence[int]) -> None:
@@ -296,18 +296,18 @@ class Search:
         return self.rows[key]
 
 
-def together(own: Options, n: int, other: Options) -> Bools:
+def together(options: Options, n: int, other: Options) -> Bools:
     """Return which of another agent's n options are compatible with option `n` of an agent, (n,).
 
     They are if neither agent touches the other or traffic, in the frames before both have arrived.
     """
-    mine, its, frames = own.poses[n : n + 1], other.poses, own.poses.shape[1]
-    ends = np.minimum(np.maximum(own.arrives_s[n], other.arrives_s) * own.hz, frames)
+    poses, other_poses, frames = options.poses[n : n + 1], other.poses, options.poses.shape[1]
+    ends = np.minimum(np.maximum(options.arrives_s[n], other.arrives_s) * options.hz, frames)
     under_way = np.arange(1, frames + 1) <= ends[:, None] + 0.5
-    own_m, other_m = own.sizes_m, other.sizes_m
-    meet = near(mine[:, :, :1], own_m[:1], its[:, :, :1], other_m[:1], MARGIN_M, under_way)
-    meet |= near(mine[:, :, :1], own_m[:1], its[:, :, 1:], other_m[1:], 0.0, under_way)
-    meet |= near(mine[:, :, 1:], own_m[1:], its[:, :, :1], other_m[:1], 0.0, under_way)
+    own_m, other_m = options.sizes_m, other.sizes_m
+    meet = near(poses[:, :, :1], own_m[:1], other_poses[:, :, :1], other_m[:1], MARGIN_M, under_way)
+    meet |= near(poses[:, :, :1], own_m[:1], other_poses[:, :, 1:], other_m[1:], 0.0, under_way)
+    meet |= near(poses[:, :, 1:], own_m[1:], other_poses[:, :, :1], other_m[:1], 0.0, under_way)
     return ~meet
 
 
@@ -377,8 +377,9 @@ def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
 def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
     """Return the world of each layout after all agents took their planned actions, by seed."""
     worlds = {seed: World.start(scenario, seed) for seed in plans_by_seed}
-    while going := [world for world in worlds.values() if not world.ended]:
-        take_turn(going, [plans_by_seed[world.seed].turn(world.step) for world in going])
+    while live_worlds := [world for world in worlds.values() if not world.ended]:
+        turns = [plans_by_seed[world.seed].turn(world.step) for world in live_worlds]
+        take_turn(live_worlds, turns)
     return worlds
 
 

@@ -38,85 +38,85 @@ AT_ONCE = 128  # more worlds do not fit into the processor's cache
 
 def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
     """Simulate worlds of one scenario, each until its frame in `until_frames` or its own end."""
-    going = [
+    pairs = [
         (world, until)
         for world, until in zip(worlds, until_frames, strict=True)
         if world.frame < until and not world.ended
     ]
-    if going and going[0][0].scenario.has_own_world:
-        for world, until in going:
+    if pairs and pairs[0][0].scenario.has_own_world:
+        for world, until in pairs:
             world.advance(until)
         return
     # Worlds with similar numbers of frames are simulated together, so that arrays stay full.
-    going.sort(key=lambda pair: pair[1] - pair[0].frame)
-    bounds = [*range(0, len(going), AT_ONCE), len(going)]
-    for begin, end in pairwise(bounds if going else ()):
-        _together(*zip(*going[begin:end], strict=True))
+    pairs.sort(key=lambda pair: pair[1] - pair[0].frame)
+    bounds = [*range(0, len(pairs), AT_ONCE), len(pairs)]
+    for begin, end in pairwise(bounds if pairs else ()):
+        _together(*zip(*pairs[begin:end], strict=True))
 
 
 def _together(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
-    begun = np.array([world.frame for world in worlds])
+    starts = np.array([world.frame for world in worlds])
     until = np.array(until_frames)
     fleet = Fleet(worlds)
     sizes_m, there, pairs = fleet.size, fleet.there, fleet.agents
     before_mps = fleet.speed[pairs]
-    poses = np.full((len(worlds), int((until - begun).max()), *fleet.speed.shape[1:], 4), np.nan)
-    going = np.arange(len(worlds))
+    poses = np.full((len(worlds), int((until - starts).max()), *fleet.speed.shape[1:], 4), np.nan)
+    live_rows = np.arange(len(worlds))
     passed = 0
-    while going.size:
+    while live_rows.size:
         happened = fleet.step()
-        poses[going, passed, :, :2] = fleet.xy
-        poses[going, passed, :, 2] = fleet.heading
-        poses[going, passed, :, 3] = fleet.speed
+        poses[live_rows, passed, :, :2] = fleet.xy
+        poses[live_rows, passed, :, 2] = fleet.heading
+        poses[live_rows, passed, :, 3] = fleet.speed
         passed += 1
-        over = fleet.frame >= until[going]
+        over = fleet.frame >= until[live_rows]
         for row in np.flatnonzero(over | happened).tolist():
-            world = worlds[going[row]]
+            world = worlds[live_rows[row]]
             standing = fleet.write(row, world)
             if happened[row]:
                 world.judge(standing)
                 fleet.going[row, [n for n, j in world.journeys.items() if j.outcome.ended]] = False
                 over[row] |= world.ended
         if happened.any() or over.any():
-            going = going[~over]
+            live_rows = live_rows[~over]
             fleet.keep(~over)
     poses = poses[:, :passed]
     poses[..., :2] -= worlds[0].scenario.road().origin_m
     np.copyto(poses, np.nan, where=~there[:, None, :, None])
-    for world, frames, first in zip(worlds, poses, begun.tolist(), strict=True):
+    for world, frames, first in zip(worlds, poses, starts.tolist(), strict=True):
         world.passed(frames[: world.frame - first, : len(world.vehicles)])
-    _measure(worlds, pairs, begun, poses, sizes_m, before_mps)
+    _measure(worlds, pairs, starts, poses, sizes_m, before_mps)
 
 
 def _measure(
     worlds: "Sequence[World]",
     agents: tuple[Ints, ...],
-    begun: Ints,
+    starts: Ints,
     poses: Floats,
     sizes_m: Floats,
     before_mps: Floats,
 ) -> None:
     """Record what some frames were for each agent, (n,), that was under way when they began.
 
-    `poses` (B, F, V, 4) are of frames after `begun`, (B,);
+    `poses` (B, F, V, 4) are of frames after `starts`, (B,);
     `before_mps` (n,) are the agents' speeds before.
     """
     rows, places = agents
     hz = worlds[0].scenario.parameters.simulation_hz
     journeys = [worlds[b].journeys[n] for b, n in zip(rows.tolist(), places.tolist(), strict=True)]
-    ends = np.array([worlds[b].frame for b in rows.tolist()]) - begun[rows]  # frames that count
+    ends = np.array([worlds[b].frame for b in rows.tolist()]) - starts[rows]  # frames that count
     if places.any():  # each agent comes first in its own
         order = np.tile(np.arange(poses.shape[2]), (len(rows), 1))
         order[np.arange(len(rows)), places], order[:, 0] = 0, places
         poses = poses[rows[:, None], :, order].swapaxes(1, 2)
         sizes_m = sizes_m[rows[:, None], order]
         ended_s = [np.inf if j.outcome.time_s is None else j.outcome.time_s for j in journeys]
-        ends = np.minimum(ends, np.rint(np.array(ended_s) * hz) - begun[rows]).astype(int)
+        ends = np.minimum(ends, np.rint(np.array(ended_s) * hz) - starts[rows]).astype(int)
         after = np.arange(poses.shape[1]) >= ends[:, None]
         np.copyto(poses, np.nan, where=after[..., None, None])
     before_m = np.array([journey.outcome.least_gap_m for journey in journeys])
     gaps_m = least_gaps_m(poses, sizes_m, before_m).tolist()
-    conflicts = observe([j.conflicts for j in journeys], poses, sizes_m, begun[rows] + 1, hz)
+    conflicts = observe([j.conflicts for j in journeys], poses, sizes_m, starts[rows] + 1, hz)
     speeds_mps = np.concatenate([before_mps[:, None], poses[:, :, 0, 3]], axis=1)
     for n, journey in enumerate(journeys):
         journey.passed(speeds_mps[n, : ends[n] + 1], gaps_m[n], conflicts[n], hz)
@@ -188,8 +188,8 @@ def _lanes(road: Callable[[], Road]) -> Lanes:
 
     def each(name: str, blank: Any, kind: type) -> Floats:
         values = [
-            getattr(lane, name) if its is kind else blank
-            for lane, its in zip(lanes, kinds, strict=True)
+            getattr(lane, name) if lane_kind is kind else blank
+            for lane, lane_kind in zip(lanes, kinds, strict=True)
         ]
         return np.array(values, dtype=float)
 
@@ -341,11 +341,11 @@ class Fleet:
         if (egos := seat < 0).any():
             xy = np.where(self.there[..., None], self.xy, np.nan)
             cleared[egos] = self.scenario.cleared(xy, self.approach, p)[self.agents[0][egos]]
-        for n, (key, its) in enumerate(self.seats.items()):
+        for n, (key, agent_seat) in enumerate(self.seats.items()):
             if (at := seat == n).any():
                 xy = self.xy[self.agents][at][:, None]
-                names = np.full(xy.shape[:2], its.names[key][0])
-                cleared[at] = its.scenario.cleared(xy, names, p)
+                names = np.full(xy.shape[:2], agent_seat.names[key][0])
+                cleared[at] = agent_seat.scenario.cleared(xy, names, p)
         return cleared
 
     def _act(self) -> None:

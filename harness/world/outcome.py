@@ -126,5 +126,5 @@ def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path])
         dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m
         ahead = dx * np.cos(ego.heading_rad) + dy * np.sin(ego.heading_rad)
         return "ego" if ahead > 0 else "other"
-    own, others = paths[ego.approach, ego.route], paths[other.approach, other.route]
-    return "ego" if own.priority < others.priority else "other"
+    ego_path, other_path = paths[ego.approach, ego.route], paths[other.approach, other.route]
+    return "ego" if ego_path.priority < other_path.priority else "other"

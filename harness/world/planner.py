@@ -96,11 +96,11 @@ def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
     """Return the meta-action that the reference planner takes for each scene graph of the ego."""
     p, road = scenario.parameters, scenario.road()
     places = [(_way(road, graph.ego), road.zone_arc_m - graph.ego.zone_m) for graph in graphs]
-    beside = [road.beside(own, at_m) for own, at_m in places]
+    beside = [road.beside(way, at_m) for way, at_m in places]
     starts: list[Start] = []
-    for graph, ways, (own, _) in zip(graphs, beside, places, strict=True):
+    for graph, ways, (way, _) in zip(graphs, beside, places, strict=True):
         sides = int("left" in ways), int("right" in ways)
-        home = road.ways.index(road.ego) - road.ways.index(own) if road.ways else 0
+        home = road.ways.index(road.ego) - road.ways.index(way) if road.ways else 0
         ego, left = graph.ego, p.decisions - graph.step
         starts.append((ego.speed_mps, ego.target_speed_mps, left, sides, home))
     rollouts = _rollouts(scenario.actions, starts, p)
@@ -115,7 +115,7 @@ def _chosen(
     scenario: Scenario,
     graph: SceneGraph,
     at_m: float,
-    own: PathKey,
+    way: PathKey,
     sequences: Sequences,
     tried: Rollouts,
 ) -> str:
@@ -128,11 +128,11 @@ def _chosen(
     gap = np.full(len(tried.travelled_m), np.inf)
     for motion in predicted(road, graph, tried.travelled_m.shape[1]):
         gap = np.minimum(gap, least_gap(tried, motion, under_way))
-    gap = np.where(_too_fast(road.paths[own], at_m, tried, under_way), np.minimum(gap, 0.0), gap)
+    gap = np.where(_too_fast(road.paths[way], at_m, tried, under_way), np.minimum(gap, 0.0), gap)
     arrival_s = short.sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
     cost = arrival_s[tried.motion]
     if road.ways:
-        cost += AWAY_S * (road.ways.index(own) + sequences.ends != road.ways.index(road.ego))
+        cost += AWAY_S * (road.ways.index(way) + sequences.ends != road.ways.index(road.ego))
     gap = gap[tried.motion]
     score = np.where(gap > 0, -cost, -1e3 + np.minimum(gap, 0.0))
     best = np.flatnonzero(score >= score.max() - 1e-9)
@@ -342,18 +342,19 @@ def least_gap(
     A value below 0 is a collision. Only steps where `under_way` is true count, (motions, steps). A
     gap wider than `within_m` may be given as inf.
     """
-    (own, own_reach), (away, reach) = cover(*SIZES_M["car"]), cover(*motion.size_m)
+    (ego_discs, ego_reach), (discs, reach) = cover(*SIZES_M["car"]), cover(*motion.size_m)
     (x, y), off_m = _middles(tried, motion.way, motion.begin_m)
     its_x, its_y, _ = motion.path.places(motion.arc_m)
-    near_m = own.max() + away.max() + own_reach + reach + MARGIN_M + off_m + within_m
+    near_m = ego_discs.max() + discs.max() + ego_reach + reach + MARGIN_M + off_m + within_m
     sequence, step = np.nonzero(((x - its_x) ** 2 + (y - its_y) ** 2 < near_m**2) & under_way)
     squared = np.full(len(x), np.inf)
     if len(step):
         right_m = None if tried.right_m is None else tried.right_m[sequence, step]
-        x, y = _discs(motion.way, motion.begin_m + tried.travelled_m[sequence, step], own, right_m)
-        its_x, its_y = (part[:, None, step] for part in _discs(motion.path, motion.arc_m, away))
+        arc_m = motion.begin_m + tried.travelled_m[sequence, step]
+        x, y = _discs(motion.way, arc_m, ego_discs, right_m)
+        its_x, its_y = (part[:, None, step] for part in _discs(motion.path, motion.arc_m, discs))
         np.minimum.at(squared, sequence, ((x - its_x) ** 2 + (y - its_y) ** 2).min(axis=(0, 1)))
-    return np.asarray(np.sqrt(squared) - reach - own_reach - MARGIN_M)
+    return np.asarray(np.sqrt(squared) - reach - ego_reach - MARGIN_M)
 
 
 @lru_cache(maxsize=8)  # the ego meets others on few ways

@@ -36,10 +36,10 @@ CLEAR_M = (
 
 
 def _from_the_right(road: Road, graph: SceneGraph, conflict: Conflict) -> bool:
-    own, other = road.paths[road.ego], road.paths[conflict.sector, conflict.route]
+    ego_path, other_path = road.paths[road.ego], road.paths[conflict.sector, conflict.route]
     at = road.crossings[conflict.sector, conflict.route]
-    if at.kind == "merging" and own.priority != other.priority:
-        return own.priority > other.priority
+    if at.kind == "merging" and ego_path.priority != other_path.priority:
+        return ego_path.priority > other_path.priority
     if max(graph.ego.speed_mps, conflict.other.speed_mps) < STANDS_MPS:
         return _lower(graph, conflict)
     turn = _turn_rad(road, conflict)
@@ -50,9 +50,9 @@ def _from_the_right(road: Road, graph: SceneGraph, conflict: Conflict) -> bool:
 
 def _turn_rad(road: Road, conflict: Conflict) -> float:
     """Return from which heading to which the ego's path and the other's meet."""
-    own, other = road.paths[road.ego], road.paths[conflict.sector, conflict.route]
+    ego_path, other_path = road.paths[road.ego], road.paths[conflict.sector, conflict.route]
     at = road.crossings[conflict.sector, conflict.route]
-    return other.project(at.x_m, at.y_m)[2] - own.project(at.x_m, at.y_m)[2]
+    return other_path.project(at.x_m, at.y_m)[2] - ego_path.project(at.x_m, at.y_m)[2]
 
 
 def _sooner(road: Road, graph: SceneGraph, conflict: Conflict) -> bool:
@@ -103,7 +103,7 @@ def under(rule: str, scenario: Scenario, graph: SceneGraph) -> SceneGraph:
         elif late or not (stuck or RULES[rule](road, graph, conflict)):
             faster = replace(other, speed_mps=max(top_mps, other.speed_mps))
             later = replace(other, arc_m=other.arc_m + GAP_S * other.speed_mps)
-            conflicts += [replace(conflict, other=its) for its in (other, faster, later)]
+            conflicts += [replace(conflict, other=arrival) for arrival in (other, faster, later)]
     return replace(graph, conflicts=tuple(conflicts))
 
 

@@ -80,7 +80,7 @@ def passes(able: Options, others: Sequence[Options]) -> Bools:
     frame = np.arange(1, able.poses.shape[1] + 1)
     under_way = frame <= np.minimum(able.arrives_s * able.hz, len(frame))[:, None] + 0.5
     free = np.ones(len(able.actions), dtype=bool)
-    own, own_size_m = able.poses[:, :, :1], able.sizes_m[:1]
+    poses, size_m = able.poses[:, :, :1], able.sizes_m[:1]
     for other in others:
-        free &= ~near(other.poses[:, :, :1], other.sizes_m[:1], own, own_size_m, 0.0, under_way)
+        free &= ~near(other.poses[:, :, :1], other.sizes_m[:1], poses, size_m, 0.0, under_way)
     return free

@@ -328,20 +328,22 @@ def paths_along(
 
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:
     """Return where paths of other approaches first meet the ego's path, by path key."""
-    own = paths[ego]
+    ego_path = paths[ego]
     meetings = {}
     for key, path in paths.items():
         if key[0] == ego[0]:
             continue
-        shared = [lane for lane in own.lanes if lane in path.lanes]
+        shared = [lane for lane in ego_path.lanes if lane in path.lanes]
         if shared:
-            begin, its_begin = ((0.0, *p.ends_m)[p.lanes.index(shared[0])] for p in (own, path))
-            meetings[key] = Crossing(*own.at(begin)[:2], begin, its_begin, "merging")
+            begin, its_begin = (
+                (0.0, *p.ends_m)[p.lanes.index(shared[0])] for p in (ego_path, path)
+            )
+            meetings[key] = Crossing(*ego_path.at(begin)[:2], begin, its_begin, "merging")
             continue
-        point = intersection(LineString(own.points), LineString(path.points))
+        point = intersection(LineString(ego_path.points), LineString(path.points))
         if point.geom_type == "Point":
             x, y = float(point.x), float(point.y)
-            meetings[key] = Crossing(x, y, own.project(x, y)[0], path.project(x, y)[0])
+            meetings[key] = Crossing(x, y, ego_path.project(x, y)[0], path.project(x, y)[0])
     return meetings
 
 

@@ -87,12 +87,12 @@ class Roundabout:
         return streets
 
     def path(
-        self, approach: str, route: str, begin: str, end: str, priority: int, own: str = ARMS[0]
+        self, approach: str, route: str, begin: str, end: str, priority: int, home: str = ARMS[0]
     ) -> Path:
         """Build the path of `approach` and `route` from arm `begin` round the ring to arm `end`.
 
         Arms are `s`, `e`, `n` or `w`. Lane names in the path are relative to an agent that comes
-        from the arm `own`.
+        from the arm `home`.
         """
         first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
         if last <= first:  # once more past the node where the ring's list begins
@@ -101,7 +101,7 @@ class Roundabout:
         lanes: list[Lane] = [(f"{begin}er", f"{begin}es", 0), (f"{begin}es", f"{begin}e", 0)]
         lanes += [(a, b, 0) for a, b in pairwise(nodes)]
         lanes += [(f"{end}x", f"{end}xs", 0), (f"{end}xs", f"{end}xr", 0)]
-        roles = [_role(lane, own) for lane in lanes]
+        roles = [_role(lane, home) for lane in lanes]
         return Path.along(self.network(), approach, route, lanes, roles, priority)
 
     def mound(self, radius_m: float) -> list[tuple[float, float, float, float]]:
@@ -117,17 +117,17 @@ class Roundabout:
         return boxes
 
 
-def name_of(arm: str, own: str) -> str:
-    """Return how an agent from arm `own` calls `arm`: `own`, `right`, `oncoming` or `left`.
+def name_of(arm: str, home: str) -> str:
+    """Return how an agent from arm `home` calls `arm`: `own`, `right`, `oncoming` or `left`.
 
     Arms are given as `s`, `e`, `n` or `w`.
     """
-    return NAMES[(ARMS.index(arm) - ARMS.index(own)) % len(ARMS)]
+    return NAMES[(ARMS.index(arm) - ARMS.index(home)) % len(ARMS)]
 
 
-def _role(lane: Lane, own: str) -> str:
-    """Name a lane as an agent from the arm `own` sees it."""
-    where = name_of(lane[1][0], own)
+def _role(lane: Lane, home: str) -> str:
+    """Name a lane as an agent from the arm `home` sees it."""
+    where = name_of(lane[1][0], home)
     if lane[0] in RING and lane[1] in RING:
         return f"ring-{where}"  # before the exit of that arm, or between its exit and its entry
     return f"approach-{where}" if "e" in lane[1] else f"exit-{where}"

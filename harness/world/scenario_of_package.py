@@ -86,9 +86,9 @@ def put_doors(scenario: Scenario) -> None:
     for name, door in (("road", _RoadDoor), ("cleared", _ClearedDoor), ("seats", _SeatsDoor)):
         function = getattr(scenario, name)
         if function is not None and not is_ours(function):
-            object.__setattr__(scenario, name, door(what, _own(function)))
+            object.__setattr__(scenario, name, door(what, _function_behind(function)))
     if not is_ours(scenario.layout):
-        layout = _LayoutDoor(what, _own(scenario.layout), scenario.road)
+        layout = _LayoutDoor(what, _function_behind(scenario.layout), scenario.road)
         object.__setattr__(scenario, "layout", layout)
 
 
@@ -97,7 +97,7 @@ def is_ours(function: Callable[..., Any]) -> bool:
     return is_in_harness(getattr(function, "func", function))
 
 
-def _own(function: Callable[..., Any]) -> Callable[..., Any]:
+def _function_behind(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return what lies behind a door, which a copy of the scenario may have another name for."""
     return function.function if isinstance(function, _Door) else function
 
@@ -194,5 +194,5 @@ def _check_numbers(thing: Spawn | Building, bounds: Mapping[str, tuple[float, fl
         if value is None and name == "brakes_at_s":  # it does not brake by itself
             continue
         if not (isinstance(value, Real) and least <= float(value) <= most):
-            shown = printable(repr(value))
-            raise ValueError(f"{thing.id} has {name} {shown}, not from {least:g} to {most:g}")
+            value_text = printable(repr(value))
+            raise ValueError(f"{thing.id} has {name} {value_text}, not from {least:g} to {most:g}")

@@ -187,8 +187,8 @@ def vehicle_on(
 def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
     """Return a spawn at a vehicle's present position and speed, as if it began there."""
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
-    begun = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
-    plans = (begun.brakes_at_s, begun.brakes_mps2, begun.brakes_to_mps) if begun else ()
+    start = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
+    plans = (start.brakes_at_s, start.brakes_mps2, start.brakes_to_mps) if start else ()
     return Spawn(v.id, v.kind, v.part, v.approach, v.route, arc, v.speed_mps, *plans, radio=v.radio)
 
 

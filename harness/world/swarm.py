@@ -27,8 +27,10 @@ def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float
     for seed in seeds:
         layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
         for agent in agents:
-            its, layout_alone = on_seat(scenario, layout, agent)
-            worlds[seed, agent] = World(its, seed, layout_alone, populated(its, layout_alone))
+            scenario_alone, layout_alone = on_seat(scenario, layout, agent)
+            worlds[seed, agent] = World(
+                scenario_alone, seed, layout_alone, populated(scenario_alone, layout_alone)
+            )
     p = scenario.parameters
     for group in by_scenario(list(worlds.values())):
         lockstep.advance(group, [round(p.time_limit_s * p.simulation_hz)] * len(group))

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from harness.world import scenarios
-from harness.world.beacons import known
+from harness.world.beacons import state_by_beacon
 from harness.world.perception.graph import scene_graph, scene_graphs
 from harness.world.perception.shared import Heard, merged
 from harness.world.scenario import Scenario
@@ -47,7 +47,7 @@ def test_a_hidden_danger_with_a_radio_is_known_by_its_beacons(settings: str) -> 
             [node] = [node for node in graph.nodes if node.id == danger]
             assert (node.sensors, node.indicator, danger in graph.seen) == (BY_BEACON, None, False)
         ego, [node] = state.ego, [n for n in graph_of(scenario, state).nodes if n.id == danger]
-        at = known(state, str(danger), ego.id)
+        at = state_by_beacon(state, str(danger), ego.id)
         assert node.forward_m**2 + node.left_m**2 == pytest.approx(
             (at.x_m - ego.x_m) ** 2 + (at.y_m - ego.y_m) ** 2, rel=0.01
         )

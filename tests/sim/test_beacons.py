@@ -16,7 +16,7 @@ from together import act_together
 from harness.core.errors import UserError
 from harness.dataset.freeze import record_of
 from harness.world import scenarios
-from harness.world.beacons import broadcast, known, last_heard
+from harness.world.beacons import broadcast, last_heard, state_by_beacon
 from harness.world.perception.graph import scene_graph
 from harness.world.state import Beacon, Snapshot, WorldState
 from harness.world.world import World
@@ -48,7 +48,7 @@ def test_who_drives_on_at_constant_speed_is_where_the_last_beacon_says():
     for _ in range(3):
         state = world.state()
         for sender, receiver in (("v1", "v2"), ("v1", "v4"), ("v2", "v1"), ("v3", "v1")):
-            there, truth = known(state, sender, receiver), state.vehicle(sender)
+            there, truth = state_by_beacon(state, sender, receiver), state.vehicle(sender)
             assert (there.x_m, there.y_m) == pytest.approx((truth.x_m, truth.y_m), abs=0.03)
             assert there.speed_mps == pytest.approx(truth.speed_mps, abs=0.005)
         world.act("IDLE")
@@ -63,14 +63,14 @@ def test_who_brakes_is_taken_to_drive_on_until_the_next_beacon():
     world.advance(25)
     state = world.state()
     for helper in HELPERS:
-        there, beacon = known(state, "v1", helper), last_heard(state, "v1", helper)
+        there, beacon = state_by_beacon(state, "v1", helper), last_heard(state, "v1", helper)
         age_s = state.time_s - beacon.time_s
         assert 0.02 - 1e-9 <= age_s <= 0.12
         assert there.speed_mps > state.ego.speed_mps
         assert there.y_m < state.ego.y_m, "farther north"
         assert there.y_m == pytest.approx(beacon.y_m - beacon.speed_mps * age_s, abs=0.02)
         assert beacon.target_speed_mps == 7.0
-    assert known(state, "v1", "v1") == state.ego
+    assert state_by_beacon(state, "v1", "v1") == state.ego
 
 
 def test_a_beacon_is_known_a_frame_after_it_was_sent():
@@ -184,7 +184,7 @@ def test_weights_and_ranges_are_from_the_beacons_that_the_ego_heard():
     record = record_of(world, state, 0, (state.ego, *state.helpers))
     zone = SCENARIO.road().zone_m
     for helper in HELPERS:
-        there, truth = known(state, helper, "v1"), state.vehicle(helper)
+        there, truth = state_by_beacon(state, helper, "v1"), state.vehicle(helper)
         distance_m = math.hypot(there.x_m - zone[0], there.y_m - zone[1])
         range_m = math.hypot(there.x_m - state.ego.x_m, there.y_m - state.ego.y_m)
         assert record.distance_m[helper] == pytest.approx(distance_m, abs=0.001)
@@ -199,7 +199,7 @@ def test_under_perfect_knowledge_nobody_broadcasts_and_everybody_knows_the_truth
     world.act("SLOWER")
     state = world.state()
     assert state.beacons == ()
-    assert known(state, "v1", "v2") == state.ego
+    assert state_by_beacon(state, "v1", "v2") == state.ego
     assert scene_graph(PERFECT, state, "v2").ego.age_s == 0.0
     there = World.start(SCENARIO, 0)
     there.act("SLOWER")
@@ -416,5 +416,5 @@ def test_dials_that_are_as_before_are_not_stated_so_that_what_was_built_stays_as
     assert not {"beacon_rule", "beacon_channel"} & set(stated)
     changed = scenarios.get(f"occluded-intersection:beacon_rule=cam,{RADIO}")
     assert changed.parameters.stated()["beacon_channel"] == "its-g5+density_per_km=120+rate_hz=25"
-    assert scenarios.stated("occluded-intersection", changed.parameters.stated()) == changed
+    assert scenarios.of_manifest("occluded-intersection", changed.parameters.stated()) == changed
     assert "interval_s" not in msgspec.to_builtins(World.start(SCENARIO, 0).state())["beacons"][0]

@@ -200,7 +200,7 @@ def test_buildings_leave_the_road_free_and_stand_one_a_corner(layouts):
 )
 def test_a_parameter_that_a_file_states_has_a_type_and_bounds(stated, said):
     with pytest.raises(UserError) as refused:
-        scenarios.stated(NAME, stated)
+        scenarios.of_manifest(NAME, stated)
     assert said in str(refused.value)
     assert str(refused.value).isprintable()
 
@@ -211,4 +211,4 @@ def test_what_a_scenario_states_is_read_back_as_it_was():
         stated = {
             k: float(v) if type(v) is int else v for k, v in scenario.parameters.stated().items()
         }
-        assert scenarios.stated(name, stated) == scenario
+        assert scenarios.of_manifest(name, stated) == scenario

@@ -72,7 +72,7 @@ class Encounter(Struct, frozen=True):
         return self.place.key
 
     @property
-    def own(self) -> PathKey:
+    def ego_key(self) -> PathKey:
         """Key (approach, route) of the ego's path."""
         return self.ego.approach, self.ego.route
 
@@ -91,12 +91,12 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     poses = []
     for d in detections:
         poses.append((d.x_m, d.y_m, np.nan if d.heading_rad is None else d.heading_rad))
-    x, y, own = np.array(poses).reshape(-1, 3).T
+    x, y, vehicle_heading = np.array(poses).reshape(-1, 3).T
     # (3, n, paths)
     projected = np.stack([path.project_all(x, y) for path in road.paths.values()], axis=-1)
     thing, path = np.nonzero(projected[1] <= ON_PATH_M)
     arc, lateral, heading = projected[:, thing, path]
-    cos = np.cos(own[thing] - heading)
+    cos = np.cos(vehicle_heading[thing] - heading)
     keys = list(road.paths)
     near: list[dict[PathKey, tuple[float, float]]] = [{} for _ in detections]
     best: list[tuple[float, PathKey] | None] = [None] * len(detections)
@@ -119,44 +119,47 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     return [Place(on, fit and fit[1]) for on, fit in zip(near, best, strict=True)]
 
 
-def conflicts(road: Road, all_known: Sequence[Encounter]) -> list[list[Conflict]]:
+def conflicts(road: Road, encounters: Sequence[Encounter]) -> list[list[Conflict]]:
     """Return, for each encounter, the conflicts of its vehicle with the ego's paths."""
-    conflicts_of: list[list[Conflict]] = [[] for _ in all_known]
+    conflicts_of: list[list[Conflict]] = [[] for _ in encounters]
     if road.form == 2:
-        for n, conflict in _along(road, all_known):
+        for n, conflict in _along(road, encounters):
             conflicts_of[n].append(conflict)
-    for n, known in enumerate(all_known):
+    for n, encounter in enumerate(encounters):
         # Who comes on a path of its own through a lane that both share has one place to meet, the
         # crossing.
         if all(conflict.kind == "oncoming" for conflict in conflicts_of[n]):
-            meeting = _meeting(road, known)
+            meeting = _meeting(road, encounter)
             if meeting:
                 conflicts_of[n] = [meeting]
     return conflicts_of
 
 
-def _meeting(road: Road, known: Encounter) -> Conflict | None:
+def _meeting(road: Road, encounter: Encounter) -> Conflict | None:
     """Return the conflict where another's path crosses or merges into the ego's;
     None if one is past it.
     """
-    crossing = road.crossings.get(known.key)
+    crossing = road.crossings.get(encounter.key)
     if crossing is None:
         return None
-    d, ego = known.d, known.ego
+    d, ego = encounter.d, encounter.ego
     length = SIZES_M[d.kind or "car"][0]
-    if road.ways and road.paths[known.own].project(crossing.x_m, crossing.y_m)[1] > ON_PATH_M:
+    if (
+        road.ways
+        and road.paths[encounter.ego_key].project(crossing.x_m, crossing.y_m)[1] > ON_PATH_M
+    ):
         return None  # it meets another of the ego's ways
-    to_go = crossing.other_arc_m - known.place.arc_m
-    ego_to_go = crossing.ego_arc_m - known.ego_arc_m
+    to_go = crossing.other_arc_m - encounter.place.arc_m
+    ego_to_go = crossing.ego_arc_m - encounter.ego_arc_m
     if to_go < -length / 2 - ego.width_m or ego_to_go < -ego.length_m:
         return None
     kind_and_lane = (crossing.kind, "own") if road.form == 2 else ()
     return Conflict(
         d.id,
-        *known.key,
-        known.seat.relative(crossing.x_m, crossing.y_m),
+        *encounter.key,
+        encounter.seat.relative(crossing.x_m, crossing.y_m),
         EgoArrival(tenths(ego_to_go), _time_s(ego_to_go, ego.speed_mps)),
-        known.arrival(to_go, _time_s(to_go, d.speed_mps)),
+        encounter.arrival(to_go, _time_s(to_go, d.speed_mps)),
         *kind_and_lane,
     )
 
@@ -166,28 +169,29 @@ def _time_s(to_go_m: float, speed_mps: float) -> float | None:
     return tenths(to_go_m / speed_mps) if speed_mps > STANDING_MPS else None
 
 
-def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Conflict]]:
+def _along(road: Road, encounters: Sequence[Encounter]) -> Iterator[tuple[int, Conflict]]:
     """Yield the conflicts in a lane that both share or the ego may change to, at present speeds.
 
     Each comes after the number of its vehicle. Of two vehicles in a row only the one behind has a
     distance to go; of two that meet head-on, both have.
     """
     shared = []
-    for n, known in enumerate(all_known):
-        ways = road.beside(known.own).items()
-        shared += [(n, side, key) for side, key in ways if key in known.place.near]
-    apart = _apart(road, [(all_known[n], key) for n, _, key in shared])
-    its_heading = _at(road, [(known.key, known.place.arc_m) for known in all_known])[:, 2]
+    for n, encounter in enumerate(encounters):
+        ways = road.beside(encounter.ego_key).items()
+        shared += [(n, side, key) for side, key in ways if key in encounter.place.near]
+    apart = _apart(road, [(encounters[n], key) for n, _, key in shared])
+    its_arcs = [(encounter.key, encounter.place.arc_m) for encounter in encounters]
+    its_heading = _at(road, its_arcs)[:, 2]
     numbers = [n for n, _, _ in shared]
-    on = np.array([all_known[n].place.near[key] for n, _, key in shared]).reshape(-1, 2)
+    on = np.array([encounters[n].place.near[key] for n, _, key in shared]).reshape(-1, 2)
     cos = np.cos(its_heading[numbers] - on[:, 1]).tolist()
     pairs = []
     for (n, side, key), separate, turned in zip(shared, apart, cos, strict=True):
-        known = all_known[n]
-        gap = known.place.near[key][0] - known.ego_arc_m
+        encounter = encounters[n]
+        gap = encounter.place.near[key][0] - encounter.ego_arc_m
         if (side != "own" and not separate) or abs(turned) < ALIGNED or (turned < 0 and gap < 0):
             continue
-        d, ego_mps = known.d, known.ego.speed_mps
+        d, ego_mps = encounter.d, encounter.ego.speed_mps
         its_mps = d.speed_mps if turned > 0 else -d.speed_mps
         kind: Meeting = "oncoming" if turned < 0 else "ahead" if gap > 0 else "behind"
         if kind == "behind" and d.speed_mps <= STANDING_MPS:
@@ -198,16 +202,16 @@ def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Co
         pairs.append((n, side, key, kind, gap, share, time_s))
     arcs = []
     for n, _, key, _, gap, share, _ in pairs:
-        arcs.append((key, all_known[n].ego_arc_m + max(gap, 0.0) * share))
+        arcs.append((key, encounters[n].ego_arc_m + max(gap, 0.0) * share))
     points = _at(road, arcs).tolist()
     for (n, side, _, kind, gap, share, time_s), (x, y, _) in zip(pairs, points, strict=True):
-        known = all_known[n]
+        encounter = encounters[n]
         conflict = Conflict(
-            known.d.id,
-            *known.key,
-            known.seat.relative(x, y),
+            encounter.d.id,
+            *encounter.key,
+            encounter.seat.relative(x, y),
             EgoArrival(tenths(abs(gap) * share), time_s),
-            known.arrival(abs(gap) * (1 - share), time_s),
+            encounter.arrival(abs(gap) * (1 - share), time_s),
             kind,
             side,
         )
@@ -216,21 +220,22 @@ def _along(road: Road, all_known: Sequence[Encounter]) -> Iterator[tuple[int, Co
 
 def _apart(road: Road, shared: Sequence[tuple[Encounter, PathKey]]) -> list[bool]:
     """Return whether each way is in another lane than the ego's where the vehicle is."""
-    x, y = np.array([(known.d.x_m, known.d.y_m) for known, _ in shared]).reshape(-1, 2).T
-    own = [known.own for known, _ in shared]
-    at = _at(road, list(zip(own, road.project(own, x, y)[0].tolist(), strict=True)))
+    positions = [(encounter.d.x_m, encounter.d.y_m) for encounter, _ in shared]
+    x, y = np.array(positions).reshape(-1, 2).T
+    ego_keys = [encounter.ego_key for encounter, _ in shared]
+    at = _at(road, list(zip(ego_keys, road.project(ego_keys, x, y)[0].tolist(), strict=True)))
     ways = [key for _, key in shared]
     apart: list[bool] = (road.project(ways, at[:, 0], at[:, 1])[1] > ONE_LANE_M).tolist()
     return apart
 
 
-def _at(road: Road, asked: Sequence[tuple[PathKey, float]]) -> Floats:
-    """Return x, y and heading at an arc length of a path, for each that is asked for, (n, 3)."""
-    poses, places = np.empty((len(asked), 3)), defaultdict[PathKey, list[int]](list)
-    for n, (key, _) in enumerate(asked):
+def _at(road: Road, path_arcs: Sequence[tuple[PathKey, float]]) -> Floats:
+    """Return x, y and heading at each of n arc lengths (m) along a path, (n, 3)."""
+    poses, places = np.empty((len(path_arcs), 3)), defaultdict[PathKey, list[int]](list)
+    for n, (key, _) in enumerate(path_arcs):
         places[key].append(n)
     for key, numbers in places.items():
         poses[numbers] = np.stack(
-            road.paths[key].places(np.array([asked[n][1] for n in numbers])), axis=-1
+            road.paths[key].places(np.array([path_arcs[n][1] for n in numbers])), axis=-1
         )
     return poses

@@ -101,8 +101,8 @@ def _perceived(
     for (n, _), d in listed.items():
         detected[n].append(d)
     for (state, viewer), sensed in zip(looks, detected, strict=True):
-        known = {viewer.id, *left_out, *[d.id for d in sensed]}
-        sensed += _announced(scenario, state, viewer, known)
+        known_ids = {viewer.id, *left_out, *[d.id for d in sensed]}
+        sensed += _announced(scenario, state, viewer, known_ids)
     # An undetected vehicle must not reveal itself by what it hides.
     solid = ~around.vehicle | among(around, listed)
     sectors = _sectors(scenario.road(), around, solid)
@@ -110,7 +110,7 @@ def _perceived(
 
 
 def _announced(
-    scenario: Scenario, state: WorldState, viewer: VehicleState, known: Collection[str]
+    scenario: Scenario, state: WorldState, viewer: VehicleState, known_ids: Collection[str]
 ) -> Iterator[Detection]:
     """Yield who else sends beacons, by the last one that the viewer has;
     nobody without a radio has any.
@@ -120,7 +120,7 @@ def _announced(
     """
     for v in state.vehicles:
         sends = v.radio or (scenario.seats is not None and v.part == "helper")
-        if not sends or v.id in known or viewer.part == "other":
+        if not sends or v.id in known_ids or viewer.part == "other":
             continue
         beacon = last_heard(state, v.id, viewer.id)
         if beacon or scenario.parameters.perfect_knowledge:

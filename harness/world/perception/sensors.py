@@ -72,19 +72,19 @@ def reports(
     nearby: list[list[VehicleState]] = []
     for state, viewer in looks:
         nearby.append([v for v in state.vehicles if v.id != viewer.id])
-    known: dict[tuple[int, int], Detection | None] = {}
+    detection_of: dict[tuple[int, int], Detection | None] = {}
 
     def reported(count: Ints) -> dict[tuple[int, int], Detection]:
         """Return what sensors report where so many rays end on each surface, (n,)."""
         enough = around.by_viewer(np.where(around.vehicle, count, 0)) >= LEAST_RAYS
         viewers, places = np.nonzero(enough)
         pairs = list(zip(viewers.tolist(), places.tolist(), strict=True))
-        new = [pair for pair in pairs if pair not in known]
+        new = [pair for pair in pairs if pair not in detection_of]
         seen = detections([(*looks[n], nearby[n][place]) for n, place in new], parameters.light)
-        known.update(zip(new, seen, strict=True))
+        detection_of.update(zip(new, seen, strict=True))
         now = {}
         for pair in pairs:
-            detection = known[pair]
+            detection = detection_of[pair]
             if detection:
                 now[pair] = detection
         return now

@@ -95,18 +95,18 @@ def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
 def _reports(p: Parameters, case: Heard) -> list[Report]:
     """Return one report of each object but the ego, the most precise."""
     ego = case.state.ego
-    own = [_reported(p, ego, node, exact=True) for node in case.own.nodes]
+    ego_reports = [_reported(p, ego, node, exact=True) for node in case.own.nodes]
     accepted = [_itself(p, ego, exact=True)]
-    senders = [own]
+    senders = [ego_reports]
     for graph in case.helpers:
-        sender = stated(p, case.source or case.state, graph.viewer)
+        sender = state_in_message(p, case.source or case.state, graph.viewer)
         senders.append([_itself(p, sender), *(_reported(p, sender, node) for node in graph.sensed)])
     for reports in senders:
         accepted = _joined(accepted, reports)
     return accepted[1:]
 
 
-def stated(p: Parameters, state: WorldState, sender: str) -> VehicleState:
+def state_in_message(p: Parameters, state: WorldState, sender: str) -> VehicleState:
     """Return a helper's state as its message gives it, with the errors of a beacon.
 
     The true state under perfect knowledge.

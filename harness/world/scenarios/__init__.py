@@ -127,11 +127,11 @@ def _of_suites(scenario: Scenario) -> dict[str, object]:
     return {key: getattr(scenario.parameters, key) for key in SCENES}
 
 
-def _spelled(scenario: Scenario, stated: Collection[str]) -> str:
-    """Return a scenario's name with those of its settings that are `stated`."""
+def _spelled(scenario: Scenario, stated_dials: Collection[str]) -> str:
+    """Return a scenario's name with those of its settings that are in `stated_dials`."""
     settings = []
     for dial in scenario.dials:
-        if dial in stated:
+        if dial in stated_dials:
             value = getattr(scenario.parameters, dial)
             text = value if isinstance(value, str) else canonical_json(value)
             settings.append(f"{dial}={text}")
@@ -143,15 +143,15 @@ def _spelled(scenario: Scenario, stated: Collection[str]) -> str:
 def _setting(scenario: Scenario, text: str) -> tuple[str, object]:
     """Read a setting such as `ambient=fog`. Raises UserError if it is unknown or not allowed."""
     key, _, value = text.partition("=")
-    shown = printable(scenario.name)
+    scenario_name = printable(scenario.name)
     if key not in scenario.dials:
-        example = f"; as in {shown}:perfect_knowledge=true"
-        raise unknown(f"setting of scenario {shown}", key, scenario.dials, example)
+        example = f"; as in {scenario_name}:perfect_knowledge=true"
+        raise unknown(f"setting of scenario {scenario_name}", key, scenario.dials, example)
     usual = getattr(scenario.parameters, key)
     setting = value_of(usual, value)
     if isinstance(setting, str) and not isinstance(usual, str):
         allowed = "true or false" if isinstance(usual, bool) else "a number"
-        raise UserError(f"scenario {shown}: {key} is {printable(value)!r}; give {allowed}")
+        raise UserError(f"scenario {scenario_name}: {key} is {printable(value)!r}; give {allowed}")
     return key, setting
 
 
@@ -171,7 +171,7 @@ def is_here(name: str) -> bool:
     return name in _files()
 
 
-def stated(name: str, parameters: Mapping[str, Any]) -> Scenario:
+def of_manifest(name: str, parameters: Mapping[str, Any]) -> Scenario:
     """Return the scenario `name` with the parameters that a dataset's or run's manifest states.
 
     Parameters that were added later and are not stated take the value of the earlier behaviour.

@@ -136,12 +136,12 @@ def seats() -> dict[PathKey, Seat]:
 
 
 def _seat(arm: int) -> Seat:
-    its = partial(road, arm, 2)
+    seat_road = partial(road, arm, 2)
     names = {
         (seen_from(0, other), route): (seen_from(arm, other), route)
         for other, route in product(range(len(APPROACHES)), ROUTES)
     }
-    return Seat(replace(SCENARIO, road=its, cleared=partial(cleared, arm)), names)
+    return Seat(replace(SCENARIO, road=seat_road, cleared=partial(cleared, arm)), names)
 
 
 SCENARIO = Scenario(

@@ -115,24 +115,26 @@ def layout(seed: int, parameters: Parameters) -> Layout:
 def _draft(draws: Draws, p: Parameters) -> Draft:
     """Draw where everybody starts, with a danger or without."""
 
-    def own(id_: str, kind: Kind, part: Any, arc_m: float, speed_mps: float = p.speed_mps) -> Spawn:
+    def own_lane_spawn(
+        id_: str, kind: Kind, part: Any, arc_m: float, speed_mps: float = p.speed_mps
+    ) -> Spawn:
         return Spawn(id_, kind, part, "own", OWN, arc_m, speed_mps)
 
     ego = -BEGIN_M - draws.between("ego_start", p.ego_start_m)
     truck = ego + (CAR + TRUCK) / 2 + draws.between("gap", p.gap_m)
     leader = truck + (CAR + TRUCK) / 2 + draws.between("leader", p.leader_m)
     leader_mps = draws.between("leader_mps", p.leader_mps)
-    itself = own("v1", "car", "ego", ego)
+    itself = own_lane_spawn("v1", "car", "ego", ego)
     if draws.seats:
         second = leader + draws.between("second", SECOND_M)
-        last = own("v4", "car", "helper", second, leader_mps)
+        last = own_lane_spawn("v4", "car", "helper", second, leader_mps)
     else:
         follower = ego - CAR - draws.between("follower", p.follower_m)
-        last = own("v4", "car", "helper", follower)
+        last = own_lane_spawn("v4", "car", "helper", follower)
     spawns = [
         itself,
-        own("v2", "truck", "helper", truck),
-        own("v3", "car", "helper", leader, leader_mps),
+        own_lane_spawn("v2", "truck", "helper", truck),
+        own_lane_spawn("v3", "car", "helper", leader, leader_mps),
         last,
     ]
 

@@ -115,7 +115,9 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
     car, van = SIZES_M["car"][0], SIZES_M["van"][0]
     ego = ZONE_M - BEGIN_M - draws.between("ego_start", p.ego_start_m)
     before = ego + (car + van) / 2 + p.speed_mps * draws.between("headway", p.headway_s)
-    lead = before + (car + van) / 2 + p.speed_mps * draws.between("lead_headway", p.lead_headway_s)
+    leader = (
+        before + (car + van) / 2 + p.speed_mps * draws.between("lead_headway", p.lead_headway_s)
+    )
     danger = draws.share("danger") < p.danger_share
     slows = draws.share("slow") < p.slow_share
     brakes = draws.between("brakes_at", p.brakes_at_s), draws.between("brakes", p.brakes_mps2)
@@ -129,7 +131,7 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
         spawn("v2", "van", "helper", RIGHT, before),
         spawn("v3", "car", "helper", LEFT, beside),
         spawn("v4", "car", "helper", LEFT, front),
-        spawn("v5", "car", "other", RIGHT, lead, *(brakes if danger else ())),
+        spawn("v5", "car", "other", RIGHT, leader, *(brakes if danger else ())),
         spawn("v6", "car", "other", LEFT, slow, *(eases if slows else ())),
     ]
     made = Layout.arranged(spawns, "ahead" if danger else None, "v5")

@@ -95,13 +95,18 @@ def network() -> Any:
 def road() -> Road:
     """Return the street as a `Road`; its conflict zone is where the ego enters the lane."""
     ego, behind = ("own", "pull-out"), ("behind", "straight")
-    own = [("space", "pull", 0), ("pull", "swing", 0), ("swing", "out", 0), ("out", "east", 0)]
+    ego_lanes = [
+        ("space", "pull", 0),
+        ("pull", "swing", 0),
+        ("swing", "out", 0),
+        ("out", "east", 0),
+    ]
     ways = {
-        behind: ([("west", "out", 0), own[-1]], ["lane behind", "lane ahead"], 1),
+        behind: ([("west", "out", 0), ego_lanes[-1]], ["lane behind", "lane ahead"], 1),
         ("oncoming", "straight"): ([("east", "west", 0)], ["oncoming lane"], 1),
         ("kerb", "parked"): ([("kerb", "end", 0)], ["kerb"], 0),
         ("opposite", "parked"): ([("opposite", "far", 0)], ["opposite kerb"], 0),
-        ego: (own, ["own space", "pull-out", "pull-out", "lane ahead"], 0),
+        ego: (ego_lanes, ["own space", "pull-out", "pull-out", "lane ahead"], 0),
     }
     paths = paths_along(network(), ways)
     at = crossings(paths, ego)[behind]

@@ -80,32 +80,32 @@ class Parameters(Shared):
     hedge_half_m: float = 0.8  # half its width; the splitter islands are 2 m wide
 
 
-def key_of(begin: str, leaves: int, own: str = EGO) -> PathKey:
-    """Return the path key (approach, route), as an agent from arm `own` names it.
+def key_of(begin: str, leaves: int, home: str = EGO) -> PathKey:
+    """Return the path key (approach, route), as an agent from arm `home` names it.
 
     The path enters at the arm `begin` (`s`, `e`, `n` or `w`) and leaves `leaves` arms farther on.
     """
-    approach = name_of(begin, own)
+    approach = name_of(begin, home)
     return approach, ROUTES[approach, leaves]
 
 
 @cache
-def road(own: str = EGO) -> Road:
+def road(home: str = EGO) -> Road:
     """Return the roundabout as a `Road` for an agent from an arm (`s`, `e`, `n` or `w`).
 
     The conflict zone is where the agent's path joins the ring.
     """
-    ego = key_of(own, 2, own)
-    arms = {name_of(arm, own): arm for arm in ARMS}
+    ego = key_of(home, 2, home)
+    arms = {name_of(arm, home): arm for arm in ARMS}
     paths = {}
     for (approach, leaves), route in ROUTES.items():
         begin = arms[approach]
         end = ARMS[(ARMS.index(begin) + leaves) % len(ARMS)]
-        path = PLACE.path(approach, route, begin, end, PRIORITY[approach], own)
+        path = PLACE.path(approach, route, begin, end, PRIORITY[approach], home)
         paths[approach, route] = path
     meetings = crossings(paths, ego)
     at, ego_path = meetings["left", "straight"], paths[ego]
-    beyond_goal = cleared(own, ego_path.points[:, None], np.array(ego[0]), None)
+    beyond_goal = cleared(home, ego_path.points[:, None], np.array(ego[0]), None)
     goal_m = float(ego_path.arc_m[beyond_goal.argmax()])
     back_m = np.linspace(*SECTOR_REACH_M, 13)
     sectors = {}
@@ -128,11 +128,11 @@ def road(own: str = EGO) -> Road:
     )
 
 
-def cleared(own: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
+def cleared(home: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
     """Return whether an agent from an arm has left the ring,
     past the next entry and who enters there.
     """
-    turned_rad, edge_m = math.pi / 2 * ARMS.index(own), PLACE.ring_m + LANE_WIDTH_M / 2
+    turned_rad, edge_m = math.pi / 2 * ARMS.index(home), PLACE.ring_m + LANE_WIDTH_M / 2
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
     at_rad = (np.arctan2(y, x) + turned_rad + math.pi) % (2 * math.pi) - math.pi
     beyond = (-math.pi / 2 < at_rad) & (at_rad < PLACE.ring_rad(3))

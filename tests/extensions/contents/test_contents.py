@@ -41,7 +41,7 @@ from harness.radio.channel import Draws
 from harness.runs import folder
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, truth_graph
-from harness.world.perception.shared import NOBODY, Heard, merged, stated
+from harness.world.perception.shared import NOBODY, Heard, merged, state_in_message
 from harness.world.scene_graph import SceneGraph
 from harness.world.state import Part, VehicleState, WorldState
 
@@ -171,12 +171,12 @@ def test_a_message_says_where_its_sender_is_with_the_errors_of_a_beacon(small: D
     apart = [
         (said.x_m - true.x_m, said.y_m - true.y_m)
         for scene in all_scenes(small) for viewer in scene.viewers[1:]
-        for said, true in [(stated(p, scene.state, viewer), scene.state.vehicle(viewer))]
+        for said, true in [(state_in_message(p, scene.state, viewer), scene.state.vehicle(viewer))]
     ]  # fmt: skip
     assert np.std(apart) == pytest.approx(p.beacon_noise_m, rel=0.4)
     exact = replace(p, perfect_knowledge=True)
     scene = all_scenes(small)[0]
-    assert stated(exact, scene.state, "v2") == scene.state.vehicle("v2")
+    assert state_in_message(exact, scene.state, "v2") == scene.state.vehicle("v2")
 
 
 # Who is heard, and when
@@ -396,7 +396,9 @@ def test_shuffled_objects_are_those_of_another_layout_where_they_are_there(pair:
         assert request.view is not None
         assert "v1" not in request.view.seen
         for sender, graph in zip(senders, there, strict=True):
-            place = stated(pair.scenario.parameters, source.state, sender.partition("!")[0])
+            place = state_in_message(
+                pair.scenario.parameters, source.state, sender.partition("!")[0]
+            )
             new = {*request.view.nodes} - {*own.nodes}
             assert place.id in {node.id for node in new} or place.id in own.seen
             assert {node.id for node in new} <= {v.id for v in source.state.vehicles} | {
