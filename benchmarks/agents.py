@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pages import harness, markdown, options, write_tables
 
-from harness.core.figures import DASH, shown
+from harness.core.figures import DASH, interval_of
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST
 from harness.core.statistics import paired_difference, rate_interval
@@ -160,7 +160,7 @@ def overall(
         rows.setdefault((each.scene, each.driver.model), layouts).update(success)
     ways = ("n", *ALONE, *CONDITIONS)
     best = {
-        scene: shown(rate_interval(np.array([*plan.values()], dtype=float))) + ended[scene]
+        scene: interval_of(rate_interval(np.array([*plan.values()], dtype=float))) + ended[scene]
         if plan
         else DASH
         for scene, plan in plans.items()
@@ -246,7 +246,7 @@ def estimate(run: Run, condition: str, metric: str) -> str:
     """Return an estimate over episodes with its interval."""
     for score in run.scores:
         if (score.condition, score.metric, score.interval) == (condition, metric, "episodes"):
-            return shown(score.estimate, METRICS[metric].unit)
+            return interval_of(score.estimate, METRICS[metric].unit)
     return DASH
 
 
@@ -264,7 +264,9 @@ def more(own: Mapping[int, float], other: Mapping[int, float]) -> str:
     pair = np.array(
         [(own[layout], other[layout]) for layout in own if layout in other], dtype=float
     )
-    return shown(paired_difference([pair[:, 0] - pair[:, 1]]), sign="+") if len(pair) else DASH
+    return (
+        interval_of(paired_difference([pair[:, 0] - pair[:, 1]]), sign="+") if len(pair) else DASH
+    )
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from families import Families, Row
 from pages import markdown, options, write_tables
 
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.core.statistics import Estimate
 from harness.runs.metrics import ALL, BALANCED, BASELINE, GAINS
 
@@ -72,7 +72,7 @@ def written(asked: Row, found: Mapping[str, Families]) -> Iterator[list[str]]:
             runs.shown(BASELINE, BALANCED),
             runs.shown("6g", BALANCED),
             runs.shown("6g", GAINS[BALANCED], "+"),
-            shown(beside, sign="+") if beside else "",
+            interval_of(beside, sign="+") if beside else "",
             runs.shown(ALL, "failed_rate_ego"),
             runs.shown(ALL, "label_mass_ego"),
         ]

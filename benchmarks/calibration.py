@@ -19,7 +19,7 @@ from typing import NamedTuple, get_args
 from pages import harness, markdown, options, write_tables
 
 from harness.core.arrays import Floats
-from harness.core.figures import PERCENT, POINTS, Unit, shown
+from harness.core.figures import PERCENT, POINTS, Unit, interval_of
 from harness.core.resources import MARKER
 from harness.core.statistics import Estimate
 from harness.extensions.calibration.calibrations import FOLDER, Level
@@ -171,7 +171,7 @@ def probabilities(runs: Sequence[tuple[Row, Run]]) -> str:
         of_condition = dict(zip(run.conditions, judged, strict=True))
         for words, condition in variants(row, ALONE):
             scores = [run.score(condition, name) for name in HONEST]
-            texts = [shown(s, entry(s.metric).unit) if s else "–" for s in scores]
+            texts = [interval_of(s, entry(s.metric).unit) if s else "–" for s in scores]
             *_, change = reliability.difference(
                 of_condition[ALONE],
                 of_condition[condition],
@@ -180,7 +180,12 @@ def probabilities(runs: Sequence[tuple[Row, Run]]) -> str:
             )
             texts.insert(ECE, str(len(of_condition[condition].sure)))
             rows.append(
-                [row.name, words, *texts, "–" if condition == ALONE else shown(change, POINTS)]
+                [
+                    row.name,
+                    words,
+                    *texts,
+                    "–" if condition == ALONE else interval_of(change, POINTS),
+                ]
             )
     head = (
         "alone",
@@ -205,12 +210,20 @@ def cooperation(runs: Sequence[tuple[Row, Run]]) -> str:
         for words, condition in variants(row, HELPED):
             scores = [run.score(condition, name) for name in COSTS]
             scores.append(run.score(condition.replace(HELPED, ALONE, 1), BALANCED))
-            texts = [shown(s, unit) if s else "–" for s, unit in zip(scores, UNITS, strict=True)]
+            texts = [
+                interval_of(s, unit) if s else "–" for s, unit in zip(scores, UNITS, strict=True)
+            ]
             places = run.conditions.index(condition), run.conditions.index(HELPED)
             change = changed(values, places)
             n = str(len(run.grid.episodes))
             rows.append(
-                [row.name, words, n, *texts, "–" if condition == HELPED else shown(change, POINTS)]
+                [
+                    row.name,
+                    words,
+                    n,
+                    *texts,
+                    "–" if condition == HELPED else interval_of(change, POINTS),
+                ]
             )
     head = (
         HELPED,

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.core.seeds import FIRST, stated
+from harness.core.seeds import FIRST, seeds_text
 from harness.core.statistics import rate_interval
 from harness.world import lockstep, reference, scenarios
 from harness.world.drivers import ALWAYS, PRIVILEGED
@@ -72,8 +72,8 @@ def main() -> None:
     given = arguments.parse_args()
     layouts, scenes = given.layouts, given.scenes
     print(
-        f"harmless layouts of {layouts} each, {stated(FIRST['tune'], layouts)}, {scenes}; seconds "
-        "later"
+        f"harmless layouts of {layouts} each, {seeds_text(FIRST['tune'], layouts)}, {scenes}; "
+        "seconds later"
     )
     print(f"{'scenario':22} decision    n   0 %    5 %   50 %  100 %   late, % [95 % interval]")
     for name in given.scenarios:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from harness.core.arrays import Bools
-from harness.core.seeds import FIRST, stated
+from harness.core.seeds import FIRST, seeds_text
 from harness.core.statistics import mean_of, rate_interval
 from harness.world import reference, scenarios
 from harness.world.drivers import CONSTANTS, PRIVILEGED
@@ -97,7 +97,9 @@ def main() -> None:
     arguments.add_argument("--scenarios", nargs="+", default=ALL)
     given = arguments.parse_args()
     layouts = given.layouts
-    print(f"success % [95 % interval] of {layouts} layouts each, {stated(FIRST['tune'], layouts)}")
+    print(
+        f"success % [95 % interval] of {layouts} layouts each, {seeds_text(FIRST['tune'], layouts)}"
+    )
     print(f"{'scenario':22} limits  action   of all, balanced over dangerous and harmless, of each")
     names = [(limits, name) for limits in VERSIONS for name in given.scenarios]
     rows = [row for limits, name in names for row in measured(name, limits, layouts)]

@@ -23,7 +23,7 @@ from markupsafe import Markup
 from pages import harness, markdown, options, write_tables
 
 from harness.core.arrays import Floats
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.core.progress import Progress
 from harness.dataset import suites
 from harness.dataset.load import find, load
@@ -163,10 +163,10 @@ def written(row: Row, study: Study, driven: Mapping[str, Outcome]) -> str:
         cells = [
             (
                 *cells,
-                shown(driven[cells[0]].success),
+                interval_of(driven[cells[0]].success),
                 ""
                 if cells[0] == "intent"
-                else shown(driven[cells[0]].over(driven["intent"]), sign="+"),
+                else interval_of(driven[cells[0]].over(driven["intent"]), sign="+"),
             )
             for cells in first.rows
         ]

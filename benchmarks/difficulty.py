@@ -27,7 +27,7 @@ import pages
 
 from harness.core import covariate
 from harness.core.arrays import Floats, Ints
-from harness.core.figures import Unit, as_mapping, known, shown
+from harness.core.figures import Unit, as_mapping, interval_of, number_or_none
 from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.dataset.load import find, load
 from harness.runs.difficulty import REFERENCES, Pool
@@ -115,7 +115,7 @@ def measure(figure: Figure, answered: int, studies: int, rng: np.random.Generato
         held += [e.low - 1e-9 <= truth <= e.high + 1e-9 for e in (better, plain)]
         widths.append((better.high - better.low) / (plain.high - plain.low))
     corrected, plain_held = (held / studies).tolist()
-    return Coverage(answered, corrected, plain_held, known(float(np.median(widths))))
+    return Coverage(answered, corrected, plain_held, number_or_none(float(np.median(widths))))
 
 
 def figures(model: str, layouts: int, folder: Path) -> Iterator[Figure]:
@@ -176,9 +176,9 @@ def main() -> None:
                 ratio = resampled_estimate(ratios, given.layouts)
                 strata = figure.by_kind.ratio(np.arange(given.layouts))
                 coverage = [measure(figure, n, given.studies, rng) for n in given.answered]
-                cells.append(Cell(figure.name, as_mapping(ratio), known(strata), coverage))
+                cells.append(Cell(figure.name, as_mapping(ratio), number_or_none(strata), coverage))
                 held = "".join(f"{100 * c.corrected:>8.1f}{100 * c.plain:>7.1f}" for c in coverage)
-                ratios_shown = f"{shown(ratio, RATIO):>20}{RATIO.number(strata):>8}"
+                ratios_shown = f"{interval_of(ratio, RATIO):>20}{RATIO.number(strata):>8}"
                 width = RATIO.number(coverage[-1].width)
                 print(f"{figure.name:<36}{ratios_shown}{width:>7}{held}", flush=True)
     print(json.dumps({"studies": given.studies, "cells": [asdict(cell) for cell in cells]}))

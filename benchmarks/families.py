@@ -7,7 +7,7 @@ from typing import NamedTuple
 from pages import harness
 
 from harness.core.arrays import Floats
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.core.statistics import Estimate, known_mean, mean_of, paired_difference
 from harness.runs import folder, suite
 from harness.runs.folder import Run
@@ -87,7 +87,7 @@ class Families(NamedTuple):
     def shown(self, condition: str, metric: str, sign: str = "") -> str:
         """Return the same in percent with its interval; empty if a family has no value."""
         estimate = self.estimate(condition, metric)
-        return shown(estimate, sign=sign) if estimate else ""
+        return interval_of(estimate, sign=sign) if estimate else ""
 
     def over(self, other: "Families", condition: str) -> Estimate:
         """Return balanced success less that of other runs in the same condition,

@@ -16,7 +16,7 @@ import numpy as np
 from constants import scenario_of, write
 
 from harness.core.arrays import Floats, Ints
-from harness.core.seeds import FIRST, stated
+from harness.core.seeds import FIRST, seeds_text
 from harness.dataset.build import build
 from harness.dataset.forest import Forest
 from harness.dataset.load import load
@@ -102,8 +102,8 @@ def main() -> None:
     arguments.add_argument("--scenarios", nargs="+", default=[name for name, _ in SEARCHED])
     given = arguments.parse_args()
     print(
-        f"{stated(FIRST['tune'], given.layouts)}; cleared, layouts, cleared without a danger, of "
-        "these"
+        f"{seeds_text(FIRST['tune'], given.layouts)}; cleared, layouts, cleared without a danger, "
+        "of these"
     )
     searched = [each for each in SEARCHED if each[0] in given.scenarios]
     rows = [measured(name, limits, given.layouts) for name, limits in searched]

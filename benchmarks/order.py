@@ -16,7 +16,7 @@ from families import Families, Row
 from pages import markdown, options, write_tables
 
 from harness.core.arrays import Floats
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.runs.metrics import BASELINE
 from harness.runs.success import by_condition
 
@@ -94,7 +94,7 @@ def difference(entries: Mapping[str, Families], pair: Sequence[str], without: st
         Families({family: run for family, run in entries[name].runs.items() if family != without})
         for name in pair
     )
-    return shown(upper.over(lower, CONDITION), sign="+")
+    return interval_of(upper.over(lower, CONDITION), sign="+")
 
 
 def least(entries: Mapping[str, Families], upper: str, lower: str) -> tuple[str, str]:

@@ -22,7 +22,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 from pages import harness, options, write_tables
 
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.extensions.checkups.prompt import ROLES, Answers, described
 from harness.prompts import versions as prompts
 from harness.report.drawing.colours import CONDITIONS, GREY
@@ -146,7 +146,7 @@ def percent(score: Score | None) -> str:
     """A score in percent over its interval."""
     if score is None:
         return "–"
-    return shown(score).replace(" [", "<br>[").replace(", ", ",&nbsp;")
+    return interval_of(score).replace(" [", "<br>[").replace(", ", ",&nbsp;")
 
 
 def answers(runs: dict[Row, Run], said: dict[Row, list[Answers]]) -> str:

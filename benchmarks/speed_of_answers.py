@@ -24,7 +24,7 @@ from families import Families, Row
 from matplotlib.figure import Figure
 from pages import harness, markdown, write_tables
 
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.dataset.load import find, load
 from harness.report.drawing.colours import GREY, MARKERS, conditions
 from harness.report.drawing.pictures import save, styled
@@ -120,7 +120,7 @@ def written(name: str, timed: Mapping[int, Families]) -> str:
     rows = [[f"{ms}", at.shown(BASELINE, BALANCED), *over[ms]] for ms, at in timed.items()]
     every = (BASELINE, *ASKING)
     faster = [
-        [f"{ms}", *(shown(at.over(first, c), sign="+") for c in every)]
+        [f"{ms}", *(interval_of(at.over(first, c), sign="+") for c in every)]
         for ms, at in timed.items()
         if at is not first
     ]

@@ -15,7 +15,7 @@ from run_on_disk import Row, made_up
 from tiers import some
 
 from harness.coordination.operating_point import POINTS
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.core.statistics import mean_of, paired_difference, rate_interval
 from harness.dataset.load import Dataset, load
 from harness.evaluate.live_world import LiveSource
@@ -218,7 +218,7 @@ def test_the_headline_has_what_cooperation_does_where_there_is_a_danger_and_wher
     done = read(made_up(tmp_path / "run", episode=end, episodes=40))
     pairs = plays([done], BALANCED).pairs("6g", "single-local")
     danger, price = (
-        shown(half_difference(pairs, dangerous), sign="+") for dangerous in (True, False)
+        interval_of(half_difference(pairs, dangerous), sign="+") for dangerous in (True, False)
     )
     assert danger.startswith("+60.0 [")
     assert price.startswith("-10.0 [")

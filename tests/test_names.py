@@ -12,7 +12,7 @@ from harness.backends.base import Completion, Request, failed
 from harness.core import resources
 from harness.core.errors import UserError, unknown
 from harness.core.files import making, write_whole
-from harness.core.work import WorkStart, begun
+from harness.core.work import WorkStart, start_of
 from harness.dataset.load import find
 from harness.runs import settings
 from harness.runs.folder import read
@@ -37,7 +37,7 @@ def test_a_name_that_nothing_can_show_is_refused_where_it_is_read_and_where_it_i
     for refused in (
         lambda: resources.find("models", f"{name}.toml"),
         lambda: find(name),
-        lambda: begun(tmp_path / name, WorkStart),
+        lambda: start_of(tmp_path / name, WorkStart),
         lambda: read(tmp_path / name),
         lambda: runs(tmp_path / name),
         lambda: settings.read(tmp_path / name, FrozenSettings, {}),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reference import pages
 
 from harness.core.errors import UserError
-from harness.core.seeds import purpose, stated
+from harness.core.seeds import purpose, seeds_text
 from harness.dataset import suites
 
 ROOT = Path(__file__).parent.parent
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parent.parent
 )
 def test_a_range_of_layouts_is_for_one_purpose(first: int, count: int, whose: str) -> None:
     assert purpose(first, count) == whose
-    assert stated(first, count) == f"layout seeds {first} to {first + count - 1} ({whose})"
+    assert seeds_text(first, count) == f"layout seeds {first} to {first + count - 1} ({whose})"
 
 
 def test_a_range_across_a_border_is_refused_with_the_borders() -> None:
@@ -40,7 +40,7 @@ def test_a_range_across_a_border_is_refused_with_the_borders() -> None:
         "layout seeds 99990 to 100009 are for tune and train; keep to one of 0 to 99999 (tune), "
         "100000 to 199999 (train), 200000 and above (report)"
     )
-    assert stated(99_990, 200_000) == "layout seeds 99990 to 299989 (tune and train and report)"
+    assert seeds_text(99_990, 200_000) == "layout seeds 99990 to 299989 (tune and train and report)"
 
 
 @given(st.integers(0, 400_000), st.integers(1, 300_000))

@@ -83,7 +83,7 @@ def test_an_error_before_anything_is_done_leaves_nothing_and_one_after_keeps_it(
         with pytest.raises(UserError, match="the engine died"), work.working(out, BEGUN) as place:
             fail(place / "answers.jsonl" if done else None)
         assert out.parent.exists() == done
-    assert work.begun(out, work.WorkStart) == BEGUN
+    assert work.start_of(out, work.WorkStart) == BEGUN
     with work.working(out, BEGUN) as place:
         assert (place / "answers.jsonl").read_text() == "128 answers"
 
@@ -127,7 +127,7 @@ def test_a_damaged_beginning_is_one_line(text: str, tmp_path: Path) -> None:
     with pytest.raises(
         UserError, match=r"config\.json is damaged .*; delete .* and start again"
     ) as raised:
-        work.begun(tmp_path, work.WorkStart)
+        work.start_of(tmp_path, work.WorkStart)
     assert str(raised.value).isprintable()
 
 

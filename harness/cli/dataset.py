@@ -16,7 +16,7 @@ from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import dataset_size, shown
+from harness.core.figures import dataset_size, interval_of
 
 if TYPE_CHECKING:
     from harness.core.statistics import Estimate
@@ -255,7 +255,7 @@ def _table(episodes: int, standings: dict[str, dict[str, "Estimate"]]) -> None:
     for driver, standing in standings.items():
         estimates = (standing["frozen"], standing["closed"], standing["difference"])
         same = f"{100 * standing['agreement'].value:.0f}"
-        rows.append((driver, *(shown(estimate) for estimate in estimates), same))
+        rows.append((driver, *(interval_of(estimate) for estimate in estimates), same))
     table(heads, rows)
     text = console()
     text.print(

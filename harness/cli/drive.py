@@ -15,7 +15,7 @@ from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import crossed
 from harness.core.plugins import Plugins
-from harness.core.seeds import stated
+from harness.core.seeds import seeds_text
 from harness.runs.settings import OUTPUT, DriveSettings, Settings, changed
 
 if TYPE_CHECKING:
@@ -198,7 +198,8 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
     drawn_from = world.selection.get("of")
     notes = (
         f"n = {crossed(world.episodes, len(done.manifest.seeds))}; "
-        f"{'of ' if drawn_from else ''}{stated(world.first_seed, drawn_from or world.episodes)};\n"
+        f"{'of ' if drawn_from else ''}"
+        f"{seeds_text(world.first_seed, drawn_from or world.episodes)};\n"
         "95 % intervals over episodes; missed: decisions longer than the decision window;\n"
         "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"
         "it did; both are means over episodes",

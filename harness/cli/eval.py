@@ -13,7 +13,7 @@ from harness.cli.run import Column, as_mapping, default_out, evaluate, show, wal
 from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.figures import crossed
-from harness.core.seeds import stated
+from harness.core.seeds import seeds_text
 from harness.runs import leading
 from harness.runs.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 
@@ -155,7 +155,7 @@ def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool) -> 
     has_gain = any(score.metric == gain.metric for score in done.scores)
     columns = (SUCCESS, gain, *COLUMNS) if has_gain else (SUCCESS, *COLUMNS)
     episodes = dataset.manifest.episodes if selected else len(dataset.episodes)
-    layout_seeds = stated(dataset.manifest.seed, episodes)
+    layout_seeds = seeds_text(dataset.manifest.seed, episodes)
     notes = [
         f"n = {crossed(len(dataset.episodes), seeds)}; {'of ' * selected}{layout_seeds};",
         "95 % intervals over episodes; msgs: per episode"

@@ -11,8 +11,8 @@ from harness.cli.progress import bar
 from harness.cli.terminal import attributes, console, echo_each, echo_fields, echo_json, table
 from harness.core import resources
 from harness.core.errors import in_range, printable
-from harness.core.figures import Unit, shown
-from harness.core.seeds import purpose, stated
+from harness.core.figures import Unit, interval_of
+from harness.core.seeds import purpose, seeds_text
 
 if TYPE_CHECKING:
     from harness.world.scenario import Scenario
@@ -117,7 +117,7 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     if all("balanced" in rates for rates in outcomes.values()):
         rows = []
         for driver, rates in outcomes.items():
-            rows.append((driver, *(shown(rates[half]) for half in halves)))
+            rows.append((driver, *(interval_of(rates[half]) for half in halves)))
         table(("driver", "balanced success % [95 % CI]", "with a danger", "without"), rows)
         first = next(iter(outcomes.values()))
         episodes_of_each = f"{first['dangerous'].n} and {first['harmless'].n} episodes"
@@ -133,11 +133,11 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     rows = []
     for driver, rates in outcomes.items():
         percent = (f"{100 * rates[k].value:.1f}" for k in ("collision", "late", "time_out"))
-        rows.append((driver, shown(rates["success"]), *percent, str(rates["other_crashes"])))
+        rows.append((driver, interval_of(rates["success"]), *percent, str(rates["other_crashes"])))
     table(heads, rows)
     off_road = sum(round(rates["off_road"].value * episodes) for rates in outcomes.values())
     console().print(
-        f"n = {episodes} episodes, {stated(seed, episodes)};\nWilson intervals; off the road: "
+        f"n = {episodes} episodes, {seeds_text(seed, episodes)};\nWilson intervals; off the road: "
         f"{off_road}"
     )
 
@@ -147,20 +147,20 @@ def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     outcome_rows, time_rows, decision_rows = list[Row](), list[Row](), list[Row]()
     for policy, of in outcomes["policies"].items():
         shares = [f"{100 * of[name].value:.1f}" for name in ("arrived", "met", "stuck")]
-        less = shown(of["less_than_joint"], sign="+")
-        outcome_rows.append((policy, shown(of["success"]), less, *shares))
-        lost_s = [shown(of[name], seconds) for name in ("lost_s", "most_lost_s")]
+        less = interval_of(of["less_than_joint"], sign="+")
+        outcome_rows.append((policy, interval_of(of["success"]), less, *shares))
+        lost_s = [interval_of(of[name], seconds) for name in ("lost_s", "most_lost_s")]
         anarchy = of["anarchy"]
-        time_rows.append((policy, *lost_s, shown(anarchy, ratio), str(anarchy.n)))
-        decisions = [shown(of[name]) for name in ("best_decisions", "gave_away")]
-        decision_rows.append((policy, *decisions, shown(of["regret_s"], seconds)))
+        time_rows.append((policy, *lost_s, interval_of(anarchy, ratio), str(anarchy.n)))
+        decisions = [interval_of(of[name]) for name in ("best_decisions", "gave_away")]
+        decision_rows.append((policy, *decisions, interval_of(of["regret_s"], seconds)))
     success = "success % [95 % CI]"
     table((driver, success, "less than joint", "arrived %", "met %", "stuck %"), outcome_rows)
     table((driver, "lost s, in sum", "lost s, the most", "price of anarchy", "n"), time_rows)
     table((driver, "best decisions %", "arrival given away %", "regret s"), decision_rows)
     text = console()
     text.print(
-        f"n = {episodes} episodes, {stated(seed, episodes)}; times where all arrive;\n"
+        f"n = {episodes} episodes, {seeds_text(seed, episodes)}; times where all arrive;\n"
         "price of anarchy: summed time of trips against joint's, on the n that both clear;\n"
         "regret: of an agent's first decisions, had the others done what they did"
     )

@@ -11,7 +11,7 @@ import typer
 from harness.cli.run import RunGroup, as_mapping, free_folder
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import amount, shown
+from harness.core.figures import amount, interval_of
 from harness.core.formats import SUITE, WORK
 
 if TYPE_CHECKING:
@@ -158,4 +158,4 @@ def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[
 
 
 def _cell(score: "Score | None") -> str:
-    return "-" if score is None else shown(score)
+    return "-" if score is None else interval_of(score)

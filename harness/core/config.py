@@ -121,8 +121,8 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
     The fields `given` are set by the program and may not be in the table. Raises UserError for an
     unknown or missing key, or a value that is not allowed.
     """
-    for path, key, known in _unknown_keys(table, kind, (), given):
-        raise unknown(f"key in {_place(where, path)}", key, known)
+    for path, key, known_keys in _unknown_keys(table, kind, (), given):
+        raise unknown(f"key in {_place(where, path)}", key, known_keys)
     whole = {**table, **given}
     try:
         record = msgspec.convert(whole, kind)
@@ -142,11 +142,11 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
     not allowed.
     """
     hints = get_type_hints(type(record), include_extras=True)
-    known = {name: getattr(record, name) for name in settable(record)}
+    current_values = {name: getattr(record, name) for name in settable(record)}
     for key in settings:
-        if key not in known:
-            raise unknown(f"setting of {where}", key, known)
-    values = {key: value_of(known[key], text) for key, text in settings.items()}
+        if key not in current_values:
+            raise unknown(f"setting of {where}", key, current_values)
+    values = {key: value_of(current_values[key], text) for key, text in settings.items()}
     kind = msgspec.defstruct("Settings", [(key, hints[key]) for key in values])
     convert(values, kind, where)
     try:

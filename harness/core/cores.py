@@ -15,5 +15,5 @@ def threads() -> int:
     on every core, an engine stalls as soon as any other program computes, since its threads wait
     for each other after each layer.
     """
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    return int(asked) if asked.isdigit() and int(asked) else max(1, usable() // 2)
+    setting = os.environ.get("OMP_NUM_THREADS", "")
+    return int(setting) if setting.isdigit() and int(setting) else max(1, usable() // 2)

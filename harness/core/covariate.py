@@ -26,7 +26,12 @@ COLLINEAR = 1e-6
 
 
 def corrected(
-    plain: Estimate, values: Floats, known: Floats, pool: Floats, least: float, level: float = LEVEL
+    plain: Estimate,
+    values: Floats,
+    variables: Floats,
+    pool: Floats,
+    least: float,
+    level: float = LEVEL,
 ) -> Estimate | None:
     """Return the mean of values (E,), corrected by control variates; None if it cannot be.
 
@@ -37,7 +42,7 @@ def corrected(
     Args:
         plain: the uncorrected mean with its interval.
         values: of E layouts, a random part of all, from `least` to 1.
-        known: the variables of these layouts, (E, K).
+        variables: the variables of these layouts, (E, K).
         pool: the variables of all N layouts, these included, (N, K).
         least: the least that a value can be.
         level: of confidence, of the plain interval.
@@ -45,14 +50,14 @@ def corrected(
     from harness.core.special import stdtrit
 
     n, deviations = len(values), values - values.mean()
-    squares, centred = float(deviations @ deviations), known - known.mean(axis=0)
+    squares, centred = float(deviations @ deviations), variables - variables.mean(axis=0)
     left_axes, lengths, axes = np.linalg.svd(centred, full_matrices=False)
     apart = lengths > COLLINEAR * math.sqrt(n)
     if n < LEAST or len(pool) <= n or squares < ROUNDING or not apart.any():
         return None
     axes = axes[apart] / lengths[apart, None]  # in which what is known is uncorrelated, of length 1
     along = deviations @ left_axes[:, apart]
-    ahead, freedom = axes @ (pool - known.mean(axis=0)).T, n - 1 - int(apart.sum())
+    ahead, freedom = axes @ (pool - variables.mean(axis=0)).T, n - 1 - int(apart.sum())
     left = max(squares - float(along @ along), 0.0) / freedom
     error = left * (1 / n + float(np.sum(ahead.mean(axis=1) ** 2)))
     error += float((along @ ahead).var(ddof=1)) / len(pool)

@@ -48,11 +48,11 @@ def printable(text: object, limit: int = 120) -> str:
 
     Control characters are escaped, and a text longer than `limit` characters is cut.
     """
-    escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _said(text))
+    escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _text_of(text))
     return escaped if len(escaped) <= limit else escaped[: limit - 1] + "…"
 
 
-def _said(thing: object) -> str:
+def _text_of(thing: object) -> str:
     """Return the text of a thing, or the name of its type where it has none,
     as a package's error may.
     """
@@ -81,30 +81,30 @@ def sayable(what: str, name: str, repair: str = "rename it") -> str:
 
 def one_line(error: Exception) -> str:
     """Return an error's message on one line of at most 200 characters, safe for a terminal."""
-    return printable(" ".join(_said(error).split()), 200)
+    return printable(" ".join(_text_of(error).split()), 200)
 
 
-def unknown(kind: str, name: str, known: Iterable[str], hint: str = "") -> UserError:
+def unknown(kind: str, name: str, known_names: Iterable[str], hint: str = "") -> UserError:
     """Build the `UserError` for an unknown name; it suggests the nearest known name.
 
     It lists all known names, or the nearest of more than `MOST_LISTED`, or of more than `FEW` if a
     command of `LISTS` prints all. `kind` is what was named, and `hint` is appended.
     """
-    names = sorted(known)
+    names = sorted(known_names)
     nearest = get_close_matches(name, names, n=1)
     suggestion = f"; did you mean {nearest[0]!r}?" if nearest else ";"
     # Of several names that begin so, the nearest is only the shortest.
-    if len(begin := [known for known in names if name and known.startswith(name)]) > 1:
+    if len(begin := [each for each in names if name and each.startswith(name)]) > 1:
         suggestion = f"; did you mean one of {', '.join(map(printable, begin[:MOST_LISTED]))}?"
-    shown = (
+    candidates = (
         names
         if len(names) <= (FEW if kind in LISTS else MOST_LISTED)
         else get_close_matches(name, names, NEAR, cutoff=0)
     )
-    listed = ", ".join(map(printable, shown)) or "(none)"
-    if len(shown) < len(names):
+    listed = ", ".join(map(printable, candidates)) or "(none)"
+    if len(candidates) < len(names):
         all_of = f"; `{LISTS[kind]}` lists all" if kind in LISTS else ""
-        listed += f" and {len(names) - len(shown)} more{all_of}"
+        listed += f" and {len(names) - len(candidates)} more{all_of}"
     return UserError(f"unknown {kind} {printable(name)!r}{suggestion} known: {listed}{hint}")
 
 

@@ -54,8 +54,8 @@ class Unit:
 
     def text(self, value: float | None) -> str:
         """Write a value with the unit's name."""
-        known = value is not None and not math.isnan(value)
-        return f"{self.number(value)} {self.name}" if known and self.name else self.number(value)
+        is_known = value is not None and not math.isnan(value)
+        return f"{self.number(value)} {self.name}" if is_known and self.name else self.number(value)
 
     def interval(
         self,
@@ -82,7 +82,7 @@ class Unit:
 PERCENT, POINTS, PLAIN = Unit("%", 1, 100.0), Unit("points", 1, 100.0), Unit()
 
 
-def shown(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
+def interval_of(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
     """Write a value and its interval as `89.0 [81.4, 93.7]`, without the unit's name."""
     return unit.interval(bounded.value, bounded.low, bounded.high, sign)
 
@@ -113,12 +113,12 @@ def dataset_size(layouts: int, points: int) -> str:
     return f"{amount(layouts, 'layout')}, {amount(points, 'decision point')}"
 
 
-def known(value: float | None) -> float | None:
+def number_or_none(value: float | None) -> float | None:
     """Return a number, or None if it is None or NaN."""
     return None if value is None or math.isnan(value) else value
 
 
 def as_mapping(estimate: Counted) -> dict[str, float | int | None]:
     """Return `value`, `low`, `high` and `n` by name; NaN becomes None."""
-    ends = {end: known(getattr(estimate, end)) for end in ("value", "low", "high")}
+    ends = {end: number_or_none(getattr(estimate, end)) for end in ("value", "low", "high")}
     return {**ends, "n": estimate.n}

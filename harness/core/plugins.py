@@ -107,27 +107,27 @@ def say_once(line: str) -> None:
     print(f"harness: {line}", file=sys.stderr)
 
 
-def texts(said: Any, what: str = "its answer") -> list[str]:
+def texts(answer: Any, what: str = "its answer") -> list[str]:
     """Return texts that a package gave as plain `str`, without its subclasses' code.
 
     Raises TypeError, which begins with `what`, for anything but a list of texts.
     """
-    each = () if isinstance(said, str) else tuple(said)
-    if isinstance(said, str) or not all(isinstance(text, str) for text in each):
+    each = () if isinstance(answer, str) else tuple(answer)
+    if isinstance(answer, str) or not all(isinstance(text, str) for text in each):
         raise TypeError(f"{what} holds what is no text")
     return ["".join((text,)) for text in each]
 
 
-def line_or_none(said: Any, what: str) -> str | None:
+def line_or_none(answer: Any, what: str) -> str | None:
     """Return a package's text as a plain one of one line, 300 characters at most; None as it is.
 
     Raises ValueError, which names `what` it is, for what is no text, or an empty one.
     """
-    if said is None:
+    if answer is None:
         return None
-    if not isinstance(said, str) or not said.strip():
-        raise ValueError(f"{what} that is no text, and not None: {printable(repr(said))}")
-    return printable(" ".join("".join((said,)).split()), 300)
+    if not isinstance(answer, str) or not answer.strip():
+        raise ValueError(f"{what} that is no text, and not None: {printable(repr(answer))}")
+    return printable(" ".join("".join((answer,)).split()), 300)
 
 
 class Failed(UserError):

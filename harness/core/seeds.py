@@ -34,7 +34,7 @@ def purpose(first: int, count: int) -> Purpose:
     return present[0]
 
 
-def stated(first: int, count: int) -> str:
+def seeds_text(first: int, count: int) -> str:
     """Write a range of layout seeds with its purpose: `layout seeds 0 to 239 (tune)`."""
     return f"layout seeds {first} to {first + count - 1} ({' and '.join(purposes(first, count))})"
 

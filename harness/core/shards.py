@@ -94,8 +94,10 @@ def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
     configs = [_read(folder, kind) for folder in folders]
     first, facts = folders[0], configs[0].facts()
     for folder, config in zip(folders, configs, strict=True):
-        theirs = config.facts()
-        if differ := [key for key in {**facts, **theirs} if facts.get(key) != theirs.get(key)]:
+        other_facts = config.facts()
+        if differ := [
+            key for key in {**facts, **other_facts} if facts.get(key) != other_facts.get(key)
+        ]:
             raise UserError(
                 f"{printable(folder)} and {printable(first)} differ in "
                 f"{printable(', '.join(differ))}; give "

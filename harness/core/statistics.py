@@ -92,9 +92,9 @@ def episode_interval(
 
 def known_mean(values: Floats, axis: int) -> Floats:
     """Return the mean along an axis, NaN left out; NaN where all values are."""
-    known = ~np.isnan(values)
-    count = np.sum(known, axis=axis)
-    total = np.sum(np.where(known, values, 0.0), axis=axis)
+    is_known = ~np.isnan(values)
+    count = np.sum(is_known, axis=axis)
+    total = np.sum(np.where(is_known, values, 0.0), axis=axis)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
@@ -104,12 +104,14 @@ def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
     Values are `(n,)`, NaN left out. `episodes` is the episode of each value, `(n,)`; by default
     each is its own. Values of one episode count as clustered (`_effective_n`).
     """
-    known = ~np.isnan(values)
-    n, n_excluded = int(known.sum()), int((~known).sum())
+    is_known = ~np.isnan(values)
+    n, n_excluded = int(is_known.sum()), int((~is_known).sum())
     if n == 0:
         return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
-    rate = float(np.mean(values[known]))
-    totals, sizes = _clusters(values[known] - rate, None if episodes is None else episodes[known])
+    rate = float(np.mean(values[is_known]))
+    totals, sizes = _clusters(
+        values[is_known] - rate, None if episodes is None else episodes[is_known]
+    )
     return Estimate(rate, *wilson(rate, _effective_n(rate, totals, sizes)), n, n_excluded)
 
 
@@ -135,12 +137,12 @@ def seed_rate_interval(values: Floats) -> Estimate:
 
     means = known_mean(values, axis=1)
     value, counted = float(known_mean(means, axis=0)), int((~np.isnan(means)).sum())
-    known = ~np.isnan(values)
-    freedom = int(np.sum(np.maximum(known.sum(axis=0) - 1, 0)))
+    is_known = ~np.isnan(values)
+    freedom = int(np.sum(np.maximum(is_known.sum(axis=0) - 1, 0)))
     if freedom == 0:
         return Estimate(value, math.nan, math.nan, counted, len(means) - counted)
     within = float(np.nansum((values - known_mean(values, axis=0)) ** 2)) / freedom
-    n = int(known.sum())
+    n = int(is_known.sum())
     half = float(stdtrit(freedom, 0.5 + LEVEL / 2)) * math.sqrt(n * within + 2) / n
     return Estimate(
         value, max(value - half, -1.0), min(value + half, 1.0), counted, len(means) - counted
@@ -179,19 +181,21 @@ def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
 
 def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
     """Return the mean of `paired_difference` and its standard error; NaN where it is not known."""
-    known = [part[~np.isnan(part)] for part in parts]
-    sizes = np.array([len(part) for part in known])
+    known_parts = [part[~np.isnan(part)] for part in parts]
+    sizes = np.array([len(part) for part in known_parts])
     if sizes.min() == 0:
         return math.nan, math.nan
-    value = float(np.mean([part.mean() for part in known]))
+    value = float(np.mean([part.mean() for part in known_parts]))
     if sizes.min() == 1:
         return value, math.nan
     weights = 1 / (len(parts) * sizes)  # of an episode in each part
     more = ALIKE / len(parts) if len(parts) > 1 else 0.0
-    own = np.array([part.var(ddof=1) for part in known])
-    of_all = float(np.mean(np.concatenate(known) ** 2))
-    variances = (sizes * own + more * of_all) / (sizes + more)
-    effects = np.concatenate([part * weight for part, weight in zip(known, weights, strict=True)])
+    own_variances = np.array([part.var(ddof=1) for part in known_parts])
+    of_all = float(np.mean(np.concatenate(known_parts) ** 2))
+    variances = (sizes * own_variances + more * of_all) / (sizes + more)
+    effects = np.concatenate(
+        [part * weight for part, weight in zip(known_parts, weights, strict=True)]
+    )
     differing = effects[effects != 0]
     usual = float(np.mean(differing**2)) if len(differing) else 0.0
     heaviest = float(weights.max()) ** 2
@@ -263,10 +267,12 @@ def resampled_estimate(values: Floats, n: int) -> Estimate:
     `values` are the figure itself, then that of each resample, in the order of `resampled`, `(1 +
     times,)`. NaN resamples are left out; if the figure itself is NaN, there is no interval.
     """
-    known = values[1:][~np.isnan(values[1:])]
+    resamples = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]):
         return Estimate(math.nan, math.nan, math.nan, 0, n)
-    low, high = np.percentile(known, (2.5, 97.5)).tolist() if len(known) else (math.nan, math.nan)
+    low, high = (
+        np.percentile(resamples, (2.5, 97.5)).tolist() if len(resamples) else (math.nan, math.nan)
+    )
     return Estimate(float(values[0]), low, high, n, 0)
 
 
@@ -314,12 +320,12 @@ def _clusters(values: Floats, episodes: Ints | None) -> tuple[Floats, Floats]:
 def _student(values: Floats, episodes: Ints, level: float = LEVEL) -> Estimate:
     from harness.core.special import stdtrit
 
-    known = ~np.isnan(values)
-    n, n_excluded = int(known.sum()), int((~known).sum())
+    is_known = ~np.isnan(values)
+    n, n_excluded = int(is_known.sum()), int((~is_known).sum())
     if n == 0:
         return Estimate(math.nan, math.nan, math.nan, 0, n_excluded)
-    mean = float(np.mean(values[known]))
-    totals, _ = _clusters(values[known] - mean, episodes[known])
+    mean = float(np.mean(values[is_known]))
+    totals, _ = _clusters(values[is_known] - mean, episodes[is_known])
     clusters, squares = len(totals), float(np.sum(totals**2))
     if clusters < 2 or squares < ROUNDING * max(mean**2, 1.0):
         return Estimate(mean, math.nan, math.nan, n, n_excluded)

@@ -23,7 +23,7 @@ from harness.core.process import Stop
 PATIENCE_S = 20.0  # after which a line says what a command waits for
 LOOK_S = 1.0  # between two looks at what runs
 _calls: dict[object, tuple[str, float, float]] = {}  # what runs now, since when, for how long
-_said: set[str] = set()
+_slow_calls: set[str] = set()
 _watchers: set[int] = set()  # processes with a thread that watches
 
 
@@ -48,8 +48,8 @@ def _watch() -> None:
     while True:
         time.sleep(LOOK_S)
         for what, since_s, patience_s in list(_calls.values()):
-            if what not in _said and time.monotonic() - since_s > patience_s:
-                _said.add(what)
+            if what not in _slow_calls and time.monotonic() - since_s > patience_s:
+                _slow_calls.add(what)
                 line = f"{what} has not come back for {patience_s:g} s; Ctrl-C ends the command"
                 print(f"harness: {line}, which goes on when it is typed again", file=sys.stderr)
 
@@ -101,10 +101,10 @@ def is_in_harness(named: Any) -> bool:
     module = str(getattr(named, "__module__", ""))
     if not module.startswith("harness."):
         return False
-    found: object = sys.modules.get(module)
+    candidate: object = sys.modules.get(module)
     for name in str(getattr(named, "__qualname__", "")).split("."):
-        found = getattr(found, name, None)
-    return found is named
+        candidate = getattr(candidate, name, None)
+    return candidate is named
 
 
 @contextmanager

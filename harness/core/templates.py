@@ -421,10 +421,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(finalize=written, **options)
-        own = {"format": _format, "join": _join, "replace": _replace, "sum": _sum}
+        own_filters = {"format": _format, "join": _join, "replace": _replace, "sum": _sum}
         for name, function in list(self.filters.items()):
             self.filters[f"{FREE}{name}"] = function
-            self.add_filter(name, own.get(name, function))
+            self.add_filter(name, own_filters.get(name, function))
         tests: dict[str, Any] = {**self.tests}
         self.tests = {
             name: _test(test) if name in _READING else test for name, test in tests.items()

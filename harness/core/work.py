@@ -39,26 +39,26 @@ class WorkStart(msgspec.Struct, frozen=True, kw_only=True):
 Kind = TypeVar("Kind", bound=WorkStart)
 
 
-def begun(out: Path, kind: type[Kind]) -> Kind | None:
+def start_of(out: Path, kind: type[Kind]) -> Kind | None:
     """Read what the unfinished work in an output folder began with; None if there is none.
 
     None means that the folder is new, empty or `idle`. `kind` is the type of the record. Raises
     UserError if the file is damaged, or the folder holds something else.
     """
     sayable("--out", out.name, "give another name")
-    shown, file = printable(out), out / WORK / CONFIG
+    folder, file = printable(out), out / WORK / CONFIG
     try:
         if file.is_file() and not idle(out):
             return msgspec.json.decode(text_of(file, "record"), type=kind)
         occupied = out.is_dir() and any(path.name != WORK for path in out.iterdir())
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
-            f"{printable(file)} is damaged ({printable(error)}); delete --out {shown} and start "
+            f"{printable(file)} is damaged ({printable(error)}); delete --out {folder} and start "
             "again"
         ) from None
     if occupied or (out.exists() and not out.is_dir()):
         what = "a folder with other files in it" if occupied else "no folder"
-        raise UserError(f"--out {shown} is {what}; choose an empty or a new one")
+        raise UserError(f"--out {folder} is {what}; choose an empty or a new one")
     return None
 
 
@@ -146,7 +146,7 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
     try:
         with alone(work / LOCK, GONE_S), going_on(out):
             # another process may have begun since this one looked
-            earlier = begun(out, type(begin))
+            earlier = start_of(out, type(begin))
             if earlier is None:
                 for path in work.iterdir():
                     if path.name != LOCK:

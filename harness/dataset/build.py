@@ -27,7 +27,7 @@ from harness.core.files import canonical_json, opened, replacing, sha256_bytes, 
 from harness.core.formats import WORK
 from harness.core.parallel import Workers, each
 from harness.core.plugins import Plugins
-from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose, stated
+from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose, seeds_text
 from harness.core.shards import Shard
 from harness.core.strangers import worded
 from harness.dataset.forest import Forest
@@ -130,7 +130,7 @@ def build(
         return finished
     part = str(shard or "")
     own_episodes = shard.part(range(episodes)) if shard else range(episodes)
-    if begun := work.begun(out, work.WorkStart):
+    if begun := work.start_of(out, work.WorkStart):
         work.same(out, {**config, "shard": part}, {**begun.settings, "shard": begun.shard})
     elif scenario.world:
         scenario.world.examine(scenario, seed)
@@ -184,7 +184,7 @@ def merge(
         parts = shards.owners(folders, begun, list(episodes), lambda part: named(episodes[part]))
         if not (out / "manifest.json").exists():
             whole = work.WorkStart(settings=config)
-            if stopped := work.begun(out, work.WorkStart):
+            if stopped := work.start_of(out, work.WorkStart):
                 work.same(out, whole.settings, stopped.settings)
             with work.working(out, whole) as place:
                 shards.collect(parts, place)
@@ -367,7 +367,7 @@ def _readme(
     audit_text = "\n\n".join(findings) or "Not audited for tells."
     return f"""# {name}
 
-Every course of {seeds} layouts of `{config["scenario"]}`, {stated(config["seed"], seeds)}:
+Every course of {seeds} layouts of `{config["scenario"]}`, {seeds_text(config["seed"], seeds)}:
 {nodes} decision points, {nodes / seeds:.0f} a layout.
 Built by `{command}`.
 

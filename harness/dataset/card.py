@@ -12,8 +12,8 @@ from typing import Any
 import pyarrow as pa
 
 from harness import __version__
-from harness.core.figures import shown
-from harness.core.seeds import Purpose, stated
+from harness.core.figures import interval_of
+from harness.core.seeds import Purpose, seeds_text
 from harness.core.statistics import Estimate
 from harness.dataset.columns import COLUMNS, Column
 from harness.dataset.schema import Manifest
@@ -66,7 +66,7 @@ class Table:
 
     @property
     def layouts(self) -> str:
-        return stated(self.manifest.seed, self.manifest.episodes)
+        return seeds_text(self.manifest.seed, self.manifest.episodes)
 
 
 def path_of(name: str) -> str:
@@ -255,7 +255,7 @@ def _references(tables: Sequence[Table]) -> Iterator[str]:
     yield _row("table", "n", *(f"`{name}`" for name in names))
     yield _row(*["---"] * (2 + len(names)))
     for t in tables:
-        cells = (shown(t.references[name]) if name in t.references else "" for name in names)
+        cells = (interval_of(t.references[name]) if name in t.references else "" for name in names)
         yield _row(f"`{t.name}`", t.manifest.episodes, *cells)
 
 

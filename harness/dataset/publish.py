@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from harness.core.errors import UserError, printable
-from harness.core.figures import known
+from harness.core.figures import number_or_none
 from harness.core.files import making, refuse_taken, sha256_file, write_whole
 from harness.core.progress import Progress
 from harness.core.statistics import rate_interval
@@ -119,7 +119,7 @@ def _rows(data: Dataset, chat: Chat) -> list[dict[str, Any]]:
         row["safe"] = safe[n]
         row["avoids_harm"] = avoids_harm[n]
         row["value"] = worth[n]
-        row["delay_s"] = [known(delay_s) for delay_s in delays_s[n]]
+        row["delay_s"] = [number_or_none(delay_s) for delay_s in delays_s[n]]
         row["next_scene"] = [ids[child] for child in children[n]]
         row["result"] = [results[edge] for edge in edges[n]]
         row["drivers"] = _json({name: actions[places[n]] for name, places in choices.items()})

@@ -131,7 +131,7 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
     `shard` is the part of the run, such as `1/3`, empty for all of it. Raises UserError if it is a
     run with other settings.
     """
-    run_start = work.begun(out, RunStart)
+    run_start = work.start_of(out, RunStart)
     if run_start:
         now = {**_comparable(spec.record()), "shard": shard}
         stored = {**_comparable(run_start.settings), "shard": run_start.shard}

@@ -185,7 +185,7 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
     tags = tuple(dict.fromkeys(tag for each in run_starts for tag in each.tags))
     created = min(each.created for each in run_starts)
     whole = msgspec.structs.replace(run_starts[0], shard="", tags=tags, created=created)
-    if stopped := work.begun(out, RunStart):
+    if stopped := work.start_of(out, RunStart):
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)

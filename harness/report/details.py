@@ -17,7 +17,7 @@ from harness.backends.registry import reads_prompts
 from harness.coordination.operating_point import questions
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.figures import known
+from harness.core.figures import number_or_none
 from harness.core.files import digest
 from harness.core.image import Image
 from harness.core.places import text
@@ -269,7 +269,7 @@ class Details:
             names = agent["model"]["name"], agent["prompt"]["version"], agent["answer"]
             fields["agent"] = " · ".join(names)
         if run.manifest.latency.speeds or run.manifest.helpers:
-            fields["took_s"] = known(run.seconds(answer))
+            fields["took_s"] = number_or_none(run.seconds(answer))
         return {
             **fields,
             "viewer": answer.key,
@@ -502,6 +502,6 @@ def _outcomes(forest: Forest, name: str) -> list[dict[str, Any]]:
         outcome["action"] = action
         outcome["safe"] = bool(forest.safe[place, n])
         outcome["result"] = "late" if late else end.result
-        outcome["delay_s"] = known(round(float(forest.delay_s[place, n]), 3))
+        outcome["delay_s"] = number_or_none(round(float(forest.delay_s[place, n]), 3))
         outcomes.append(outcome)
     return outcomes

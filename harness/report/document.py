@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from markupsafe import Markup
 
-from harness.core.figures import Bounded, known
+from harness.core.figures import Bounded, number_or_none
 from harness.report.templating import environment, visible
 
 # characters of a cell at the right of its column, such as a number with its interval
@@ -99,7 +99,7 @@ def reach(bounded: Iterable[Bounded]) -> tuple[float, float]:
     """Return the smallest and largest of all values and interval ends; (0, 1) if there are none."""
     numbers = list[float]()
     for each in bounded:
-        ends = (known(each.value), known(each.low), known(each.high))
+        ends = (number_or_none(each.value), number_or_none(each.low), number_or_none(each.high))
         numbers += [number for number in ends if number is not None]
     return min(numbers, default=0.0), max(numbers, default=1.0)
 
@@ -120,13 +120,13 @@ def forest(bounded: Bounded, least: float, most: float, verdict: str = "") -> Ma
     def x(value: float) -> float:
         return round(8 + (value - least) / ((most - least) or 1.0) * (WIDTH - 16), 1)
 
-    low, high = known(bounded.low), known(bounded.high)
+    low, high = number_or_none(bounded.low), number_or_none(bounded.high)
     zero = interval = ""
     if least < 0 < most:
         zero = f'<path class="zero" d="M{x(0.0)} 0V{HEIGHT}"/>'
     if low is not None and high is not None:
         interval = f'<path d="M{x(low)} {y}H{x(high)}M{x(low)} {y - 3}v6M{x(high)} {y - 3}v6"/>'
-    left = x(known(bounded.value) or 0.0) - 3.5
+    left = x(number_or_none(bounded.value) or 0.0) - 3.5
     square = f'<rect x="{left}" y="{y - 3.5}" width="7" height="7"/>'
     name = f"forest {verdict}".strip()
     return Markup(

@@ -11,7 +11,7 @@ import numpy as np
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.figures import amount, known
+from harness.core.figures import amount, number_or_none
 from harness.core.power import Spread
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.report.compare.pair import pair
@@ -191,7 +191,7 @@ def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:
         condition = {
             "condition": row.condition or None,
             "layouts": row.layouts,
-            "finds": known(row.finds),
+            "finds": number_or_none(row.finds),
             "requests": cost and cost.requests,
             "tokens": cost and cost.tokens,
             "minutes": cost and cost.minutes,

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from harness.core.covariate import worth
 from harness.core.errors import printable
 from harness.core.figures import POINTS, within
-from harness.core.figures import shown as shown_estimate
+from harness.core.figures import interval_of as shown_estimate
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.caveats import doubted

@@ -17,7 +17,7 @@ from msgspec import UNSET
 from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, one_line, printable
-from harness.core.figures import PERCENT, POINTS, Unit, shown
+from harness.core.figures import PERCENT, POINTS, Unit, interval_of
 from harness.core.plugins import Plugins, of_type, one_of, say_once
 from harness.core.statistics import (
     LEVEL,
@@ -1178,7 +1178,7 @@ def percentiles(latency_ms: Floats) -> Floats:
 
 def written(score: Score) -> str:
     """Return a score with its interval as text, in the metric's unit but without its name."""
-    return shown(score, entry(score.metric).unit)
+    return interval_of(score, entry(score.metric).unit)
 
 
 def _position(values: Ints, names: Sequence[int]) -> Ints:

@@ -21,7 +21,7 @@ from harness.coordination.trigger import entropy_nats
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.figures import Unit, amount, shown
+from harness.core.figures import Unit, amount, interval_of
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval, resampled
 from harness.core.versions import versions
@@ -369,7 +369,7 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
     k, episodes = repeats.k, len(repeats.runs[0].grid.episodes)
 
     def cells(condition: str, *metrics: str) -> list[str]:
-        return [shown(repeats.estimate(condition, metric)) for metric in metrics]
+        return [interval_of(repeats.estimate(condition, metric)) for metric in metrics]
 
     rows = list[Sequence[str]]()
     for name in repeats.conditions:
@@ -430,7 +430,7 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
 
 def nats(e: Estimate) -> str:
     """Return an entropy with its interval as text; a dash where it is unknown."""
-    return shown(e, NATS)
+    return interval_of(e, NATS)
 
 
 def headline(repeats: Repeats) -> list[str]:
@@ -446,9 +446,9 @@ def _flip_sentence(repeats: Repeats) -> str:
     everywhere, anywhere = repeats.estimate(c, f"pass^{k}"), repeats.estimate(c, f"any@{k}")
     return (
         f"Asked again at temperature {m.settings.temperature:g}, {m.variant} decides differently "
-        f"in {shown(flips)} % of decisions under {c} (n = {flips.n} decision points). "
-        f"{shown(once)} % of its episodes succeed, {shown(everywhere)} % in all {k} repeats and "
-        f"{shown(anywhere)} % in at least one (n = {once.n} episodes)."
+        f"in {interval_of(flips)} % of decisions under {c} (n = {flips.n} decision points). "
+        f"{interval_of(once)} % of its episodes succeed, {interval_of(everywhere)} % in all {k} "
+        f"repeats and {interval_of(anywhere)} % in at least one (n = {once.n} episodes)."
     )
 
 
@@ -458,8 +458,8 @@ def _variance_sentence(repeats: Repeats) -> Iterator[str]:
     if shares:
         c = min(shares, key=lambda c: shares[c].value)
         yield (
-            f"Under {c}, {shown(shares[c])} % of the variance of success lies between episodes "
-            f"(n = {shares[c].n}); the rest is chance between repeats of one episode."
+            f"Under {c}, {interval_of(shares[c])} % of the variance of success lies between "
+            f"episodes (n = {shares[c].n}); the rest is chance between repeats of one episode."
         )
 
 

@@ -11,8 +11,8 @@ from harness.cli.progress import bar
 from harness.cli.scenario import ready_to_drive
 from harness.cli.terminal import console, echo_json, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import Unit, shown
-from harness.core.seeds import FIRST, stated
+from harness.core.figures import Unit, interval_of
+from harness.core.seeds import FIRST, seeds_text
 
 if TYPE_CHECKING:
     from harness.extensions.audit.tells import Audit
@@ -68,10 +68,10 @@ def _print(result: "Audit") -> None:
 
     table(
         ("predicted from the ego's view", "AUC [95 % CI]"),
-        [(question, shown(auc, Unit(decimals=2))) for question, auc in result.auc.items()],
+        [(question, interval_of(auc, Unit(decimals=2))) for question, auc in result.auc.items()],
     )
     text = console()
-    text.print(f"n = {result.layouts} layouts, {stated(result.seed, result.layouts)};")
+    text.print(f"n = {result.layouts} layouts, {seeds_text(result.seed, result.layouts)};")
     text.print(
         f"decision points {result.steps[0]} to {result.steps[-1]}, while the danger is out of sight"
     )

@@ -18,7 +18,7 @@ from harness.cli.progress import bar
 from harness.cli.run import evaluate
 from harness.cli.terminal import echo_json, echo_text, table
 from harness.core.errors import UserError, printable
-from harness.core.figures import amount, shown
+from harness.core.figures import amount, interval_of
 from harness.core.formats import SUITE
 
 if TYPE_CHECKING:
@@ -313,7 +313,7 @@ def _show_board(lines: "Sequence[Line]") -> None:
     for line in lines:
         scores = (line.success[by], line.gain)
         rank = "-" if line.rank is None else str(line.rank)
-        cells = ("-" if score is None else shown(score) for score in scores)
+        cells = ("-" if score is None else interval_of(score) for score in scores)
         rows.append((printable(line.name, 40), rank, *cells))
     table(("entry", "rank", by, f"gain over {BASELINE}"), rows)
     typer.echo("success in % [95 % CI], balanced where dangers are known; means over families")

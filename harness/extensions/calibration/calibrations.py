@@ -21,7 +21,7 @@ from harness.core.arrays import Floats
 from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import read_once
-from harness.core.seeds import purposes, stated
+from harness.core.seeds import purposes, seeds_text
 from harness.world.scenario import Scenario
 
 FOLDER = "calibrations"
@@ -147,5 +147,5 @@ def check_seeds(what: str, first: int, last: int) -> None:
     """
     if not 0 <= first <= last or purposes(first, last - first + 1) != ["tune"]:
         raise UserError(
-            f"{what}: {ONLY_TUNE}, and these are {stated(first, max(last - first, 0) + 1)}"
+            f"{what}: {ONLY_TUNE}, and these are {seeds_text(first, max(last - first, 0) + 1)}"
         )

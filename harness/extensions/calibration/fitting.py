@@ -12,7 +12,7 @@ from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.files import write_whole
-from harness.core.seeds import stated
+from harness.core.seeds import seeds_text
 from harness.dataset import rebuilt
 from harness.dataset.forest import Forest
 from harness.evaluate.texts import refuse_others
@@ -112,7 +112,7 @@ def calibrate(
     if not fitted or fitted[0].role != "ego":
         raise UserError(f"{name}: no answer of the ego could be read, so there is nothing to fit")
     corrections = {each.role: each.correction for each in fitted}
-    seeds = stated(first, last - first + 1)
+    seeds = seeds_text(first, last - first + 1)
     found = Calibration(
         level,
         command,

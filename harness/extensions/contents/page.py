@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.coordination.contents import INTENT
 from harness.core.errors import printable
-from harness.core.figures import shown
+from harness.core.figures import interval_of
 from harness.core.multiplicity import LEVEL
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
@@ -105,11 +105,11 @@ def headline(result: Result) -> list[str]:
     base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
     gains, costs = list[str](), list[str]()
     for content in result.sent:
-        gains.append(f"{content} {shown(result.at(base, content).over(intent), sign='+')}")
+        gains.append(f"{content} {interval_of(result.at(base, content).over(intent), sign='+')}")
     for content in result.model.contents:
         outcome = result.at(base, content)
         cost = f"{_kbit(outcome):.1f} kbit and {_age(outcome):.0f} ms"
-        costs.append(f"{content} {shown(outcome.success)} % with {cost}")
+        costs.append(f"{content} {interval_of(outcome.success)} % with {cost}")
     return [
         f"{name}, {base.condition}, points of {result.words} over intents: {'; '.join(gains)}. "
         f"Of {len(result.points)} points, "
@@ -184,7 +184,7 @@ def _over(result: Result, setting: Setting, content: str) -> str:
         return ""
     gain = result.at(setting, content).over(result.at(setting, INTENT))
     p = result.p(setting, content)
-    return strong(shown(gain, sign="+"), p is not None and p <= LEVEL)
+    return strong(interval_of(gain, sign="+"), p is not None and p <= LEVEL)
 
 
 def _at_base(result: Result) -> Table:
@@ -197,8 +197,10 @@ def _at_base(result: Result) -> Table:
         costs = (f"{_kbit(outcome):.2f}", f"{_age(outcome):.1f}")
         late = f"{100 * outcome.estimate(LATE).value:.1f}"
         off_lag = f"{100 * outcome.estimate(OFF_LAG).value:.1f}"
-        of_halves = [shown(outcome.estimate(half)) for half in halves]
-        rows.append((content, shown(outcome.success), gain, p, *costs, late, off_lag, *of_halves))
+        of_halves = [interval_of(outcome.estimate(half)) for half in halves]
+        rows.append(
+            (content, interval_of(outcome.success), gain, p, *costs, late, off_lag, *of_halves)
+        )
     heads = ["content", f"{result.words} %", "over intents", "p"]
     heads += ["kbit", "age, ms", "late %", "off lag %"]
     if halves:
@@ -235,9 +237,9 @@ def _at_equal(result: Result, title: str, cost: Callable[[Outcome], float]) -> T
             continue
         best_name = max(affordable, key=lambda name: affordable[name].success.value)
         best = affordable[best_name]
-        gain = "" if best is intent else shown(best.over(intent), sign="+")
+        gain = "" if best is intent else interval_of(best.over(intent), sign="+")
         costs = (f"{_kbit(best):.2f}", f"{_age(best):.1f}")
-        rows.append((content, best_name, shown(best.success), gain, *costs))
+        rows.append((content, best_name, interval_of(best.success), gain, *costs))
     return Table(
         f"{result.model.name}, {result.base.condition}: at the {title} of intents",
         ("content", "setting", f"{result.words} %", "over intents", "kbit", "age, ms"),
@@ -254,8 +256,8 @@ def _by_family(result: Result) -> Table:
     for family in result.families:
         outcomes = {content: result.at(result.base, content) for content in contents}
         metric, intent = result.headline_metric, outcomes[INTENT]
-        scores = [shown(outcome.estimate(metric, family)) for outcome in outcomes.values()]
-        gains = [shown(outcomes[c].over(intent, family), sign="+") for c in result.sent]
+        scores = [interval_of(outcome.estimate(metric, family)) for outcome in outcomes.values()]
+        gains = [interval_of(outcomes[c].over(intent, family), sign="+") for c in result.sent]
         rows.append((family, *scores, *gains))
     heads = (
         "family",
@@ -272,7 +274,7 @@ def _along(result: Result, panel: Panel) -> Table:
     of_paper = _of_paper(panel.axis)
     for setting in panel.settings:
         row = [_value(setting)]
-        row += [shown(result.at(setting, content).success) for content in contents]
+        row += [interval_of(result.at(setting, content).success) for content in contents]
         row += [_over(result, setting, content) for content in result.sent]
         if of_paper:
             row.append(of_paper.get(setting.value, ""))

@@ -13,7 +13,7 @@ from harness.cli import options
 from harness.cli.terminal import echo_each, echo_json, echo_text, table
 from harness.core import resources
 from harness.core.errors import UserError, in_range, printable
-from harness.core.figures import Unit, known, shown
+from harness.core.figures import Unit, interval_of, number_or_none
 
 if TYPE_CHECKING:
     from harness.extensions.devices.fit import Fit
@@ -108,7 +108,7 @@ def _as_mapping(fit: "Fit") -> dict[str, Any]:
         "answer": fit.answer,
         "prompt_tokens": fit.prompt_tokens,
         "output_tokens": fit.output_tokens,
-        "ms": known(1000 * fit.seconds),
+        "ms": number_or_none(1000 * fit.seconds),
         "in_time": fit.in_time,
         "joules": fit.joules,
         "memory_gb": fit.row.memory_gb and fit.row.memory_gb.value,
@@ -119,7 +119,7 @@ def _fit_cells(fit: "Fit", of_run: bool) -> Sequence[str]:
     """Return a line of the table of fits; of a run's answers shares and joules have intervals."""
     unit = Unit("J", 2)
     if of_run:
-        in_time, joules = shown(fit.in_time), shown(fit.joules, unit)
+        in_time, joules = interval_of(fit.in_time), interval_of(fit.joules, unit)
     else:
         in_time, joules = "yes" if fit.in_time.value else "no", unit.number(fit.joules.value)
     decimals = 0 if fit.seconds >= 0.1 else 1
@@ -169,7 +169,7 @@ def check(
     lines = []
     for result in results:
         what, factor = scales[result.what]
-        measured = shown(result.measured, Unit(factor=factor))
+        measured = interval_of(result.measured, Unit(factor=factor))
         stated = _known(result.stated, f"{result.stated * factor:.1f}")
         role, n = role_word(result.role), str(result.measured.n)
         lines.append((role, what, measured, stated, n))
@@ -231,8 +231,11 @@ def measure(
     lines = []
     for power in powers:
         name, idle = printable(power.meter), f"{power.idle_watts:.2f}"
-        of_answer, above_idling = shown(power.answer_j, joules), shown(power.more_j, joules)
-        lines.append((name, idle, shown(power.watts, watts), of_answer, above_idling))
+        of_answer, above_idling = (
+            interval_of(power.answer_j, joules),
+            interval_of(power.more_j, joules),
+        )
+        lines.append((name, idle, interval_of(power.watts, watts), of_answer, above_idling))
     table(["meter", "idle W", "asking W", "J an answer", "J above idling"], lines)
     echo_text(
         f"means of {WINDOWS} windows of {window_s:g} s or more, with 95 % intervals over them; a "

@@ -12,7 +12,7 @@ from harness.cli import options
 from harness.cli.terminal import echo_each, echo_fields, echo_json, echo_text, table
 from harness.core import resources
 from harness.core.errors import UserError, in_range, printable, unknown
-from harness.core.figures import Unit, known, shown
+from harness.core.figures import Unit, interval_of, number_or_none
 
 if TYPE_CHECKING:
     from harness.extensions.radio.reception import Check
@@ -57,7 +57,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     latencies, busy = latencies_ms(channel, DISTANCES_M), None
     if isinstance(channel, Physical):
         curves = {sight: curve.tolist() for sight, curve in by_sight(channel, DISTANCES_M).items()}
-        busy = known(channel.busy_ratio())
+        busy = number_or_none(channel.busy_ratio())
     if as_json:
         about = asdict(profile)
         del about["parameters"]
@@ -186,7 +186,7 @@ def _messages_table(result: "Check") -> None:
     """Print the reception of single messages, a row a distance."""
     rows = []
     for at in result.messages:
-        rates = (f"{100 * at.model:.1f}", shown(at.crossing), shown(at.round_trip))
+        rates = (f"{100 * at.model:.1f}", interval_of(at.crossing), interval_of(at.round_trip))
         rows.append((f"{at.distance_m:g} m", *rates, f"{1000 * at.delay_s:.1f}"))
     table(["in sight", "model %", "one message %", "round trip %", "delay ms"], rows)
 
@@ -195,7 +195,10 @@ def _waits_table(result: "Check") -> None:
     """Print how long after one packet the next arrives, a row a distance."""
     rows = []
     for wait in result.waits:
-        mean, p95 = shown(wait.mean_s, Unit("s", 3)), shown(wait.p95_s, Unit("s", 2))
+        mean, p95 = (
+            interval_of(wait.mean_s, Unit("s", 3)),
+            interval_of(wait.p95_s, Unit("s", 2)),
+        )
         rows.append((f"{wait.distance_m:g} m", mean, p95, f"{wait.independent_s:.3f}"))
     table(["next packet after, s", "mean", "95th percentile", "if independent"], rows)
 
@@ -291,7 +294,7 @@ def _refuse_format(out: Path | None) -> None:
     from harness.report.drawing.pictures import FORMATS
 
     if out.suffix[1:] not in FORMATS:
-        raise unknown("--out, a file that ends in", out.suffix, [f".{known}" for known in FORMATS])
+        raise unknown("--out, a file that ends in", out.suffix, [f".{name}" for name in FORMATS])
 
 
 def channel_of(text: str) -> "tuple[str, Channel]":

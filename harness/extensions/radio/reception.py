@@ -13,7 +13,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.config import changed
 from harness.core.errors import UserError, printable
-from harness.core.figures import known
+from harness.core.figures import number_or_none
 from harness.core.pairs import pairs
 from harness.core.statistics import Estimate, episode_interval, rate_interval, resampled
 from harness.extensions.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
@@ -263,7 +263,7 @@ def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check
     curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
     return Check(
         n,
-        known(channel.busy_ratio()),
+        number_or_none(channel.busy_ratio()),
         gaps(channel, DISTANCES_M, n // 10)
         if isinstance(channel, Transceiver) and channel.rate_hz
         else [],

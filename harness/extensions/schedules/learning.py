@@ -21,7 +21,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.files import write_whole
-from harness.core.seeds import Purpose, purposes, stated
+from harness.core.seeds import Purpose, purposes, seeds_text
 from harness.dataset import rebuilt
 from harness.extensions.schedules.choices import Choices, Choose, choices
 from harness.extensions.schedules.learnt import INPUTS, Learnt, Network, Stated, Weights, inputs
@@ -47,12 +47,12 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
     if purposes(first, count) != [wanted]:
         raise UserError(
-            f"{printable(stored.run.path)}: {stated(first, count)}; give a run on {wanted} "
+            f"{printable(stored.run.path)}: {seeds_text(first, count)}; give a run on {wanted} "
             "layouts, which `harness dataset build --seed` makes"
         )
     rebuilt.refuse(stored.dataset, [run.dataset for run in reported])
     return (
-        f"{stored.name} on {stored.dataset.name}, {stated(first, count)}, "
+        f"{stored.name} on {stored.dataset.name}, {seeds_text(first, count)}, "
         f"{amount(len(seeds), 'layout')}"
     )
 

@@ -21,7 +21,7 @@ from harness.coordination.scheduling import NEVER, ORACLE, PAPER
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
-from harness.core.figures import DASH, shown, some_of
+from harness.core.figures import DASH, interval_of, some_of
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.core.versions import versions
@@ -540,9 +540,10 @@ def headline(compared: Compared) -> list[str]:
     regret, words = compared.regret, compared.success_rule.words
     bound = compared.oracle.means["messages"]
     sentences = [
-        f"{compared.name}, {compared.point.name}: {words} of the oracle is {shown(regret)} points "
-        f"above that of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} episodes), "
-        f"with {bound:.1f} instead of {compared.paper.means['messages']:.1f} messages per episode."
+        f"{compared.name}, {compared.point.name}: {words} of the oracle is {interval_of(regret)} "
+        f"points above that of entropy above {compared.point.ask.tau_nats:g} (n = {regret.n} "
+        f"episodes), with {bound:.1f} instead of "
+        f"{compared.paper.means['messages']:.1f} messages per episode."
     ]
     within = [row for row in compared.rows[1:-1] if row.messages.value <= SLACK * compared.budget]
     if compared.tune and within:
@@ -552,14 +553,15 @@ def headline(compared: Compared) -> list[str]:
         best = by_name[first]
         if close:
             outcome = (
-                f"no schedule clearly has the most {words}: it is {shown(best.success)} %, and "
-                f"these cannot be told apart there: {some_of([first, *close])}."
+                f"no schedule clearly has the most {words}: it is {interval_of(best.success)} %, "
+                f"and these cannot be told apart there: {some_of([first, *close])}."
             )
         else:
             outcome = (
-                f"{first} has the most {words}, {shown(best.success)} %, a difference of "
-                f"{shown(best.over_paper)} points from the paper's schedule: it closes "
-                f"{shown(best.closed)} % of that gap with {shown(best.messages)} % of the messages."
+                f"{first} has the most {words}, {interval_of(best.success)} %, a difference of "
+                f"{interval_of(best.over_paper)} points from the paper's schedule: it closes "
+                f"{interval_of(best.closed)} % of that gap with {interval_of(best.messages)} % "
+                "of the messages."
             )
         budget = f"{100 * compared.budget:g} % of the paper's messages"
         sentences.append(f"Chosen on tune layouts within {budget}, {outcome}")
@@ -609,23 +611,23 @@ def _table(run: Compared) -> Table:
     for n, row in enumerate(run.rows):
         means, paper = row.play.means, n == 0  # which is not compared with itself
         over, closed, share = (
-            DASH if paper else shown(e) for e in (row.over_paper, row.closed, row.messages)
+            DASH if paper else interval_of(e) for e in (row.over_paper, row.closed, row.messages)
         )
         cells = (
             name_of(row) + " (the paper's)" * paper,
-            shown(row.success),
-            shown(row.plain),
+            interval_of(row.success),
+            interval_of(row.plain),
             f"{means['messages']:.1f}",
             f"{means['energy_j']:.1f}",
             over,
             closed,
             p_cell(row.p),
-            shown(row.over_random),
+            interval_of(row.over_random),
             share,
             f"{means['airtime_ms']:.3f}",
             f"{means['latency_ms']:.1f}",
-            shown(row.area),
-            shown(row.area_j),
+            interval_of(row.area),
+            interval_of(row.area_j),
         )
         rows.append([cell for head, cell in zip(HEADS, cells, strict=True) if head in heads])
     return Table(

@@ -21,7 +21,7 @@ from harness.coordination.rules import EGO_PROMPT, RULES, reads
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
-from harness.core.figures import as_mapping, crossed, shown, some_of
+from harness.core.figures import as_mapping, crossed, interval_of, some_of
 from harness.core.files import digest
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
@@ -475,15 +475,15 @@ def headline(bench: Bench) -> list[str]:
     words = bench.success_rule.words
     if bench.unfused:
         return [
-            f"While nobody attacks, {words} is {shown(peace)} %, and {shown(alone)} % with an ego "
-            "that never asks.",
+            f"While nobody attacks, {words} is {interval_of(peace)} %, and {interval_of(alone)} % "
+            "with an ego that never asks.",
             f"If {100 * share:.0f} % of the helpers attack, {worst} harms most: {words} is "
-            f"{shown(bench.success(BASE, worst, share))} %. No rule fuses anything, since "
+            f"{interval_of(bench.success(BASE, worst, share))} %. No rule fuses anything, since "
             f"{bench.unfused}; what is called linear is the ego's own answer.",
         ]
     sentences = [
-        f"While nobody attacks, {words} is {shown(peace)} % under the linear pool, and "
-        f"{shown(alone)} % with an ego that never asks.",
+        f"While nobody attacks, {words} is {interval_of(peace)} % under the linear pool, and "
+        f"{interval_of(alone)} % with an ego that never asks.",
         f"If {100 * share:.0f} % of the helpers attack, {_worst(bench, share)}",
         f"On average over all {len(bench.attacks)} attacks, {_best(bench, share)}",
     ]
@@ -505,7 +505,7 @@ def _worst(bench: Bench, share: float) -> str:
     """Say which attack harms the linear pool most, or that none clearly does."""
     harm = {attack: 1.0 - bench.at(BASE, attack, share).success for attack in bench.attacks}
     worst, *close = bench.success_rule.most(harm)
-    left = f"{bench.success_rule.words} is {shown(bench.success(BASE, worst, share))} %"
+    left = f"{bench.success_rule.words} is {interval_of(bench.success(BASE, worst, share))} %"
     if not close:
         return f"{worst} harms the linear pool most: {left}."
     return (
@@ -519,7 +519,7 @@ def _best(bench: Bench, share: float) -> str:
     best, *close = bench.success_rule.most(
         {rule: bench.over_attacks(rule, share) for rule in bench.rules}
     )
-    most, linear = (shown(bench.mean(rule, share)) for rule in (best, BASE))
+    most, linear = (interval_of(bench.mean(rule, share)) for rule in (best, BASE))
     if not close:
         price = _price(bench, best)
         return (
@@ -533,7 +533,7 @@ def _best(bench: Bench, share: float) -> str:
 
 
 def _price(bench: Bench, rule: str) -> str:
-    return "–" if rule == BASE else shown(bench.price(rule))
+    return "–" if rule == BASE else interval_of(bench.price(rule))
 
 
 def _title(share: float) -> str:
@@ -544,16 +544,16 @@ def _tables(bench: Bench, share: float) -> Iterator[Table]:
     """Yield a table of the rules at a share of attackers, and one of each attack under each."""
     rows: list[Sequence[str]] = []
     for rule in bench.rules:
-        mean, worst = shown(bench.mean(rule, share)), bench.worst(rule, share)
-        there = shown(bench.success(rule, worst, share))
+        mean, worst = interval_of(bench.mean(rule, share)), bench.worst(rule, share)
+        there = interval_of(bench.success(rule, worst, share))
         rows.append((rule, _price(bench, rule), mean, worst, there))
     heads = ("rule", "price in peace", "mean of attacks %", "worst attack", "there %")
     yield Table(_title(share), heads, rows, terminal=range(len(heads)))
-    rows = [("nobody attacks", *(shown(bench.success(rule)) for rule in bench.rules))]
+    rows = [("nobody attacks", *(interval_of(bench.success(rule)) for rule in bench.rules))]
     for attack in bench.attacks:
         cells = []
         for rule in bench.rules:
-            success = shown(bench.success(rule, attack, share))
+            success = interval_of(bench.success(rule, attack, share))
             cells.append(strong(success, bench.clear(rule, attack, share)))
         rows.append((attack, *cells))
     yield Table(
@@ -563,7 +563,7 @@ def _tables(bench: Bench, share: float) -> Iterator[Table]:
         "Bold: the rule differs from the linear pool under the same attack, with p at most 0.05 "
         "after Holm's correction over the grid. For comparison, a linear pool that knows the "
         "attackers and does not hear them succeeds in "
-        f"{shown(bench.success(BASE, EXCLUDED, share))} %.",
+        f"{interval_of(bench.success(BASE, EXCLUDED, share))} %.",
     )
 
 
@@ -573,7 +573,7 @@ def _detections(bench: Bench) -> Iterator[Table]:
         rows = []
         for cell in bench.cells.values():
             if cell.rule == rule and cell.flagged is not None:
-                found = [shown(estimate) for estimate in cell.detection().values()]
+                found = [interval_of(estimate) for estimate in cell.detection().values()]
                 time = f"{cell.time_to_detection:.0f}" if cell.caught else "–"
                 caught = f"{len(cell.caught)} of {len(cell.first)}"
                 attack = cell.attack or "nobody attacks"

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from harness.core.errors import printable
-from harness.core.figures import known
+from harness.core.figures import number_or_none
 from harness.core.junit import Case
 from harness.core.junit import junit as test_suite
 from harness.prompts.difference import PromptChange
@@ -281,8 +281,8 @@ def _difference(d: Difference) -> dict[str, Any]:
         "a": d.a,
         "b": d.b,
         "difference": d.change.value,
-        "low": known(d.change.low),
-        "high": known(d.change.high),
+        "low": number_or_none(d.change.low),
+        "high": number_or_none(d.change.high),
         "n": d.change.n,
         "n_excluded": d.change.n_excluded,
         "p": d.p_value,

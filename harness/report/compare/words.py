@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import printable
-from harness.core.figures import POINTS, amount, crossed, shown, within
+from harness.core.figures import POINTS, amount, crossed, interval_of, within
 from harness.core.multiplicity import LEVEL
 from harness.prompts.difference import marked
 from harness.prompts.versions import as_it_was
@@ -184,7 +184,7 @@ def _any_time(pair: Pair) -> Iterator[str]:
         success = Success.of(ends, lead_of(pair.a.run, pair.b.run))
         a = pair.values(pair.a, SUCCESS, condition).T
         b = pair.values(pair.b, SUCCESS, condition).T
-        change = shown(success.any_time_difference(b, a), POINTS, "+")
+        change = interval_of(success.any_time_difference(b, a), POINTS, "+")
         yield (
             f"{printable(condition)}: {success.words} B - A {change} points, by an interval of "
             "every look"
@@ -229,7 +229,7 @@ def adjusted(c: InCondition) -> Iterator[str]:
         if better and changes[metric].n >= SHOWN_FROM:
             gained = as_good_as(changes[metric], better)
             yield (
-                f"{name} adjusted for difficulty: B - A {shown(better, POINTS, '+')} points, "
+                f"{name} adjusted for difficulty: B - A {interval_of(better, POINTS, '+')} points, "
                 f"{gained}"
             )
 

@@ -138,7 +138,7 @@ def command(
             "evaluation": settings_as_file(to_builtins(settings)),
         }
     )
-    if begun := work.begun(where, work.WorkStart):
+    if begun := work.start_of(where, work.WorkStart):
         work.same(where, begins.settings, begun.settings)
     cache, label = None if no_cache else default_file(), f"asking {printable(settings.model, 30)}"
     with (

@@ -9,7 +9,7 @@ from harness.core.errors import UserError, printable
 from harness.core.formats import WORK
 from harness.core.parallel import Workers
 from harness.core.progress import Progress
-from harness.core.seeds import FIRST, Purpose, purposes, stated
+from harness.core.seeds import FIRST, Purpose, purposes, seeds_text
 from harness.dataset import load, rebuilt
 from harness.dataset.schema import Manifest
 from harness.dataset.verify import scenario_of
@@ -28,7 +28,7 @@ def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) ->
     """
     if purposes(first, count) != [wanted]:
         raise UserError(
-            f"{option} {printable(name)}: {stated(first, count)}; a prompt is searched on tune "
+            f"{option} {printable(name)}: {seeds_text(first, count)}; a prompt is searched on tune "
             f"seeds ({FIRST['tune']} to {FIRST['train'] - 1}) and certified on report seeds (from "
             f"{FIRST['report']})"
         )

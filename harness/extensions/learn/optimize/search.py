@@ -15,10 +15,10 @@ import numpy as np
 from harness.backends.swarm import open_each, together
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
-from harness.core.figures import POINTS, as_mapping, shown, within
+from harness.core.figures import POINTS, as_mapping, interval_of, within
 from harness.core.files import BROKEN, text_of
 from harness.core.progress import Progress
-from harness.core.seeds import stated
+from harness.core.seeds import seeds_text
 from harness.core.statistics import Estimate, mean_of
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
@@ -266,8 +266,8 @@ def _study(
             estimates.append({"dataset": name, "side": side, **ends(estimate)})
         families.append(family)
         gained = row["difference"]
-        points = shown(gained, POINTS, "+")
-        cells.append((name, shown(row[OLD]), shown(row[NEW]), points, str(gained.n)))
+        points = interval_of(gained, POINTS, "+")
+        cells.append((name, interval_of(row[OLD]), interval_of(row[NEW]), points, str(gained.n)))
     report_seeds = [_seeds(spec) for spec in report]
     certificate = {
         "metric": success.metric,
@@ -279,8 +279,8 @@ def _study(
     manifest |= {"certificate": certificate, "looks": look}
     gain, what = rows[-1]["difference"], success.words
     headline = [
-        f"{plan.version} against {base.version}: {shown(gain, POINTS, '+')} points of {what} on "
-        f"report layouts, {_verdict(gain)} (n = {gain.n} layouts, paired, 95 % interval over "
+        f"{plan.version} against {base.version}: {interval_of(gain, POINTS, '+')} points of {what} "
+        f"on report layouts, {_verdict(gain)} (n = {gain.n} layouts, paired, 95 % interval over "
         f"layouts; {', '.join(report_seeds)}, read once, after the search).",
         f"On the tune layouts that chose it: {100 * _mean(tuning, best):.1f} % against "
         f"{100 * _mean(tuning, first):.1f} %. {searched}; the best is: "
@@ -339,7 +339,7 @@ def _about(plan: Search) -> str:
 def _seeds(spec: Spec) -> str:
     """Return the layout seeds of an evaluation in words."""
     seeds = list(spec.source.layout_seeds)
-    return stated(min(seeds), max(seeds) - min(seeds) + 1)
+    return seeds_text(min(seeds), max(seeds) - min(seeds) + 1)
 
 
 def _mean(tuning: Tuning, record: Record) -> float:

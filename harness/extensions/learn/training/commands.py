@@ -15,7 +15,7 @@ from harness.cli.scenario import ready_to_drive
 from harness.core import extras, resources
 from harness.core.errors import UserError, in_range, printable, unknown
 from harness.core.files import write_whole
-from harness.core.seeds import FIRST, LAST_SEED, purpose, stated
+from harness.core.seeds import FIRST, LAST_SEED, purpose, seeds_text
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
@@ -104,8 +104,8 @@ def distill(
     driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]
     if purpose(first_seed, layouts) != "train":
         raise UserError(
-            f"--first-seed {first_seed}: {stated(first_seed, layouts)}; a model learns from train "
-            f"seeds alone, {FIRST['train']} to {FIRST['report'] - 1}"
+            f"--first-seed {first_seed}: {seeds_text(first_seed, layouts)}; a model learns from "
+            f"train seeds alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
     learnt = {}
     for each in driven:

@@ -99,7 +99,7 @@ def distill(
         )
     learnt = curriculum.settings()  # once: the base's file may change while this learns from it
     settings = {**learnt, **plan.settings()}
-    if begun := work.begun(out, work.WorkStart):
+    if begun := work.start_of(out, work.WorkStart):
         work.same(out, settings, begun.settings)
     with work.working(out, begun or work.WorkStart(settings=settings)) as place:
         layouts, seed, folder = curriculum.layouts, curriculum.seed, place / "lessons"

@@ -16,7 +16,7 @@ import numpy as np
 from harness.backends.base import BARE
 from harness.core.errors import UserError, printable
 from harness.core.files import write_whole
-from harness.core.seeds import FIRST, purpose, stated
+from harness.core.seeds import FIRST, purpose, seeds_text
 from harness.dataset import rebuilt
 from harness.evaluate.agent import in_mode, sent_messages
 from harness.evaluate.fusion import messages_of, source_of
@@ -72,8 +72,8 @@ def _check_seeds(what: str, seeds: Collection[int]) -> None:
     least, most = min(seeds), max(seeds)
     if most >= FIRST["report"]:
         raise UserError(
-            f"{what} has {stated(least, most - least + 1)}, and a model that learns from them can "
-            "no longer be measured on them; make a run on a dataset of train seeds, `harness "
+            f"{what} has {seeds_text(least, most - least + 1)}, and a model that learns from them "
+            "can no longer be measured on them; make a run on a dataset of train seeds, `harness "
             f"dataset build --seed {FIRST['train']}`, or give --report-seeds-too"
         )
 

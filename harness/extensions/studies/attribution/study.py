@@ -21,7 +21,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import PERCENT, Unit, as_mapping, some_of
-from harness.core.figures import shown as figure
+from harness.core.figures import interval_of as figure
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate, rate_interval
 from harness.dataset.load import Scene

@@ -19,7 +19,7 @@ from harness.backends.registry import open_backend
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
-from harness.core.figures import PLAIN, crossed, shown
+from harness.core.figures import PLAIN, crossed, interval_of
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled_estimate
@@ -425,9 +425,10 @@ def _halves(grid: Grid, h: Halves) -> str:
         verdict = "the choice of the helpers matters more"
     return (
         f"Under {h.condition}, {verdict}: the choice among {grid.rows} egos explains "
-        f"{shown(h.ego)} % of the differences in {grid.success_rule.words} between the "
+        f"{interval_of(h.ego)} % of the differences in {grid.success_rule.words} between the "
         f"{len(grid.cells)} combinations, the choice among {grid.columns} helpers "
-        f"{shown(h.helpers)} %, both together {shown(h.together)} % (n = {h.ego.n} episodes)."
+        f"{interval_of(h.helpers)} %, both together {interval_of(h.together)} % "
+        f"(n = {h.ego.n} episodes)."
     )
 
 
@@ -459,7 +460,7 @@ def _cells(grid: Grid, condition: str, out: Path, terminal: bool) -> Table:
     best = {cell.run.path for cell in front(grid, condition)}
     place, rows = beside(out / "index.html"), []
     for cell in sorted(grid.cells, key=lambda cell: -grid.success(cell, condition).value):
-        success = shown(grid.success(cell, condition))
+        success = interval_of(grid.success(cell, condition))
         latency = f"{cell.estimate(LATENCY, condition).value:.1f}{' ◆' * (cell.run.path in best)}"
         tokens_of_decision = PLAIN.number(cell.estimate("tokens", condition).value)
         agents = f"{cell.ego.name} + {cell.helper.name}"
@@ -484,7 +485,7 @@ def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
     effects = [effect for effect in grid.effects if effect.condition == condition]
     effects = [effect for effect in effects if not np.isnan(effect.estimate.value)]
     effects.sort(key=lambda effect: -abs(effect.estimate.value))
-    rows = [(effect.what, shown(effect.estimate), p_cell(effect.p)) for effect in effects]
+    rows = [(effect.what, interval_of(effect.estimate), p_cell(effect.p)) for effect in effects]
     return Table(
         f"Effect of each choice, {condition}",
         ("effect", "points, 95 % CI", "p"),

@@ -106,7 +106,7 @@ class Questions:
     def goes_on(self, out: Path) -> bool:
         """Return whether the folder `out` has this study, stopped, with no process on it."""
         try:
-            left = work.begun(out, work.WorkStart)
+            left = work.start_of(out, work.WorkStart)
             if work.idle(out):
                 return not work.held(out)
             if left is None or (out / RESULT).exists() or work.held(out):
@@ -160,7 +160,7 @@ def ask(
         _identity, [questions.spec], workers, lambda done: None, lambda spec: name, False
     )
     begun = questions.begin(identity)
-    if left := work.begun(out, work.WorkStart):
+    if left := work.start_of(out, work.WorkStart):
         work.same(out, begun.settings, left.settings)
     with work.working(out, begun, RESULT) as place:
         points = [

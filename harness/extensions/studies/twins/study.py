@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from markupsafe import Markup, escape
 
-from harness.core.figures import PERCENT, Unit, as_mapping, shown
+from harness.core.figures import PERCENT, Unit, as_mapping, interval_of
 from harness.core.files import write_whole
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
@@ -128,8 +128,8 @@ def _cells(questions: Questions, row: Row) -> list[str]:
         Markup('<span id="{}">{}</span>').format(name, row.twin.name),
         row.role,
         row.twin.holds,
-        shown(row.invariance_rate),
-        shown(row.tv_distance, DISTANCE),
+        interval_of(row.invariance_rate),
+        interval_of(row.tv_distance, DISTANCE),
         PERCENT.number(row.failed_rate.value),
         str(row.invariance_rate.n),
         "100" if constant_holds(questions, row.twin) else "0",
