@@ -130,11 +130,11 @@ def build(
         return finished
     part = str(shard or "")
     own_episodes = shard.part(range(episodes)) if shard else range(episodes)
-    if begun := work.start_of(out, work.WorkStart):
-        work.same(out, {**config, "shard": part}, {**begun.settings, "shard": begun.shard})
+    if start := work.start_of(out, work.WorkStart):
+        work.same(out, {**config, "shard": part}, {**start.settings, "shard": start.shard})
     elif scenario.world:
         scenario.world.examine(scenario, seed)
-    with work.working(out, begun or work.WorkStart(settings=config, shard=part)) as place:
+    with work.working(out, start or work.WorkStart(settings=config, shard=part)) as place:
         _freeze_missing(scenario, place, seed, own_episodes, workers, progress)
         if shard:
             return config
@@ -175,13 +175,13 @@ def merge(
     The bytes are the same. Raises UserError as `build`, or if the folders are not all the shards of
     one build, a shard is unfinished, or two hold different bytes for the same layout.
     """
-    begun = shards.read(folders, work.WorkStart)
-    config = begun[0].settings
+    starts = shards.read(folders, work.WorkStart)
+    config = starts[0].settings
     with shards.made_whole(folders, out):
         in_range("episodes of a shard's dataset", config["episodes"], 1, LAST_EPISODE + 1)
         in_range("seed of a shard's dataset", config["seed"], 0, LAST_SEED)
         episodes = {part_of(e): e for e in range(config["episodes"])}
-        parts = shards.owners(folders, begun, list(episodes), lambda part: named(episodes[part]))
+        parts = shards.owners(folders, starts, list(episodes), lambda part: named(episodes[part]))
         if not (out / "manifest.json").exists():
             whole = work.WorkStart(settings=config)
             if stopped := work.start_of(out, work.WorkStart):

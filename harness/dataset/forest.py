@@ -142,9 +142,9 @@ class Forest:
         """Earliest time (s) at which the goal can be reached after each action, (N, A), or inf."""
         earliest_s = self.cleared_s[self.edge]
         for rows in self._levels_backwards():
-            leads = self.child[rows] >= 0
+            has_child = self.child[rows] >= 0
             after = earliest_s[self.child[rows]].min(axis=-1)
-            earliest_s[rows] = np.where(leads, after, earliest_s[rows])
+            earliest_s[rows] = np.where(has_child, after, earliest_s[rows])
         return earliest_s
 
     @cached_property

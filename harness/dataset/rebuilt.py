@@ -73,8 +73,9 @@ def differences(dataset: Dataset) -> Iterator[str]:
     if numbers:
         from importlib.metadata import version
 
-        stated, here = dataset.manifest.versions.get("highway-env", "none"), version("highway-env")
-        versions = "" if here == stated else f" by highway-env {here}, of {printable(stated, 20)}"
+        stated_version = dataset.manifest.versions.get("highway-env", "none")
+        here, there = version("highway-env"), printable(stated_version, 20)
+        versions = "" if here == stated_version else f" by highway-env {here}, of {there}"
         seed = dataset.manifest.seed + numbers[0]
         more = f"; {len(numbers) - 1} more" if len(numbers) > 1 else ""
         yield f"layout {numbers[0]} is not what layout seed {seed} gives{versions}{more}"
@@ -121,13 +122,13 @@ def _other_trees(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
     return differing
 
 
-def _courses(levels: Sequence[Sequence[Branching]], stated: Tree) -> list[list[object]]:
+def _courses(levels: Sequence[Sequence[Branching]], stored_tree: Tree) -> list[list[object]]:
     """Return the decision points of a layout by step, what drivers do there,
     and where each action leads.
 
-    Without what an older dataset, as its tree is stated, does not have of an edge.
+    Edges are without what that of an older dataset, `stored_tree`, does not have.
     """
-    has_conflicts = stated.levels[0][0].edges[0].ttc_s is not UNSET
+    has_conflicts = stored_tree.levels[0][0].edges[0].ttc_s is not UNSET
     courses = []
     for level in levels:
         points: list[object] = []
@@ -171,5 +172,5 @@ def _coarse(vehicle: VehicleState) -> dict[str, object]:
     """Return a vehicle with its numbers to 0.01,
     since a difference of a rounding makes no other layout.
     """
-    stated = to_builtins(vehicle).items()
-    return {key: round(value, 2) if isinstance(value, float) else value for key, value in stated}
+    fields = to_builtins(vehicle).items()
+    return {key: round(value, 2) if isinstance(value, float) else value for key, value in fields}

@@ -58,9 +58,9 @@ class Selection:
         if self.sample is not None:
             numbers = drawn(numbers, self.sample, self.sample_seed, max(dataset.episodes) + 1)
         if not numbers:
-            shown = ", ".join(f"--{key} {printable(value)}" for key, value in self.given.items())
+            options = ", ".join(f"--{key} {printable(value)}" for key, value in self.given.items())
             raise UserError(
-                f"{shown}: no episode of {printable(dataset.name)} matches; give other values"
+                f"{options}: no episode of {printable(dataset.name)} matches; give other values"
             )
         return dataset.of_episodes(frozenset(numbers[: self.limit]))
 
