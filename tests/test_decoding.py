@@ -65,7 +65,7 @@ def ask(
         {"role": "user", "content": f"Scene {i * 'x'}: truck {i * 7} m"},
     )
     if answer == "readout":
-        messages = readout.asked(messages, actions)
+        messages = readout.letter_chat(messages, actions)
     options = {"max_tokens": 12 if answer == "json" else 80, **options}
     return Request(f"s{i}/{role}", role, messages, actions, answer=answer, **options)
 
@@ -338,7 +338,7 @@ def test_one_spelling_alone_is_read_out_to_the_last_bit_as_ever() -> None:
     [answer] = Decoding(engine).answer([ask(0, "readout")], [[[5, 6]]])
     log_p = [math.log(x) for x in p.values()]
     weights = [math.exp(x - max(log_p)) for x in log_p]
-    assert answer.text == readout.stated(ACTIONS, weights)
+    assert answer.text == readout.answer_json(ACTIONS, weights)
     assert answer.label_mass == math.exp(max(log_p)) * sum(weights)
 
 

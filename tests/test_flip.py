@@ -66,12 +66,14 @@ class Taking:
 
     def text(self, request: Request) -> str:
         if self.of_actions:
-            return readout.stated(request.actions, [self.of_actions[a] for a in request.actions])
+            return readout.answer_json(
+                request.actions, [self.of_actions[a] for a in request.actions]
+            )
         if request.orders:
             return average_orders(
                 request.actions, [self.of_letters] * (1 + len(request.orders))
             ).text
-        return readout.stated(request.actions, self.of_letters)
+        return readout.answer_json(request.actions, self.of_letters)
 
 
 @LETTERS

@@ -266,7 +266,7 @@ def test_tokens_that_are_none_fail_and_the_next_prompts_do_not(tiny: Path, their
 def in_mode(request: Request, answer: Any) -> Request:
     messages = request.messages
     if answer == "readout":
-        messages = readout.asked(messages, request.actions)
+        messages = readout.letter_chat(messages, request.actions)
     return replace(request, answer=answer, messages=messages, max_tokens=32)
 
 

@@ -23,7 +23,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.prompts.answer_schema import Shape
-from harness.prompts.readout import letters, stated
+from harness.prompts.readout import answer_json, letters
 
 
 class Choice:
@@ -276,7 +276,9 @@ def _completion_of_letters(
     largest = max(max(of_tokens) for of_tokens in of_letters)
     weights = _letter_weights(of_letters, largest)
     mass = min(1.0, math.exp(largest) * sum(weights))
-    return _completion(request, stated(request.actions, weights), 1, batch_size, label_mass=mass)
+    return _completion(
+        request, answer_json(request.actions, weights), 1, batch_size, label_mass=mass
+    )
 
 
 def _letter_weights(log_p: Sequence[Sequence[float]], scale_log_p: float = 0.0) -> list[float]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.prompts.readout import stated
+from harness.prompts.readout import answer_json
 
 LEAST_P = 1e-9  # a letter to which a server's list leaves nothing
 
@@ -45,7 +45,7 @@ def average_orders(actions: Sequence[str], letters_p: Sequence[Sequence[float]])
     total = float((within**2).sum())
     of_letter = len(p) * float((within.mean(axis=0) ** 2).sum())
     return AveragedReadOut(
-        text=stated(actions, weights.tolist()),
+        text=answer_json(actions, weights.tolist()),
         label_mass=min(1.0, float(mass.mean())),
         letter_share=round(min(1.0, of_letter / total), 6) if total > 0 else 0.0,
         follows_letter=len(set(log_p.argmax(axis=1).tolist())) == 1,

@@ -182,7 +182,9 @@ class Agent:
                 lambda order: in_mode(self.answer, self.prompt, rendered, graph, order, words),
             )
         question = decision.question(rendered, graph, actions, words)
-        chats = self.in_orders(actions, lambda order: decision.asked(question, rendered, order))
+        chats = self.in_orders(
+            actions, lambda order: decision.letter_chat(question, rendered, order)
+        )
         return {**chats, "question": question}
 
     def in_orders(
@@ -265,10 +267,10 @@ def in_mode(
     """
     if answer == "decision":
         question = decision.question(messages, graph, actions, words)
-        return decision.asked(question, messages, actions)
+        return decision.letter_chat(question, messages, actions)
     if answer != "readout":
         return tuple(messages)
-    return readout.asked(messages, actions, example_actions(prompt, graph.role, actions))
+    return readout.letter_chat(messages, actions, example_actions(prompt, graph.role, actions))
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:

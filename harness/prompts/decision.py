@@ -68,16 +68,16 @@ def question(
     care = CARE[graph.role]
     if graph.role == "ego":
         hidden = f" Other cars may be hidden by {hiding}." if hiding else ""
-        asked = (
+        instructions = (
             f"You drive car {ego}. Your task: {task}.{hidden} {care} What do you do in the next "
             "second?"
         )
     else:
-        asked = (
+        instructions = (
             f"You help car {ego}, which does not see all that you see. Its task: {task}. {care} "
             f"What should {ego} do in the next second?"
         )
-    return Question(messages[-1]["content"], asked, {a: _meaning(a, words) for a in actions})
+    return Question(messages[-1]["content"], instructions, {a: _meaning(a, words) for a in actions})
 
 
 def _meaning(action: str, words: Mapping[str, str]) -> str | None:
@@ -85,7 +85,7 @@ def _meaning(action: str, words: Mapping[str, str]) -> str | None:
     return text and text.replace("{speeds}", words.get("speeds", "those there are"))
 
 
-def asked(
+def letter_chat(
     question: Question, messages: Sequence[Mapping[str, str]], order: Sequence[str]
 ) -> tuple[Mapping[str, str], ...]:
     """Return the chat messages that ask a chat model the same question, to answer by one letter.
@@ -98,4 +98,4 @@ def asked(
         f"{action}: {text}" if text else action for action, text in zip(order, meant, strict=True)
     ]
     user = {**messages[-1], "content": "\n".join([question.state, *options])}
-    return readout.asked(({"role": "system", "content": question.instructions}, user), order)
+    return readout.letter_chat(({"role": "system", "content": question.instructions}, user), order)

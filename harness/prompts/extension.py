@@ -84,16 +84,16 @@ def _schema(schema: object, what: str, depth: int) -> dict[str, Any]:
     if depth > MOST_DEPTH:
         raise UserError(f"{what} is nested {depth} deep; give at most {MOST_DEPTH}")
     kind = schema.get("type")
-    known = KEYWORDS.get(kind) if isinstance(kind, str) else None
+    keywords = KEYWORDS.get(kind) if isinstance(kind, str) else None
     every = {word for words in KEYWORDS.values() for word in words}
     for word in schema:
-        if word != "type" and word not in (every if known is None else known):
-            of = "a schema" if known is None else f"type {kind}"
-            allowed = ", ".join(("type", *(sorted(every) if known is None else known)))
+        if word != "type" and word not in (every if keywords is None else keywords):
+            of = "a schema" if keywords is None else f"type {kind}"
+            allowed = ", ".join(("type", *(sorted(every) if keywords is None else keywords)))
             raise UserError(
                 f"{what}: {of} may not have {printable(word, 40)!r}; allowed: {allowed}"
             )
-    if known is None:
+    if keywords is None:
         raise UserError(f"{what}: type {printable(kind, 40)!r}; give one of {', '.join(KEYWORDS)}")
     if kind == "string":
         return {"type": kind, **_text(schema, what)}

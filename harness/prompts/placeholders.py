@@ -15,8 +15,8 @@ def placeholders(template: str) -> tuple[str, ...]:
 
     A value ends where Jinja fills something in.
     """
-    shown = _JINJA.sub(_FILLED, template)
+    text = _JINJA.sub(_FILLED, template)
     values = [
-        value.partition(_FILLED)[0].strip().strip('"').strip() for value in _MEMBER.findall(shown)
+        value.partition(_FILLED)[0].strip().strip('"').strip() for value in _MEMBER.findall(text)
     ]
     return tuple(dict.fromkeys(value for value in values if value))

@@ -50,7 +50,7 @@ def question(actions: Sequence[str]) -> str:
     return f"Answer with one letter: {options}."
 
 
-def asked(
+def letter_chat(
     messages: Sequence[Mapping[str, str]], actions: Sequence[str], answered: Sequence[str] = ()
 ) -> tuple[Mapping[str, str], ...]:
     """Return a chat in which every question asks for the letter of an action.
@@ -68,7 +68,7 @@ def asked(
     return tuple({**message, "content": content(message)} for message in messages)
 
 
-def stated(actions: Sequence[str], shares: Sequence[float]) -> str:
+def answer_json(actions: Sequence[str], shares: Sequence[float]) -> str:
     """Return the JSON of an answer with these shares of the actions, normalised, in millionths."""
     total = math.fsum(shares)
     p = rounded([share / total for share in shares], parts=10**6)

@@ -173,8 +173,8 @@ class Prompt:
         helpers to the ego, with `sender`, `evidence`, `risk`, `intent`, `recommended_maneuver` and
         `confidence`; or with `sender` and `evidence` alone if the version `shows_words`; or agents'
         plans if it `shows_plans` (`fusion.messages_of`). `words` are texts by which the scenario
-        describes itself. If `letter` is true, a letter is asked for (`readout.asked`) in place of
-        the block `question`. Raises UserError if the template fails.
+        describes itself. If `letter` is true, a letter is asked for (`readout.letter_chat`) in
+        place of the block `question`. Raises UserError if the template fails.
         """
         system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
         turns = self._turns(graph.role, actions, words, letter)

@@ -191,7 +191,7 @@ def test_a_page_names_the_answer_mode_and_has_the_prompt_of_a_read_out(dataset, 
         [scene] = dataset.scenes([answer.scene])
         shown = V2.render(scene.graphs[answer.viewer], dataset.actions)
         return structs.replace(
-            answer, prompt_sha256=digest(readout.asked(shown, dataset.actions)), **said
+            answer, prompt_sha256=digest(readout.letter_chat(shown, dataset.actions)), **said
         )
 
     run = write_run(tmp_path / "run", dataset, change=as_read_out)

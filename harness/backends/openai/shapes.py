@@ -18,7 +18,7 @@ from harness.backends.openai.said import NoText, in_texts, refusal, thought
 from harness.backends.servers import MOST_LOGPROBS, Kind, Server
 from harness.core.errors import UserError
 from harness.core.image import Image
-from harness.prompts.readout import letters, spelt, stated
+from harness.prompts.readout import answer_json, letters, spelt
 
 _REMEDY = (
     "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
@@ -191,7 +191,7 @@ def _read_out(
     rest_p = max(0.0, 1.0 - total) / max(1, len(missing))
     for name in missing:
         letter_p[name] = min(least_listed_p, rest_p)
-    text = stated(request.actions, list(letter_p.values()))
+    text = answer_json(request.actions, list(letter_p.values()))
     tokens = prompt_tokens, completion_tokens
     return Completion(request.id, text, *tokens, "stop", None, 1, label_mass=min(1.0, mass))
 

@@ -130,7 +130,7 @@ def _plain(agent: Agent, fact: Fact, number: int, present: str, absent: str) -> 
 
     def half(end: str, text: str) -> Request:
         chat = [{"role": "user", "content": text}]
-        chats = agent.in_orders(YES_NO, lambda order: readout.asked(chat, order))
+        chats = agent.in_orders(YES_NO, lambda order: readout.letter_chat(chat, order))
         return agent.blank("ego", YES_NO).alike(id=f"{fact}-{number}{end}/ego", **chats)
 
     return Pair(fact, "YES", half("a", present), half("b", absent))

@@ -103,7 +103,7 @@ class ServedModel:
             )
         turn = {"role": "user", "image": "camera"} if image else {"role": "user"}
         chats = self._agent.in_orders(
-            asked.options, lambda order: decision.asked(asked.question, (turn,), order)
+            asked.options, lambda order: decision.letter_chat(asked.question, (turn,), order)
         )
         blank = self._agent.blank("ego", asked.options)
         return blank.alike(

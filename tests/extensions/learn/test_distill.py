@@ -334,7 +334,7 @@ def test_its_tokenizer_renders_the_chat_that_it_was_trained_on(
 
     tokenizer = AutoTokenizer.from_pretrained(student)
     for q in (*asked[:8], *asked[-8:]):
-        sent = readout.asked(q.messages, q.actions)
+        sent = readout.letter_chat(q.messages, q.actions)
         rendered = tokenizer.apply_chat_template(
             [dict(m) for m in sent], tokenize=False, add_generation_prompt=True
         )
