@@ -49,8 +49,8 @@ def read(
     actions, repairs = shape.actions, set(so_far)
     names = tuple(shape.further)
     if not isinstance(members, Repeated):
-        members, found = pieces.gathered(members, shape.role, actions, names)
-        repairs |= found
+        members, found_repairs = pieces.gathered(members, shape.role, actions, names)
+        repairs |= found_repairs
     fields, rest = values.sort_fields(members, FIELDS[shape.role] + names, repairs)
     extension = None
     if names:
@@ -74,10 +74,10 @@ def read(
     if "confidence" in fields:  # which has no sum to tell percent by
         fields["confidence"] = values.in_percent(fields["confidence"], list(rest.values()))
     if "action_distribution" in fields:
-        fields["action_distribution"], found = pieces.distribution_in(
+        fields["action_distribution"], found_repairs = pieces.distribution_in(
             fields["action_distribution"], actions
         )
-        repairs |= found
+        repairs |= found_repairs
 
     if _is_other_form(fields, shape):
         repairs.add(Repair.OTHER_FORM)
@@ -198,12 +198,12 @@ def _lists(value: str, options: Sequence[str]) -> bool:
 
 
 def _confidence(value: object, repairs: set[Repair]) -> float:
-    stated, percent = values.number("confidence", value, repairs)
+    confidence, percent = values.number("confidence", value, repairs)
     if percent:
         repairs.add(Repair.PERCENT)
-        stated /= 100
-    values.check_range("confidence", stated)
-    return abs(stated)
+        confidence /= 100
+    values.check_range("confidence", confidence)
+    return abs(confidence)
 
 
 def _evidence(value: object, shape: Shape, repairs: set[Repair]) -> str | None:

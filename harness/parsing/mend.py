@@ -74,16 +74,16 @@ def around(
         [name] = [key for key, member in members.items() if member == _HOLE]
     except Exception:  # any error of a third-party reader is a syntax error of the text
         raise unreadable() from None
-    known = {key: member for key, member in members.items() if key != name}
-    texts = [member for member in known.values() if isinstance(member, str)]
+    other_members = {key: member for key, member in members.items() if key != name}
+    texts = [member for member in other_members.values() if isinstance(member, str)]
     repeated = any(len(re.findall(rf'"{re.escape(field)}"\s*:', source)) > 1 for field in fields)
     if repeated or not set(members) <= set(fields) or not all(member in source for member in texts):
         raise unreadable()
-    if _numbers(list(known.values())) != [
+    if _numbers(list(other_members.values())) != [
         float(number) for number in _NUMBER.findall(source[:at] + source[end:])
     ]:
         raise unreadable()
-    return known, name, text[len(source) :]
+    return other_members, name, text[len(source) :]
 
 
 def _numbers(value: object) -> list[float]:

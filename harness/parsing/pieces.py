@@ -65,15 +65,15 @@ def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list
 
     They are beside the schema's keywords, or under `properties` in place of types.
     """
-    found: list[Found] = []
-    own = {key: value for key, value in schema.items() if key not in _OF_A_SCHEMA}
-    if _states(own, role, actions):
-        found.append((own, frozenset({Repair.EXTRA_FIELD})))
+    answers: list[Found] = []
+    outer = {key: value for key, value in schema.items() if key not in _OF_A_SCHEMA}
+    if _states(outer, role, actions):
+        answers.append((outer, frozenset({Repair.EXTRA_FIELD})))
     members = _properties(schema)
     inner = type(members)({key: _properties(value) for key, value in members.items()})
     if members is not schema and _states(inner, role, actions):
-        found.append((inner, frozenset({Repair.NESTED})))
-    return found
+        answers.append((inner, frozenset({Repair.NESTED})))
+    return answers
 
 
 def distribution_in(value: object, actions: Sequence[str]) -> tuple[Any, frozenset[Repair]]:
@@ -99,8 +99,10 @@ def _states(members: dict[str, Any], role: str, actions: Sequence[str]) -> bool:
     """
     shares = [value for key, value in members.items() if match(key, (_DISTRIBUTION,))]
     for each in (members, *(share for share in shares if isinstance(share, dict))):
-        stated = [value for key, value in each.items() if match(key, (NAMED[role], *actions))]
-        if stated and all(isinstance(value, str | float) for value in stated):
+        answer_values = [
+            value for key, value in each.items() if match(key, (NAMED[role], *actions))
+        ]
+        if answer_values and all(isinstance(value, str | float) for value in answer_values):
             return True
     return False
 

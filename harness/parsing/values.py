@@ -42,17 +42,17 @@ _WORDS = re.compile(
 Intent = tuple[float, ...]
 
 
-def match(name: str, known: Sequence[str]) -> str | None:
-    """Return the one of the `known` names that is meant; None if there is none, or several.
+def match(name: str, names: Sequence[str]) -> str | None:
+    """Return the one of `names` that is meant; None if there is none, or several.
 
     Letter case and separators may differ. A name behind a sign that denies it, such as !SLOWER, is
     not meant.
     """
-    if name in known:
+    if name in names:
         return name
     if name.lstrip().startswith(_NOT):
         return None
-    similar = [candidate for candidate in known if _plain(candidate) == _plain(name)]
+    similar = [candidate for candidate in names if _plain(candidate) == _plain(name)]
     return similar[0] if len(similar) == 1 else None
 
 
@@ -61,7 +61,7 @@ def _plain(name: str) -> str:
 
 
 def sort_fields(
-    members: dict[str, Any], known: Sequence[str], repairs: set[Repair]
+    members: dict[str, Any], names: Sequence[str], repairs: set[Repair]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Split members into those with a known name, under that name, and the rest.
 
@@ -73,7 +73,7 @@ def sort_fields(
     fields: dict[str, Any] = {}
     rest: dict[str, Any] = {}
     for key, value in members.items():
-        name = match(key, known)
+        name = match(key, names)
         if name is None:
             rest[key] = value
             continue
@@ -111,13 +111,13 @@ def distribution(
             failures.append(Failure(Status.UNKNOWN_ACTION, detail))
     if missing := [action for action in actions if action not in fields]:
         failures.append(Failure(Status.MISSING_ACTION, f"no probability for {', '.join(missing)}"))
-    stated = []
+    stated_numbers = []
     for action in [action for action in actions if action in fields]:
         with noted(failures):
-            stated.append(number(action, fields[action], repairs))
+            stated_numbers.append(number(action, fields[action], repairs))
     if failures:
         raise joined(failures)
-    numbers = _in_unit(stated, repairs)
+    numbers = _in_unit(stated_numbers, repairs)
     for action, probability in zip(actions, numbers, strict=True):
         with noted(failures):
             check_range(action, probability)
@@ -165,8 +165,8 @@ def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]
         elif _NON_FINITE.fullmatch(text):
             value = math.nan
     if type(value) is not float:
-        shown = f": {printable(value, 40)!r}" if isinstance(value, str | bool) else ""
-        raise Failure(Status.NON_NUMERIC, f"{printable(name, 40)} is no number{shown}")
+        value_text = f": {printable(value, 40)!r}" if isinstance(value, str | bool) else ""
+        raise Failure(Status.NON_NUMERIC, f"{printable(name, 40)} is no number{value_text}")
     if not math.isfinite(value):
         raise Failure(Status.NON_FINITE, f"{printable(name, 40)} is not finite")
     return value, percent
@@ -197,10 +197,10 @@ def in_percent(value: object, rest: Sequence[object]) -> object:
 
     `rest` are the values of the members beside it. Any other value is returned as it is.
     """
-    stated = any(
+    has_unit = any(
         isinstance(each, str) and each.strip().casefold() in _PERCENT_WORDS for each in rest
     )
-    return f"{value}%" if stated and type(value) is float else value
+    return f"{value}%" if has_unit and type(value) is float else value
 
 
 def is_placeholder(value: object) -> bool:
