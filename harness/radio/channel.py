@@ -62,7 +62,7 @@ class Site:
 
     def take(self, at: Any) -> "Site":
         """Return the part with these indices of the first batch dimension."""
-        units = {unit: its.take(at) for unit, its in self.units.items()}
+        units = {unit: site.take(at) for unit, site in self.units.items()}
         return Site(
             self.xy_m[at],
             self.sight[at],
@@ -89,7 +89,7 @@ class Site:
             np.take_along_axis(self.blocker_m, places, axis=-1),
             np.take_along_axis(self.corner_m, places[..., None], axis=-2),
             self.first_m,
-            {unit: its.of_helpers(with_ego) for unit, its in self.units.items()},
+            {unit: site.of_helpers(with_ego) for unit, site in self.units.items()},
         )
 
 

@@ -134,19 +134,19 @@ def by_unit(
     ask = broadcast(channel, bits, to_helpers)
     unit_s = heard_s(channel, to_unit, ego_link, to_ego.first)
     ready_s = ready(unit_s + delay_s + heard_s(channel, ask, helper_links, to_helpers))
-    asked = links.asked & reached[..., None]
-    replies = delivered(channel, replace(helper_links, asked=asked, ready_s=ready_s), to_helpers)
+    is_asked = links.asked & reached[..., None]
+    replies = delivered(channel, replace(helper_links, asked=is_asked, ready_s=ready_s), to_helpers)
     back = broadcast(channel, bits, replace(to_ego, given=back_draw[..., None]))
     back_s = delay_s + heard_s(channel, back, ego_link, draws.of(".roadside-policy").first)[..., 0]
     latest_s = left_s - back_s
     sent = reached & (latest_s >= unit_s[..., 0])
     crossed = sent & (policy_draw >= lost(bits))
-    replied_s = np.max(np.where(asked, replies.delay_s, 0.0), axis=-1, initial=0.0)
-    up = asked & replies.up & (crossed | ~sent)[..., None]
+    replied_s = np.max(np.where(is_asked, replies.delay_s, 0.0), axis=-1, initial=0.0)
+    up = is_asked & replies.up & (crossed | ~sent)[..., None]
     parts = ((wanted, to_unit), (reached, ask), (sent, back))
     airtime_s = sum(np.where(happened, part.airtime_s, 0.0) for happened, part in parts)
     return Consulted(
-        asked=asked,
+        asked=is_asked,
         up=up,
         end_s=replies.delay_s,
         fused=up & crossed[..., None] & (replies.delay_s <= latest_s[..., None]),
@@ -157,7 +157,7 @@ def by_unit(
         requests=wanted.astype(int) + reached,
         request_bits=bits * (2.0 * wanted + reached),
         policy_bits=bits * sent,
-        airtime_s=airtime_s + np.sum(np.where(asked, replies.airtime_s, 0.0), axis=-1),
+        airtime_s=airtime_s + np.sum(np.where(is_asked, replies.airtime_s, 0.0), axis=-1),
     )
 
 

@@ -66,24 +66,24 @@ def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
     if is_ours(channel):
         return channel.deliver(links, draws)
     up, delay_s, loss, airtime_s = channel.deliver(read_only(links), read_only(draws))
-    asked, shape = links.asked, links.asked.shape
+    is_asked, shape = links.asked, links.asked.shape
     check_shape("up", up, shape)
     if up.dtype != bool:
         raise ValueError(f"up of type {up.dtype}, not bool")
     delay_s = numbers("delays", delay_s, shape)
-    if not np.all((delay_s[asked] >= 0.0) & (delay_s[asked] < np.inf)):
+    if not np.all((delay_s[is_asked] >= 0.0) & (delay_s[is_asked] < np.inf)):
         raise ValueError("a delay that is negative, infinite or NaN for a helper that was asked")
-    early = asked & (delay_s < links.ready_s - ROUNDING)
+    early = is_asked & (delay_s < links.ready_s - ROUNDING)
     if early.any():
         raise ValueError(
             f"a reply that ends {delay_s[early][0]:g} s after the request, and is ready after "
             f"{links.ready_s[early][0]:g} s"
         )
     loss = numbers("losses", loss, shape, (*shape[:-1], 1))
-    if not np.all(((loss >= 0.0) & (loss <= 1.0)) | ~asked):
+    if not np.all(((loss >= 0.0) & (loss <= 1.0)) | ~is_asked):
         raise ValueError("a loss that is no probability for a helper that was asked")
     airtime_s = numbers("airtimes", airtime_s, shape)
-    if np.any((airtime_s[asked] < 0.0) | np.isinf(airtime_s[asked])):
+    if np.any((airtime_s[is_asked] < 0.0) | np.isinf(airtime_s[is_asked])):
         raise ValueError("an airtime that is negative or infinite for a helper that was asked")
     return Delivery(np.array(up), delay_s, loss, airtime_s)
 
