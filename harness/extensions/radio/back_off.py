@@ -108,9 +108,9 @@ def same_slot(
         before, left = left, (left + (reached * ends) @ behind) / 2
         if np.abs(left - before).max() < 1e-9:
             break
-    begun = mean[:, 0]
+    senders = mean[:, 0]
     cycle = packet_slots + aifs_slots + reached.sum() - 1
-    return float(reached @ (begun * ends) / (reached @ begun)), float(packet_slots / cycle)
+    return float(reached @ (senders * ends) / (reached @ senders)), float(packet_slots / cycle)
 
 
 def crowding(busy: float, packet_s: float, aifs_s: float, window: int) -> float:

@@ -39,8 +39,8 @@ def block_error(curve: str) -> BlockError:
         return lambda sinr_db: np.interp(sinr_db, snr_db, lost)
     fits = {row["curve"]: row for row in _rows("block_error_fits.csv")}
     if curve not in fits:
-        known = sorted({row["curve"] for row in _rows("block_error_points.csv")} | set(fits))
-        raise UserError(f"block error curve {curve!r} is unknown: use one of {', '.join(known)}")
+        names = sorted({row["curve"] for row in _rows("block_error_points.csv")} | set(fits))
+        raise UserError(f"block error curve {curve!r} is unknown: use one of {', '.join(names)}")
     middle, slope = (float(fits[curve][key]) for key in ("midpoint_db", "slope_per_db"))
     return lambda sinr_db: expit(slope * (middle - sinr_db))
 

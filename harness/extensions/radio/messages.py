@@ -178,9 +178,9 @@ def wraps(
         (f"{encoding}-network", "envelope", f"{encoding}-link") if headers else ("envelope",)
     ):
         inside = _shares(layer, {**counts, "payload": octets}, 1.0, (layer,))
-        own = [share for share in inside if share.path[-1] != "content"]
-        octets = octets + _total(own) / 8
-        added += own
+        own_shares = [share for share in inside if share.path[-1] != "content"]
+        octets = octets + _total(own_shares) / 8
+        added += own_shares
     return added
 
 

@@ -190,11 +190,11 @@ def curves_of(path: Path) -> list[Curve]:
     It may also have `configuration` and `source`, each pair of which is a curve. Raises UserError,
     with file, line and value, if it is no such table or a value is not allowed.
     """
-    shown = printable(path)
+    file = printable(path)
     _, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
     curves: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for line, row in rows:
-        where = f"{shown}, line {line}"
+        where = f"{file}, line {line}"
         refuse_ragged(where, row)
         point = (
             number_of(where, row, "distance_m", *DISTANCE_M),
@@ -204,7 +204,7 @@ def curves_of(path: Path) -> list[Curve]:
         curves.setdefault(key, []).append(point)
     if not curves:
         raise UserError(
-            f"{shown} has no rows; give distance_m and reception at one distance at least"
+            f"{file} has no rows; give distance_m and reception at one distance at least"
         )
     return [Curve(*key, *np.array(points).T) for key, points in curves.items()]
 

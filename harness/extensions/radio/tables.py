@@ -14,28 +14,29 @@ DISTANCE_M, RECEPTION = (1e6, "metres, 0 to 1000000"), (1.0, "a share from 0 to 
 
 
 def rows_of(
-    path: Path, needed: Collection[str], known: Collection[str]
+    path: Path, needed: Collection[str], known_columns: Collection[str]
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     """Return the column names of a CSV file, and its rows with their line numbers.
 
     Raises UserError if it is no table, lacks a column that is `needed`, or has one that is not
-    `known`.
+    `known_columns`.
     """
-    shown = printable(path)
+    file = printable(path)
     try:
         table = csv.DictReader(StringIO(text_of(path), newline=""))
         columns = list(table.fieldnames or ())
         if missing := [name for name in needed if name not in columns]:
             raise UserError(
-                f"{shown}: has no column {' or '.join(missing)}; its first line names "
-                f"{printable(', '.join(columns) or 'none', 60)}, and may name {', '.join(known)}"
+                f"{file}: has no column {' or '.join(missing)}; its first line names "
+                f"{printable(', '.join(columns) or 'none', 60)}, and may name "
+                f"{', '.join(known_columns)}"
             )
         for name in columns:
-            if name not in known:
-                raise unknown(f"column of {shown}", name, known)
+            if name not in known_columns:
+                raise unknown(f"column of {file}", name, known_columns)
         return columns, [(table.line_num, row) for row in table]
     except (OSError, UnicodeDecodeError, csv.Error) as problem:
-        raise UserError(f"{shown}: cannot be read as a table ({printable(problem)})") from None
+        raise UserError(f"{file}: cannot be read as a table ({printable(problem)})") from None
 
 
 def number_of(

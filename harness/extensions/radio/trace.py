@@ -186,23 +186,23 @@ def read(path: Path) -> tuple[Point, ...]:
 
     Raises UserError if the table is wrong.
     """
-    shown = printable(path)
+    file = printable(path)
     columns, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
-    _refuse_mixed_latencies(shown, columns)
-    points = [_point(f"{shown}, line {line}", row) for line, row in rows]
+    _refuse_mixed_latencies(file, columns)
+    points = [_point(f"{file}, line {line}", row) for line, row in rows]
     if not points:
-        raise UserError(f"{shown}: has no rows; give reception at one distance at least")
+        raise UserError(f"{file}: has no rows; give reception at one distance at least")
     sights = {p.sight for p in points}
     if sights != {None} and sights != {*SIGHTS}:
         lacks = next(name for name in SIGHTS if name not in sights)
         raise UserError(
-            f"{shown}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}"
+            f"{file}: has no row of sight {lacks!r}; with sight it needs {', '.join(SIGHTS)}"
         )
     points = _with_latencies(sorted(points, key=_place))
     for a, b in pairwise(points):
         if (a.sight, a.distance_m) == (b.sight, b.distance_m):
             raise UserError(
-                f"{shown}: distance_m {a.distance_m:g} stands there twice; give each once"
+                f"{file}: distance_m {a.distance_m:g} stands there twice; give each once"
             )
     return tuple(points)
 
@@ -211,15 +211,15 @@ def _place(point: Point) -> tuple[int, float]:
     return SIGHTS[point.sight] if point.sight else CLEAR, point.distance_m
 
 
-def _refuse_mixed_latencies(shown: str, columns: Sequence[str]) -> None:
+def _refuse_mixed_latencies(file: str, columns: Sequence[str]) -> None:
     has = [name for name in SPREAD if name in columns]
     if has and MEAN in columns:
         raise UserError(
-            f"{shown}: has both {MEAN} and {has[0]}; give {MEAN}, or {' and '.join(SPREAD)}"
+            f"{file}: has both {MEAN} and {has[0]}; give {MEAN}, or {' and '.join(SPREAD)}"
         )
     if len(has) == 1:
         lacks = next(name for name in SPREAD if name not in has)
-        raise UserError(f"{shown}: has {has[0]} without {lacks}; add {lacks}, or give {MEAN} alone")
+        raise UserError(f"{file}: has {has[0]} without {lacks}; add {lacks}, or give {MEAN} alone")
 
 
 def _with_latencies(points: Sequence[Point]) -> list[Point]:
@@ -229,9 +229,9 @@ def _with_latencies(points: Sequence[Point]) -> list[Point]:
     Reception is interpolated, so that something is received next to them. The point before them
     comes first, so that no row changes what is nearer. Points are sorted by sight and distance.
     """
-    known = [point for point in points if not _blank(point)]
+    known_points = [point for point in points if not _blank(point)]
     return [
-        point._replace(latency_s=_beside(point, known)) if _blank(point) else point
+        point._replace(latency_s=_beside(point, known_points)) if _blank(point) else point
         for point in points
     ]
 
@@ -240,7 +240,7 @@ def _blank(point: Point) -> bool:
     return isinstance(point.latency_s, float) and math.isnan(point.latency_s)
 
 
-def _beside(point: Point, known: Iterable[Point]) -> float | Spread | None:
+def _beside(point: Point, known_points: Iterable[Point]) -> float | Spread | None:
     """Return the latency of the point before, else after;
     where this sight has none, of the next sight.
     """
@@ -254,7 +254,7 @@ def _beside(point: Point, known: Iterable[Point]) -> float | Spread | None:
             abs(other.distance_m - point.distance_m),
         )
 
-    nearest = min(known, key=how_far, default=None)
+    nearest = min(known_points, key=how_far, default=None)
     return nearest and nearest.latency_s
 
 
