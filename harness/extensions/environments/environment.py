@@ -47,7 +47,7 @@ def joined(name: str, settings: Sequence[str]) -> str:
     return ":".join([head, *([",".join(settings)] if settings else [])]) + config + changes
 
 
-def shown(name: str) -> str:
+def label(name: str) -> str:
     """Return a scenario's name, shortened and made printable, for messages."""
     return printable(name, 80)
 
@@ -89,9 +89,11 @@ def _only_allowed(name: str, env_id: str, changed: Mapping[str, Any]) -> None:
     of_id = env_id.rpartition(":")[0]
     paths = (text.rpartition(".")[0] for text in _texts(changed) if "." in text)
     for module in filter(None, (of_id, *paths)):
-        if not any(f"{module}.".startswith(f"{known}.") for known in (OWN_PACKAGE, *_allowed())):
+        if not any(
+            f"{module}.".startswith(f"{package}.") for package in (OWN_PACKAGE, *_allowed())
+        ):
             raise UserError(
-                f"{shown(name)} would import the module {printable(module, 40)}; if you trust it, "
+                f"{label(name)} would import the module {printable(module, 40)}; if you trust it, "
                 f"set {IMPORTS}={printable(module.partition('.')[0], 40)} in your environment"
             )
 
@@ -121,7 +123,7 @@ def reset(name: str, seed: int) -> Any:
         raise
     except Exception as error:
         raise UserError(
-            f"{shown(name)} cannot be reset: {raised(error)}; mind its config"
+            f"{label(name)} cannot be reset: {raised(error)}; mind its config"
         ) from None
     meta_actions(name, env)
     _only_drivable(name, env)
@@ -131,7 +133,7 @@ def reset(name: str, seed: int) -> Any:
 def _only_drivable(name: str, env: Any) -> None:
     """Raise UserError unless the ego is on the road, meta-actions drive it, and it can be hit."""
     ego = env.vehicle
-    subject = f"{shown(name)}: its ego"
+    subject = f"{label(name)}: its ego"
     if not any(v is ego for v in env.road.vehicles):
         raise UserError(f"{subject} is not on the road; append self.vehicle to self.road.vehicles")
     subject += f" is a {printable(type(ego).__name__)}, which"
@@ -167,7 +169,7 @@ def _create(name: str) -> Any:
     changed = _changed(name, changes or "{}")
     _only_allowed(name, env_id, changed)
     if not re.search(r"-v\d+$", env_id):
-        raise UserError(f"{shown(name)}: give its version too, as in merge-v0")
+        raise UserError(f"{label(name)}: give its version too, as in merge-v0")
     _constants().restore()
     try:
         with watched(shown(name)), strangers(shown(name)):
@@ -177,22 +179,22 @@ def _create(name: str) -> Any:
     except ModuleNotFoundError as error:
         missing = printable(str(error).partition(". ")[0])
         raise UserError(
-            f"{shown(name)}: {missing}; install the package, or put its folder on PYTHONPATH"
+            f"{label(name)}: {missing}; install the package, or put its folder on PYTHONPATH"
         ) from None
     except gymnasium.error.Error as error:
         raise UserError(
-            f"{shown(name)}: {printable(error)}; give an id that gymnasium.make knows"
+            f"{label(name)}: {printable(error)}; give an id that gymnasium.make knows"
         ) from None
     except Exception as error:
-        raise UserError(f"{shown(name)} cannot be made: {raised(error)}") from None
+        raise UserError(f"{label(name)} cannot be made: {raised(error)}") from None
     if not isinstance(env, AbstractEnv):
         raise UserError(
-            f"{shown(name)} is a {type(env).__name__}, no environment of highway-env; its class "
+            f"{label(name)} is a {type(env).__name__}, no environment of highway-env; its class "
             "must be a subclass of highway_env's AbstractEnv"
         )
     for key, value in changed.items():
         if key not in env.config:
-            raise unknown(f"config key of {shown(name)}", key, env.config)
+            raise unknown(f"config key of {label(name)}", key, env.config)
         env.config[key] = _merged(env.config[key], value)
     return env
 
@@ -209,7 +211,7 @@ def _changed(name: str, changes: str) -> dict[str, Any]:
             raise ValueError(type(changed).__name__)
     except (ValueError, RecursionError) as error:
         raise UserError(
-            f"{shown(name)}: its config is no JSON object ({printable(error)})"
+            f"{label(name)}: its config is no JSON object ({printable(error)})"
         ) from None
     return changed
 
@@ -243,13 +245,13 @@ def meta_actions(name: str, env: Any) -> Any:
         kind = kind.agents_action_types[0]
     if not isinstance(kind, DiscreteMetaAction):
         raise UserError(
-            f"{shown(name)} has no meta-actions but {type(kind).__name__}; config "
+            f"{label(name)} has no meta-actions but {type(kind).__name__}; config "
             '{"action": {"type": "DiscreteMetaAction"}} gives it some, where its vehicles can take '
             "them"
         )
     if missing := sorted({*KNOWN_ACTIONS}.difference(kind.actions.values())):
         raise UserError(
-            f"{shown(name)} has no action {', '.join(missing)}; set `longitudinal` in its action "
+            f"{label(name)} has no action {', '.join(missing)}; set `longitudinal` in its action "
             "config"
         )
     return kind

@@ -5,7 +5,7 @@ before a dataset is built or an episode is driven.
 from collections.abc import Sequence
 
 from harness.core.errors import UserError
-from harness.extensions.environments.environment import meta_actions, numbered, raised, reset, shown
+from harness.extensions.environments.environment import label, meta_actions, numbered, raised, reset
 from harness.extensions.environments.world import EnvironmentWorld
 from harness.world.scenario import Scenario
 
@@ -19,7 +19,7 @@ def examine(scenario: Scenario, seed: int) -> None:
     Drives IDLE, FASTER and SLOWER twice by the environment's own `step`, and once frame by frame in
     deep copies; the poses and speeds of all vehicles must agree at every decision.
     """
-    name = shown(scenario.name)
+    name = label(scenario.name)
     once, again = (_stepped(scenario, seed, TRIED) for _ in range(2))
     if once != again:
         raise UserError(
@@ -54,7 +54,7 @@ def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Plac
         try:
             *_, terminated, _, _ = env.step(numbered(env, kind, action))
         except Exception as error:
-            raise UserError(f"{shown(scenario.name)}: its step() fails: {raised(error)}") from None
+            raise UserError(f"{label(scenario.name)}: its step() fails: {raised(error)}") from None
         places.append(_places(env))
         if terminated:
             break

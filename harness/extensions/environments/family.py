@@ -65,9 +65,9 @@ class Environments:
         if not (module := environment.module_of(name)):
             return None
         environment.allow(name)
-        shown = printable(module)
+        module_name = printable(module)
         variable = environment.IMPORTS
-        return f"commands that read it import {shown}, if you set {variable}={shown}"
+        return f"commands that read it import {module_name}, if you set {variable}={module_name}"
 
 
 ENVIRONMENTS = Environments()

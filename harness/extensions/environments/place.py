@@ -136,12 +136,12 @@ def _parameters(name: str, env: Any, actions: int) -> Parameters:
             or not 0 < value <= MOST_HZ
         ):
             raise UserError(
-                f"{environment.shown(name)}: {kind}_frequency is {printable(repr(value))}; set a "
+                f"{environment.label(name)}: {kind}_frequency is {printable(repr(value))}; set a "
                 f"number above 0, at most {MOST_HZ}, in its config"
             )
     if hz % decisions_hz:
         raise UserError(
-            f"{environment.shown(name)}: simulation_frequency {hz:g} is no multiple of "
+            f"{environment.label(name)}: simulation_frequency {hz:g} is no multiple of "
             f"policy_frequency {decisions_hz:g}; set one in its config"
         )
     period_s = 1 / decisions_hz
@@ -173,8 +173,8 @@ def _sectors(
         before = np.concatenate([*sectors.values(), np.full((1, 2), np.inf)])
         apart_m = np.hypot(*(points[:, None] - before).T).min(axis=0)
         # of a way that parts later only what is its own
-        if (own := points[apart_m > ONE_LANE_M]).size:
-            sectors[key[1]] = own
+        if (own_points := points[apart_m > ONE_LANE_M]).size:
+            sectors[key[1]] = own_points
     for key, at in meetings.items():
         if key[0] not in sectors:
             sectors[key[0]] = paths[key].points_at(at.other_arc_m - np.linspace(*BEFORE_M, 9))

@@ -20,11 +20,11 @@ from harness.extensions.environments.environment import (
     Constants,
     config,
     hittable,
+    label,
     lane_of,
     meta_actions,
     numbered,
     reset,
-    shown,
 )
 from harness.extensions.environments.place import Parameters, ends_of, first_target_mps, place
 from harness.world import beacons
@@ -66,12 +66,12 @@ class EnvironmentWorld(OwnWorld):
         here, ego = place(name), env.vehicle
         if ends_of(env.road.network) != here.ends:
             raise UserError(
-                f"{shown(name)}: its road is another in seed {seed} than in seed 0; fix it in its "
+                f"{label(name)}: its road is another in seed {seed} than in seed 0; fix it in its "
                 "config"
             )
         if not set(here.routes.keys(lane_of(ego), ego.route)).intersection(here.road.ways):
             raise UserError(
-                f"{shown(name)}: the ego starts on another road in seed {seed} than in seed 0; fix "
+                f"{label(name)}: the ego starts on another road in seed {seed} than in seed 0; fix "
                 "it in its config"
             )
         layout = Layout((), _buildings(env, here.road.origin_m), None, None)
@@ -114,7 +114,7 @@ class EnvironmentWorld(OwnWorld):
         self.born += 1
         if self.born > MOST_VEHICLES:
             raise UserError(
-                f"{shown(self.scenario.name)}: more than {MOST_VEHICLES} vehicles; set fewer in "
+                f"{label(self.scenario.name)}: more than {MOST_VEHICLES} vehicles; set fewer in "
                 "its config"
             )
         v.spawn, v.braking = Spawn(f"v{self.born}", _kind(v), part, "", "", 0.0, 0.0), False
@@ -155,13 +155,13 @@ class EnvironmentWorld(OwnWorld):
 
     def target_after(self, action: str, agent: int = 0) -> Target:
         ego, kept = self.everybody[0], (self.action, self.taken)
-        own = {
+        fields = {
             name: list(value) if isinstance(value, list) else value
             for name, value in vars(ego).items()
         }
         self.take(action)
         target = self.target()
-        vars(ego).update(own)
+        vars(ego).update(fields)
         self.action, self.taken = kept
         return target
 
@@ -196,15 +196,15 @@ class EnvironmentWorld(OwnWorld):
         present, places = {id(v) for v in solid}, {id(v): n for n, v in enumerate(self.everybody)}
         if id(self.everybody[0]) not in present:
             raise UserError(
-                f"{shown(self.scenario.name)}: its ego leaves the road in seed {self.seed}; keep "
+                f"{label(self.scenario.name)}: its ego leaves the road in seed {self.seed}; keep "
                 "it in self.road.vehicles, collidable and solid"
             )
         self.everybody = [v for v in self.everybody if id(v) in present]
-        known = {id(v) for v in self.everybody}
+        known_ids = {id(v) for v in self.everybody}
         for v in self.everybody:
             self._place(v)
         for v in solid:
-            if id(v) not in known:
+            if id(v) not in known_ids:
                 self._enter(v, "other")
         now = [places.get(id(v), -1) for v in self.everybody]
         if now != list(range(len(places))):
@@ -257,10 +257,10 @@ class EnvironmentWorld(OwnWorld):
 
 def _reads_observations(env: Any) -> bool:
     """Return whether observations, each as slow as many frames, affect the episode."""
-    own = any(
+    is_own = any(
         not f.__module__.startswith("highway_env.") for f in (type(env).step, type(env)._info)
     )
-    return own or type(env.observation_type).__name__ == "KinematicsGoalObservation"
+    return is_own or type(env.observation_type).__name__ == "KinematicsGoalObservation"
 
 
 def _kind(v: Any) -> Kind:
