@@ -60,7 +60,7 @@ class Negotiated(Part, frozen=True, kw_only=True):
 
 def further_rounds(
     point: "OperatingPoint",
-    said: "SentIntents",
+    sent_intents: "SentIntents",
     heard: "Exchange",
     fused: "Callable[[Exchange, Intents], Coordination]",
 ) -> "tuple[SentIntents, Exchange]":
@@ -70,20 +70,20 @@ def further_rounds(
 
     Args:
         point: the condition.
-        said: what was sent in the first round, in decisions (n,).
+        sent_intents: what was sent in the first round, in decisions (n,).
         heard: the exchange of the first round.
         fused: returns the decisions by an exchange and the intents known after it.
     """
     from harness.coordination.exchange import exchange
 
     for number in range(2, point.setting("rounds") + 1):
-        intents, draws = said.intents, said.draws
+        intents, draws = sent_intents.intents, sent_intents.draws
         assert intents.plans is not None
         senders = intents.plans.row
         decided, there = fused(heard, intents), senders >= 0
         policy = decided.fused
         # An attacker repeats what it said.
-        newer = np.where(said.attackers[..., None], intents.helpers, policy[senders])
+        newer = np.where(sent_intents.attackers[..., None], intents.helpers, policy[senders])
         # unknown where the inference is, which counts as 0
         call_s = np.nan_to_num(decided.fusion_s)
         decided_s = heard.exchange_s + call_s
@@ -94,8 +94,8 @@ def further_rounds(
             _of_round(draws, number),
             heard.asked & (decided_s < point.fusion.window_s)[:, None],
         )
-        said = replace(
-            said,
+        sent_intents = replace(
+            sent_intents,
             intents=replace(
                 intents, helpers=np.where(more.on_time[..., None], newer, intents.helpers)
             ),
@@ -103,7 +103,7 @@ def further_rounds(
         # Who hears nothing new keeps the last decision, and its call counts once.
         repeated_s = np.where(any_of(more.on_time), 0.0, call_s)
         heard = replace(_together(heard, more), exchange_s=more.exchange_s - repeated_s)
-    return said, heard
+    return sent_intents, heard
 
 
 def _of_round(draws: "Draws", number: int) -> "Draws":
