@@ -15,7 +15,11 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Ambient:
-    """Describe one kind of light and weather by its effect on cameras and rendered pictures."""
+    """Describe one kind of light and weather by its effect on cameras and rendered pictures.
+
+    `camera_m` and `fades_m` are in m; within `glare_rad` of a low sun a camera tells nothing (0
+    without one).
+    """
 
     camera_m: float  # distance up to which a camera tells class, indicator and brake lamps
     fades_m: float  # distance over which contrast falls to 1/e

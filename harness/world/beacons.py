@@ -94,7 +94,8 @@ def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> Ve
 def lead_in(p: Parameters, poses: Floats) -> Floats:
     """Extrapolate poses at the start back in time at constant speed, to when beacons begin.
 
-    `poses` are x, y, heading and speed, (V, 4); the result is (F, V, 4), the start last.
+    `poses` are x, y, heading and speed of V vehicles, (V, 4); the result is (F, V, 4) for F frames,
+    the start last.
     """
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz
@@ -280,10 +281,11 @@ def _lead_frames(p: Parameters) -> int:
 def losses(
     p: Parameters, world: Callable[[], WorldState], radios: Sequence[str], poses: Floats
 ) -> Callable[[int], Floats]:
-    """Return a function from a frame to the probability to lose a beacon on each link, (H,).
+    """Return a function from a frame to the probability to lose a beacon on each of H links, (H,).
 
     A link is from the first of the ids `radios` to each other one. `world` returns the present
-    state; `poses` are x, y, heading and speed of all its vehicles, (F, V, 4). Frames count from 0.
+    state; `poses` are x, y, heading and speed of all V vehicles in F frames, (F, V, 4). Frames
+    count from 0.
     """
     radio = beacon_radio(p.beacon_channel)
     if radio is None:

@@ -43,10 +43,11 @@ DECIMALS = 3  # decimals of both, s
 
 @dataclass(frozen=True, eq=False)
 class Conflicts:
-    """Hold an agent's least TTC and PET since a decision, and the poses that are still needed.
+    """Hold an agent's least times of conflict since a decision, and poses that are still needed.
 
-    `trail` has x, y and heading of V vehicles at the last T moments, (T, V, 3), and `box` a
-    bounding box around all positions of each so far, (4, V).
+    They are the time to collision (TTC) and the post-encroachment time (PET), in s; inf where
+    nobody came near. `trail` has x, y and heading of V vehicles at the last T moments, (T, V, 3),
+    and `box` a bounding box around all positions of each so far, (4, V).
     """
 
     ttc_s: float = np.inf  # least time to collision; inf where missing
@@ -81,17 +82,17 @@ class Conflicts:
 
 
 def rounded(measure_s: float) -> float | None:
-    """Return a TTC or PET (s), rounded for a record; None if it is not finite."""
+    """Return a time of conflict (s), such as TTC, rounded for a record; None if not finite."""
     return round(measure_s, DECIMALS) if np.isfinite(measure_s) else None
 
 
 def columns(ttc_s: Floats, pet_s: Floats) -> dict[str, Floats]:
-    """Return TTC and PET of n decisions as table columns, and whether each is short.
+    """Return the conflict times of n decisions as table columns, and whether each is short.
 
-    The columns are `ttc_s`, `pet_s`, `short_ttc` and `short_pet`, (n,). The first two are NaN where
-    no vehicle came near. The `short_` ones are 1 below `SHORT_TTC_S` and `SHORT_PET_S`, else 0. The
-    arguments, (n,), are inf where no vehicle came near in time, and NaN where nothing was measured;
-    then all four are NaN.
+    The columns are `ttc_s` (time to collision), `pet_s` (post-encroachment time), `short_ttc` and
+    `short_pet`, (n,). The first two are NaN where no vehicle came near. The `short_` ones are 1
+    below `SHORT_TTC_S` and `SHORT_PET_S`, else 0. The arguments, (n,), are inf where no vehicle
+    came near in time, and NaN where nothing was measured; then all four are NaN.
     """
     ttc_s, pet_s = ttc_s.round(DECIMALS), pet_s.round(DECIMALS)
     return {
@@ -170,10 +171,11 @@ def _measured(
 def times_to_collision(
     poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats
 ) -> Floats:
-    """Return the TTC of n pairs of vehicles that drive straight on, (n,) s; inf for never.
+    """Return the time to collision of n pairs of vehicles that drive straight on, (n,) s.
 
-    `poses` and `others` are x, y, heading and speed, (n, 4), and the sizes length and width, (n,
-    2). The rectangles touch when their extents overlap on all four of their axes.
+    It is inf for never. `poses` and `others` are x, y, heading and speed, (n, 4), and the sizes
+    length and width, (n, 2). The rectangles touch when their extents overlap on all four of their
+    axes.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     its_cos, its_sin = np.cos(others[:, 2]), np.sin(others[:, 2])

@@ -64,6 +64,8 @@ def constant(scenario: Scenario) -> str | None:
     """Return the action that driver `constant` always takes in a scenario, or None if not measured.
 
     It is the single action that succeeds most on tune layouts (`constants.csv`).
+
+    Tune layouts are those on which settings are chosen; results are reported on others.
     """
     return _constants().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 
@@ -72,6 +74,8 @@ def open_loop(scenario: Scenario) -> tuple[str, ...] | None:
     """Return the fixed actions of driver `open-loop` in a scenario, or None if not measured.
 
     It is the sequence that succeeds most on tune layouts (`open_loop.csv`).
+
+    Tune layouts are those on which settings are chosen; results are reported on others.
     """
     return _open_loops().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 

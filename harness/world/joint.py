@@ -36,7 +36,12 @@ MOST_PLANS = 8  # that are driven for a layout until one keeps its promise
 
 @dataclass
 class Rehearsal(World):
-    """Simulate one agent alone with the other traffic, and record where all vehicles were."""
+    """Simulate one agent alone with the other traffic, and record where all vehicles were.
+
+    `agent` is its index in the layout, `script` the actions that it takes (None for all that are
+    possible), and `taken` those that it took. `record` has poses after each frame, (frames, V, 4)
+    each, of V vehicles. `arrives_s` is inf before the agent reached its goal.
+    """
 
     agent: int = 0  # the agent's place in the layout
     script: Sequence[str] | None = None  # the actions that it takes; None for all that there are
@@ -76,7 +81,12 @@ class Rehearsal(World):
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Hold the action sequences by which an agent touches no other traffic, soonest first."""
+    """Hold the action sequences by which an agent touches no other traffic, soonest first.
+
+    `actions` has n sequences of meta-actions, and `arrives_s`, (n,), when each reaches the goal;
+    inf for never. `poses` are x, y and heading of the agent and then of the other traffic in F
+    frames, (n, F, V, 3), `sizes_m` their lengths and widths, (V, 2), and `hz` frames a second.
+    """
 
     actions: Sequence[tuple[str, ...]]  # the meta-actions of each of the n sequences
     arrives_s: Floats  # when it reaches its goal, (n,); inf for never
@@ -92,7 +102,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """Hold an action sequence for every agent of a layout."""
+    """Hold an action sequence for every agent of a layout.
+
+    `actions` and `arrives_s` (inf for never) are keyed by an agent's index. No plan has a smaller
+    sum of arrival times than `bound_s`; `nodes` counts the partial choices that the search looked
+    at.
+    """
 
     actions: Mapping[int, tuple[str, ...]]  # of each agent, by its place
     arrives_s: Mapping[int, float]  # when each reaches its goal; inf for never
@@ -232,6 +247,10 @@ class Search:
     """Search, by branch and bound, for compatible options of all agents with the least total cost.
 
     Two options are compatible if the agents and the traffic do not touch (`together`).
+
+    `able` has each agent's options, and `unfit` the choices, as one option index for each agent,
+    that are left out. `best` is the best choice found, of cost `cost_s` (inf for none). What was
+    not searched may cost `open_s` at least.
     """
 
     able: Sequence[Options]  # of each agent
@@ -375,7 +394,7 @@ def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
 
 
 def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
-    """Return the world of each layout after all agents took their planned actions, by seed."""
+    """Return each layout's world, by seed, after all of its agents took their planned actions."""
     worlds = {seed: World.start(scenario, seed) for seed in plans_by_seed}
     while live_worlds := [world for world in worlds.values() if not world.ended]:
         turns = [plans_by_seed[world.seed].turn(world.step) for world in live_worlds]

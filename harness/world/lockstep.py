@@ -144,7 +144,7 @@ class Lanes:
     others: dict[int, Any]  # highway-env's lane of each number that is neither
 
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
-        """Return positions along and to the right of lanes (m), (...), as `local_coordinates` does.
+        """Return positions along and to the right of lanes (m), (...), as highway-env has them.
 
         `xy` are positions, (..., 2) m, and `lane` is the number of each one's lane, (...).
         """

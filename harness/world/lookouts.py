@@ -35,6 +35,9 @@ class Draft:
     """Hold one random draw of an episode's start, not yet checked for who sees the danger.
 
     `phantoms` are the danger as it would come from each sector, whether or not it is in the layout.
+
+    `layout` has nobody in the blind seats, from which no danger can be seen; `seats` are the cars
+    there, none if the draw names none.
     """
 
     layout: Layout  # with the lookouts as helpers, and nobody in the blind seats

@@ -29,7 +29,13 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
 @dataclass(frozen=True)
 class Outcome:
-    """Describe how an episode ended for one agent (usually the ego), or that it still runs."""
+    """Describe how an episode ended for one agent (usually the ego), or that it still runs.
+
+    `result` is `running`, `cleared` (the only success), `collision`, `time_out`, `late` or
+    `off_road`, decided at `time_s` (None while running). Of a collision `partner` is the other's
+    id, `striker` whose front hit and `fault` who should have given way; all three are None without
+    one. `least_gap_m` is the smallest distance so far to another vehicle's outline.
+    """
 
     # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure:
     # `time_out` (never), `late` (too long after the full-view driver) or `off_road`; `running`
@@ -57,8 +63,9 @@ class Outcome:
     def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":
         """Return this outcome, as `late` if the ego came too long after the full-view driver.
 
-        `reference` is that driver's outcome in the same layout. The allowed delay depends on
-        whether the layout has a `danger` (`Parameters.allowance_s`).
+        That is the reference driver that sees everything, and `reference` its outcome in the same
+        layout. The allowed delay depends on whether the layout has a `danger`
+        (`Parameters.allowance_s`).
         """
         if (
             not self.success
@@ -76,7 +83,12 @@ class Outcome:
 
 
 class End(Struct, frozen=True, array_like=True):
-    """Describe how one agent's drive in an episode ended."""
+    """Describe how one agent's drive in an episode ended.
+
+    `result` is `cleared` at the goal, else how the drive failed, decided at `time_s`. `lost_s` is
+    how much later than on an empty road it arrived; None unless it did. `partner` is the id of the
+    vehicle that it collided with, None without one, and `met` whether that is an agent, too.
+    """
 
     agent: str  # the agent's vehicle id
     result: str  # `cleared` if it reached its goal, else how it failed

@@ -45,7 +45,11 @@ Point = tuple[Floats, Floats]
 class Sequences:
     """Hold n sequences of meta-actions that the planner tries, with what each does to the ego.
 
-    `levels` is (n, decisions), `right_m` (n, steps of `STEP_S`), and all others are (n,).
+    `first` has each one's first action and `calm` its rank, the calmest first. `levels`, (n,
+    decisions), are changes of the target speed's level. A way is one of the ego's paths that lie
+    side by side: `ends` is the final one, counted to the right, and `right_m`, (n, steps of
+    `STEP_S`), the distance to the right of the present one; None if the ego stays. `shift` is the
+    index of its lateral motion.
     """
 
     first: Sequence[str]  # first action of each, (n,)
@@ -61,8 +65,9 @@ class Sequences:
 class Rollouts:
     """Hold the ego's predicted motions, each shared by all action sequences that lead to it.
 
-    `travelled_m` and `right_m` are (motions, steps of `STEP_S`); `motion` maps sequences to
-    motions.
+    `travelled_m` is the distance along the ego's way, its present path, and `right_m` that to the
+    right of it (None if it stays), both (motions, steps of `STEP_S`); `motion` has the index of
+    each sequence's motion.
     """
 
     travelled_m: Floats  # distance along the ego's way, (motions, steps)
@@ -276,7 +281,11 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
 
 @dataclass(frozen=True)
 class Motion:
-    """Describe the predicted motion of another vehicle, and the ego's path that it may meet."""
+    """Describe the predicted motion of another vehicle, and the ego's path that it may meet.
+
+    `way` and `path` are the ego's and the other's paths; `begin_m` is the ego's present arc length,
+    `arc_m`, (steps,), the other's later ones, and `size_m` the other's length and width.
+    """
 
     way: Path  # the ego's way
     begin_m: float  # the ego's present position on it

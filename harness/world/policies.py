@@ -39,7 +39,12 @@ UNKNOWN = Regret(np.nan, np.nan, np.nan)
 
 @dataclass(frozen=True)
 class Fate:
-    """Describe how the agents of one layout fared under one policy that all of them follow."""
+    """Describe how the agents of one layout fared under one policy that all of them follow.
+
+    `arrived` is the share of agents that reached their goals, `sum_s` the sum of their arrival
+    times, and `lost_s` how much later that is than alone on the road (NaN unless all arrived).
+    `exact` says of a joint plan whether it was searched to the end and no driver does better.
+    """
 
     arrived: float  # share of agents that reached their goals
     met: bool  # whether agents collided with each other
@@ -68,7 +73,7 @@ def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> 
     """Return how the agents of a finished world fared.
 
     `alone_s` has the time (s) at which each would arrive on an empty road, by its index. `exact`
-    and `cost` are stored as they are.
+    (see `Fate`) and `cost`, that of the agents' decisions, are stored as they are.
     """
     agent_ends, worst = ends(world, alone_s), gravest(world.journeys)
     lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in agent_ends])

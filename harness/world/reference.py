@@ -104,7 +104,10 @@ def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> 
 
 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
-    """Drive one episode with a reference driver; the outcome is not yet judged for being `late`."""
+    """Drive one episode with a reference driver, and return the ego's outcome.
+
+    It is not yet judged for being `late` (`Outcome.judged`).
+    """
     [outcome] = finish([World.start(scenario, seed)], [driver])
     return outcome
 
@@ -112,7 +115,8 @@ def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
     """Drive each seed's episode with every driver of `DRIVERS`; return outcomes by driver.
 
-    An outcome is `late` if that driver cleared too long after the full-view driver.
+    An outcome is `late` if that driver cleared too long after the full-view driver, which sees
+    everything.
     """
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
     outcomes = finish(worlds, DRIVERS * len(seeds))

@@ -22,7 +22,9 @@ class Regret:
     """Hold what the first decisions of a layout's agents cost; NaN where none could arrive.
 
     A cost is how much later (s) an agent can arrive at the soonest after its decisions than before,
-    if all others do what they did.
+    if all others do what they did. `best_decisions` is the share of decisions that cost nothing,
+    `gave_away` the share of agents that by one of theirs lost every way to arrive, and `regret_s`
+    the mean cost of the other agents.
     """
 
     best_decisions: float  # share of decisions after which an agent can arrive as soon as before

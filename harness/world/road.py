@@ -32,7 +32,13 @@ NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Describe one path along the road, in consecutive sections, each a lane of highway-env."""
+    """Describe one path along the road, in consecutive sections, each a lane of highway-env.
+
+    `approach` is where it comes from and `route` what it does, such as `straight`. It has n evenly
+    spaced `points`, (n, 2) m, at arc lengths `arc_m`, (n,). Its sections end at `ends_m`, and have
+    the names `roles` in scene graphs and the lanes `lanes`. Of two paths the one with the higher
+    `priority` has the right of way.
+    """
 
     approach: str  # where it comes from
     route: str  # what it does, such as `straight`. A vehicle on a route `left` or `right` indicates
@@ -199,7 +205,11 @@ def _within(points: Floats, reach_m: float) -> Floats:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Describe the point where another path meets the ego's."""
+    """Describe the point where another path meets the ego's.
+
+    Its position is in m to the east and south; `ego_arc_m` and `other_arc_m` are the arc lengths
+    there along both paths.
+    """
 
     x_m: float  # position, m to the east
     y_m: float  # position, m to the south
@@ -211,7 +221,11 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Ground:
-    """Hold what pictures show of a road's ground, in m to the east and to the *north*."""
+    """Hold what pictures show of a road's ground, in m to the east and to the *north*.
+
+    `outlines` are the edges of the surface, `marks` centre lines and `stops` stop lines, (n, 2)
+    each; `boxes` are corners (2, 2) of areas that labels must avoid.
+    """
 
     # edges of the surface, (n, 2) each: the outer one, and those of islands
     outlines: tuple[Floats, ...]
@@ -223,7 +237,15 @@ class Ground:
 
 @dataclass(frozen=True)
 class Road:
-    """Describe a road with all of its paths, and which of its places matter to the ego."""
+    """Describe a road with all of its paths, and which of its places matter to the ego.
+
+    `paths` are keyed by approach and route, and `ego` is the key of the ego's; `ways` are those
+    that it reaches by changing lane, from left to right. `crossings` are the points where others
+    meet the ego's path, `zone_m` the position of the conflict zone, and `sectors` the points (k, 2)
+    m that must be seen in each direction that danger can come from. `network` returns highway-env's
+    network, and `goal_m` the arc length of the goal (m); None if the goal is not a place on the
+    path. Positions are in m to the east and south of the origin.
+    """
 
     # description in frozen records: texts, and numbers with their unit in the name
     facts: Mapping[str, str | float]

@@ -24,7 +24,11 @@ NAMES = ("own", "right", "oncoming", "left")
 
 @dataclass(frozen=True)
 class Roundabout:
-    """Describe a one-lane roundabout with four arms around the origin."""
+    """Describe a one-lane roundabout with four arms around the origin.
+
+    `ring_m` is the radius of the ring's middle, `entry_m` that of the arcs by which cars enter and
+    leave, and `beside_m` how far from an arm's centre line its lanes are.
+    """
 
     ring_m: float  # radius of the middle of the ring's lane
     entry_m: float  # radius of the arcs by which cars enter and leave

@@ -22,6 +22,9 @@ class Draws:
     """Draw the random quantities of one layout, each keyed by its name and the layout seed.
 
     So a parameter that changes one quantity leaves the draws of all others as they are.
+
+    `attempt` counts earlier draws that did not fit; `seats` are the names of cars from which the
+    danger cannot be seen.
     """
 
     scenario: str
@@ -49,7 +52,12 @@ class Draws:
 
 @dataclass(frozen=True)
 class Spawn:
-    """Describe one vehicle at the start of an episode."""
+    """Describe one vehicle at the start of an episode.
+
+    It begins at `arc_m` (m) of the path (`approach`, `route`) with `speed_mps`. At `brakes_at_s`
+    (None for never) it brakes by itself, with `brakes_mps2`, down to `brakes_to_mps`. `radio` says
+    whether one that does not help sends beacons.
+    """
 
     id: str  # `v1`, `v2`, …
     kind: Kind  # class of vehicle
@@ -66,7 +74,11 @@ class Spawn:
 
 @dataclass(frozen=True)
 class Layout:
-    """Hold the start of one episode: its vehicles, its buildings and its danger."""
+    """Hold the start of one episode: its vehicles, its buildings and its danger.
+
+    `danger` is the sector that the danger comes from and `danger_id` the id of that vehicle; both
+    are None without a danger.
+    """
 
     spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first
     buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
@@ -96,6 +108,8 @@ class Seat:
 
     The road network, name, actions and parameters are the shared scenario's; road, goal and prompt
     words are the agent's own.
+
+    `names` maps the key of each path of the shared road to the one that it has for this agent.
     """
 
     scenario: "Scenario"  # the scenario with the agent as its ego
@@ -107,6 +121,11 @@ class Scenario:
     """Describe one scenario: its road, layouts, goal, actions, parameters and words for prompts.
 
     Pickled by name and parameters, so it must be found by name in the registry.
+
+    `road` returns the road, `layout(seed, parameters)` the start of an episode, and `cleared(xy_m,
+    approaches, parameters)` whether the ego has reached its goal. `dials` are the parameters that a
+    name may set. `seats` returns the scenario as other agents play it, None if only the ego has a
+    goal; `world` is the class that plays the episodes, None for the harness's simulator.
     """
 
     name: str  # its name for users, and in manifests and frozen states

@@ -33,7 +33,11 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class Journey:
-    """Hold what has happened to one agent of an episode so far."""
+    """Hold what has happened to one agent of an episode so far.
+
+    `hard_brakings` counts how often it began to brake harder than `HARD_BRAKING_MPS2`, and
+    `conflicts` has how near in time others came to it.
+    """
 
     outcome: Outcome = field(default_factory=Outcome)  # its `ended` says whether it is decided
     hard_brakings: int = 0  # how often it began to brake harder than HARD_BRAKING_MPS2
@@ -59,7 +63,12 @@ class Journey:
 
 @dataclass
 class World:
-    """Simulate one episode: its vehicles, its agents' records and its clock."""
+    """Simulate one episode: its vehicles, its agents' records and its clock.
+
+    `journeys` are the agents' records by their index among the vehicles, 0 for the ego; `step`
+    counts decisions and `frame` simulated frames. `beacons` are those that receivers may still
+    read.
+    """
 
     scenario: Scenario  # the episode's scenario
     seed: int  # seed of the episode's layout
@@ -144,7 +153,7 @@ class World:
 
     @classmethod
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":
-        """Restore a world of this class; `World.thaw` chooses the class."""
+        """Restore a world of this class from a state and its snapshot; `thaw` chooses the class."""
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot.sections, strict=True):
             spawn = spawn_of(scenario, layout, v)

@@ -123,6 +123,8 @@ class Sight(Image):
     """A picture of a vehicle's cameras that is rendered when its pixels are read.
 
     It holds the state instead of pixels, but is pickled as its pixels.
+
+    `size_px` is width and height.
     """
 
     scenario: Scenario

@@ -37,7 +37,11 @@ class Seat(Struct, frozen=True):
 
 
 class Place(Struct, frozen=True):
-    """Describe where on the road's paths a vehicle is."""
+    """Describe where on the road's paths a vehicle is.
+
+    `near` has, for each path near the vehicle, the arc length (m) and the path's heading there
+    (rad); `key` is the path that it seems to follow, None if none.
+    """
 
     # arc length, and heading there, on each path to which it is nearer than ON_PATH_M
     near: Mapping[PathKey, tuple[float, float]]
@@ -51,7 +55,11 @@ class Place(Struct, frozen=True):
 
 
 class Encounter(Struct, frozen=True):
-    """Pair another vehicle with the ego, both as one viewer knows them."""
+    """Pair another vehicle with the ego, both as one viewer knows them.
+
+    `seat` is the viewer's pose, `d` the other vehicle as detected and `place` where it is on the
+    road; `ego_arc_m` is the ego's arc length (m) on its path.
+    """
 
     seat: Seat  # the viewer's
     d: Detection  # the vehicle

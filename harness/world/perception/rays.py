@@ -20,7 +20,11 @@ Look = tuple[WorldState, VehicleState]  # a state, and the vehicle that looks ar
 
 @dataclass(frozen=True)
 class Sweep:
-    """Hold the bearings and distances of one full turn of `RAYS` rays, and what each ray hits."""
+    """Hold the bearings and distances of one full turn of `RAYS` rays, and what each ray hits.
+
+    `range_m`, (RAYS,), is inf where a ray meets nothing; `hits` has the indices of the rays that
+    end on each vehicle or building, by its id.
+    """
 
     bearing_rad: Floats  # direction of each ray in the world frame, (RAYS,)
     range_m: Floats  # distance to the first surface, (RAYS,); inf if there is none
@@ -33,6 +37,9 @@ class Surfaces:
     """Hold the outlines that stop the rays of v viewers, n in all, viewer by viewer.
 
     A viewer's surfaces are all other vehicles of its state, in their order, then the buildings.
+
+    `viewer`, `place` and `vehicle`, (n,), are the number of a surface's viewer, its index among
+    that viewer's surfaces, and whether it is a vehicle; `corners_m` is (n, 4, 2).
     """
 
     origins_m: Floats  # the viewers' centres, (v, 2)
@@ -144,7 +151,10 @@ def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Hold m possible meetings of a ray with a surface, by ascending number of the surface."""
+    """Hold m possible meetings of a ray with a surface, by ascending number of the surface.
+
+    `t` is the distance (m) at which the ray meets it; inf if it passes by.
+    """
 
     surface: Ints  # number of the surface, (m,)
     target: Ints  # number of the ray, RAYS for each viewer, (m,)

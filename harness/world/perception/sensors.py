@@ -37,7 +37,12 @@ SENSORS = {
 
 
 class Detection(Struct, frozen=True):
-    """Describe one object as all sensors of one vehicle together report it, in the road's frame."""
+    """Describe one object as all sensors of one vehicle together report it, in the road's frame.
+
+    `sensors` are those of camera, lidar and radar that reported it. What a sensor alone tells is
+    None without it: `kind`, `indicator` and `braking` are the camera's, `range_rate_mps` (negative
+    when closing) the radar's; `heading_rad` is None if only the radar saw it.
+    """
 
     id: str  # the object's id (association across vehicles is assumed to be perfect)
     sensors: tuple[str, ...]  # those of `camera`, `lidar` and `radar` that reported it

@@ -40,7 +40,11 @@ ROUNDED_M = 0.1 / 12**0.5  # standard deviation of the rounding of a graph's pla
 
 
 class Heard(NamedTuple):
-    """Hold what the ego sees by itself, and the scene graphs that it got from helpers."""
+    """Hold what the ego sees by itself, and the scene graphs that it got from helpers.
+
+    `source` is the state in which the helpers made `helpers`, their graphs; None for `state`, in
+    which the ego is.
+    """
 
     state: WorldState
     own: SceneGraph  # the ego's graph
@@ -50,7 +54,11 @@ class Heard(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """Describe one object as one sender reports it, with the covariance of its errors."""
+    """Describe one object as one sender reports it, with the covariance of its errors.
+
+    `node` is the object in the ego's own scene graph; None for one out of a message. `place_m2` is
+    the covariance of its position, (2, 2), and `speed_m2ps2` the variance of its speed.
+    """
 
     detection: Detection  # in the frame of the road
     node: Node | None  # the ego's own node; None in a message

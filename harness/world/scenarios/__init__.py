@@ -94,7 +94,8 @@ def split(text: str) -> tuple[str, str | None]:
 def argument(scenario: Scenario) -> str:
     """Return the text by which `get` finds this scenario again, even if its defaults change later.
 
-    It spells out the settings that differ from the defaults, and those in which suites differ.
+    It spells out the settings that differ from the defaults, and those in which suites (sets of
+    datasets, one for each scenario) differ.
     """
     return _spelled(scenario, {*_changed(scenario), *_of_suites(scenario)})
 

@@ -129,8 +129,10 @@ def road(home: str = EGO) -> Road:
 
 
 def cleared(home: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
-    """Return whether an agent from an arm has left the ring,
-    past the next entry and who enters there.
+    """Return whether an agent has left the ring past the next entry, for each world, (...).
+
+    `home` is its arm (`s`, `e`, `n` or `w`), and `xy_m` are the centres of all vehicles, (..., V,
+    2), the agent first.
     """
     turned_rad, edge_m = math.pi / 2 * ARMS.index(home), PLACE.ring_m + LANE_WIDTH_M / 2
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
