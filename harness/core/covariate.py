@@ -35,14 +35,14 @@ def corrected(
 ) -> Estimate | None:
     """Return the mean of values (E,), corrected by control variates; None if it cannot be.
 
-    The values are of some layouts; variables are known of these and of further layouts. It is None
-    with fewer than `LEAST` values, without further layouts, or if the values or all variables are
-    constant.
+    A control variate is a variable that goes with the values and is known of more layouts than they
+    are. It is None with fewer than `LEAST` values, without further layouts, or if the values or all
+    variables are constant.
 
     Args:
         plain: the uncorrected mean with its interval.
         values: of E layouts, a random part of all, from `least` to 1.
-        variables: the variables of these layouts, (E, K).
+        variables: the K variables of these layouts, (E, K).
         pool: the variables of all N layouts, these included, (N, K).
         least: the least that a value can be.
         level: of confidence, of the plain interval.
@@ -70,9 +70,10 @@ def corrected(
 
 
 def worth(plain: Estimate, better: Estimate) -> float:
-    """Return by what factor the plain mean needs more layouts to be as precise as `better`.
+    """Return how many times as many layouts the mean `plain` needs to be as precise as `better`.
 
-    It is the squared ratio of interval widths, at the end farther from the bounds; 1 if not known.
+    It is the squared ratio of the widths of their intervals, at the end farther from the bounds of
+    the values; 1 if not known.
     """
     below = plain.value - plain.low, better.value - better.low
     above = plain.high - plain.value, better.high - better.value

@@ -28,7 +28,10 @@ LISTS = {"model": "harness model list", "prompt": "harness prompt list"}
 
 
 class UserError(Exception):
-    """Report bad input in one line: the thing, the value, what is allowed and what to do."""
+    """Report bad input in one line: the thing, the value, what is allowed and what to do.
+
+    `code` is the exit code with which the command ends.
+    """
 
     code: ClassVar[int] = 2  # what the command ends with, one of `EXIT_CODES`
 

@@ -42,6 +42,9 @@ class Setting:
     """Describe a setting of a run that an extension adds.
 
     It is an option of `harness eval` and `harness drive`.
+
+    `help` is a sentence for people. `behind` names the setting of the core after which files and
+    help list this one; empty for a table of their own.
     """
 
     kind: type  # str, int, float or bool
@@ -56,7 +59,11 @@ class Setting:
 class Extension:
     """Describe what a package adds to the harness: commands, studies, settings and plug-ins.
 
-    Tables are keyed by name. A function or object is given as `module:name`, imported at first use.
+    `name` is that of its entry point, and `interface` the version of this class it was written for.
+    All else are tables by name: `adds` has plug-ins by kind (such as `rules`) and name, `groups`
+    the help of groups of commands, `panels` the panel of each command on the first screen, and
+    `spellings` what replaces older commands. A function or object is given as `module:name`,
+    imported at first use.
     """
 
     name: str  # the same as that of its entry point
@@ -119,7 +126,10 @@ class OfExtension(NamedTuple):
 
 
 def setting_of_extension(name: str) -> OfExtension | None:
-    """Return the extension that adds a setting of conditions (operating points), or None."""
+    """Return the extension that adds a setting of conditions (operating points), or None.
+
+    `name` is the setting's; it is looked up in package metadata.
+    """
     entry = entries(SETTINGS).get(name)
     if entry is None:
         return None
@@ -128,7 +138,10 @@ def setting_of_extension(name: str) -> OfExtension | None:
 
 
 def beside() -> dict[str, Setting]:
-    """Return the settings of extensions that files have beside those of the core, by name."""
+    """Return, by name, the settings that extensions add among those of the core.
+
+    The settings of other packages stand in a table of their own in files (`Setting.behind`).
+    """
     declared = entries(GROUP)
     settings: dict[str, Setting] = {}
     for name, extension in extensions().items():

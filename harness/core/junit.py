@@ -11,7 +11,11 @@ WHOLE = 10**6  # most characters of a message
 
 @dataclass(frozen=True)
 class Case:
-    """Describe one test case of a JUnit report."""
+    """Describe one test case of a JUnit report.
+
+    `of` is the class of tests it belongs to. `failure` says why it failed and `error` why it has no
+    result; both are None if it passed.
+    """
 
     of: str  # the class
     name: str  # the case's own name

@@ -22,7 +22,7 @@ def folder() -> Path:
 
 
 def recall(name: str) -> bytes | None:
-    """Read what `keep` stored under a file name in the cache folder; None if it cannot be read."""
+    """Read the data stored under a file name in the cache folder; None if it cannot be read."""
     try:
         return bytes_of(folder() / name, "rows")
     except OSError:

@@ -14,9 +14,10 @@ LEAST = 1e-12  # below this p-value, levels of confidence are too near 1 to be t
 def p_value(interval: Callable[[float], Estimate]) -> float | None:
     """Return the two-sided p-value of a difference of 0, by inverting its confidence interval.
 
-    `interval` gives the difference's estimate at a level of confidence. The result is below 0.05
-    exactly if the 95 % interval excludes 0; for Student's t interval it is that of the paired t
-    test. None without an interval; `LEAST` for any smaller value, and 1 above 0.999.
+    `interval` returns the difference's estimate with an interval at a level of confidence, from 0
+    to 1. The result is below 0.05 exactly if the 95 % interval excludes 0; for Student's t interval
+    it is that of the paired t test. None without an interval; `LEAST` for any smaller value, and 1
+    above 0.999.
     """
     difference = interval(1 - LEVEL)
     if math.isnan(difference.low) or math.isnan(difference.high):
@@ -42,9 +43,9 @@ def p_value(interval: Callable[[float], Estimate]) -> float | None:
 def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
     """Return the two-sided p-value of a difference of 0 from a bootstrap's 95 % interval.
 
-    `value` is the difference. The side nearer to 0 is treated as that of a normal distribution
-    (Altman and Bland 2011, doi:10.1136/bmj.d2304), since resamples are too few to invert the
-    interval. None without an interval.
+    `value` is the difference, and `low` and `high` are the ends of the interval. The side nearer to
+    0 is treated as that of a normal distribution (Altman and Bland 2011, doi:10.1136/bmj.d2304),
+    since resamples are too few to invert the interval. None without an interval.
     """
     from harness.core.special import ndtr, ndtri
 

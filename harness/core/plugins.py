@@ -90,7 +90,10 @@ def _name_of(distribution: Any) -> str:
 
 @dataclass(frozen=True)
 class Added:
-    """An object that an extension adds, as an entry point of the package that has the extension."""
+    """An object that an extension adds, as if it were an entry point of the extension's package.
+
+    `value` is its place, `module:name`, and `dist` the package's distribution.
+    """
 
     value: str  # its place, `module:name`
     dist: Any  # the package's distribution
@@ -135,17 +138,26 @@ class Failed(UserError):
 
 
 def of_type(kind: type) -> Allowed:
-    """Return the rule, for `Plugins.stated`, that a value is of one type."""
+    """Return a rule for an attribute of a plug-in: that its value is of one type.
+
+    Rules are given in `Plugins.stated`.
+    """
     return lambda value: isinstance(value, kind), kind.__name__
 
 
 def one_of(*values: object) -> Allowed:
-    """Return the rule, for `Plugins.stated`, that a value is one of these."""
+    """Return a rule for an attribute of a plug-in: that its value is one of these.
+
+    Rules are given in `Plugins.stated`.
+    """
     return values.__contains__, ", ".join(map(str, values))
 
 
 def tuple_of(each: Allowed) -> Allowed:
-    """Return the rule, for `Plugins.stated`, that a value is a tuple of what `each` allows."""
+    """Return a rule for an attribute of a plug-in: that it is a tuple of what `each` allows.
+
+    Rules are given in `Plugins.stated`.
+    """
     fits, words = each
     return lambda value: isinstance(value, tuple) and all(map(fits, value)), f"a tuple of {words}"
 

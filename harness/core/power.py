@@ -20,10 +20,11 @@ HALVINGS = 60  # of a bracket: to the rounding of a number
 
 @dataclass(frozen=True)
 class Spread:
-    """Hold how much a paired difference of success varies between episodes, by stratum.
+    """Hold how much a paired difference of success varies between episodes, in each of H strata.
 
-    `shares`, (H,), of all episodes are in each of H strata, and `variances` are (..., H). The mean
-    over strata is unweighted, as in `statistics.paired_difference`.
+    Strata are groups of episodes that are averaged apart, such as those with a danger. `shares`,
+    (H,), are the shares of all episodes in each, and `variances`, (..., H), those of an episode's
+    difference there. The mean over strata is unweighted, as in `statistics.paired_difference`.
     """
 
     shares: Floats  # share of all episodes that is in each stratum, (H,); they sum to 1
@@ -85,9 +86,10 @@ class Spread:
 
 
 def variance(values: Floats, counts: Ints) -> Floats:
-    """Return the sample variance of values (E,) with integer weights `counts`, (..., E) to (...).
+    """Return the sample variance of E values, (E,), with integer weights, (...).
 
-    inf where the weights sum to less than 2.
+    `counts`, (..., E), are the weights: how often each value counts. inf where they sum to less
+    than 2.
     """
     n = counts.sum(axis=-1)
     mean = counts @ values / np.maximum(n, 1)

@@ -29,7 +29,7 @@ STREAMS = {"stdin": "r", "stdout": "w", "stderr": "w"}  # in the order of their 
 
 
 class Stop(KeyboardInterrupt):
-    """Raised wherever the program is when SIGTERM or SIGINT comes, with the signal's number."""
+    """Raised wherever the program is when SIGTERM or SIGINT comes; it holds the signal's number."""
 
     @property
     def word(self) -> str:

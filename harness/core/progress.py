@@ -2,7 +2,10 @@
 
 
 class Progress:
-    """Receive counts of work that is done and still to do; this base class shows nothing."""
+    """Receive counts of work that is done and still to do; this base class shows nothing.
+
+    It is called with the number of things just done.
+    """
 
     def __call__(self, done: int) -> None:
         """Add to what is done."""

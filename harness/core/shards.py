@@ -34,7 +34,7 @@ TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}
 
 @dataclass(frozen=True)
 class Shard:
-    """Name part `number` of `of` equal parts of the work, counted from 1."""
+    """Name part `number`, from 1, of the `of` equal parts into which some work is divided."""
 
     number: int
     of: int
@@ -119,9 +119,10 @@ def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
 
 @contextmanager
 def made_whole(folders: Sequence[Path], out: Path) -> Iterator[None]:
-    """Make a whole of shards, in the folder `out`, of what their files state.
+    """Make one dataset or run of its shards (parts of the work), in the folder `out`.
 
-    Raises UserError where that makes none; then `out` is not there if it was not before.
+    The code inside does that of what the shards' files in `folders` state. Raises UserError where
+    that makes none; then `out` is not there if it was not before.
     """
     was_there = out.exists()
     try:

@@ -34,9 +34,10 @@ class Estimate:
 
 
 def safe_target(safe: Bools) -> Floats:
-    """Return the uniform distribution over the safe actions, `(..., A)`.
+    """Return the uniform distribution over the safe ones of A actions, `(..., A)`.
 
-    NaN where no action is safe.
+    `safe` says of each action whether the episode can still succeed after it, `(..., A)`. NaN where
+    no action is safe.
     """
     count = np.sum(safe, axis=-1, keepdims=True)
     return np.where(count > 0, safe / np.maximum(count, 1), np.nan)
@@ -45,20 +46,22 @@ def safe_target(safe: Bools) -> Floats:
 def brier(p: Floats, target: Floats) -> Floats:
     """Return the Brier score (1950) of intents against target distributions, `(..., A)` to `(...)`.
 
-    It is the squared distance: 0 is best, 2 worst. The target may be a distribution (`safe_target`)
-    instead of one true class. It is smallest at p = target: with two safe actions, an intent that
-    is sure of one scores 0.5, and one that is undecided between both scores 0.
+    Both are probabilities of A actions. It is their squared distance: 0 is best, 2 worst. The
+    target may be a distribution (`safe_target`) instead of one true class. It is smallest at p =
+    target: with two safe actions, an intent that is sure of one scores 0.5, and one that is
+    undecided between both scores 0.
     """
     score: Floats = np.sum((p - target) ** 2, axis=-1)
     return score
 
 
 def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
-    """Return -ln of the probability that intents give to the safe actions, `(..., A)` to `(...)`.
+    """Return -ln of the probability that intents give to the safe ones of A actions, `(...)`.
 
-    This is the logarithmic score (Good 1952) of the event that the action is safe, in nats; 0 is
-    best. How the probability is spread among safe actions does not matter. NaN where no action is
-    safe. An answer that is sure and wrong costs -ln(`LEAST_MASS`) = 9.2.
+    Both arguments are `(..., A)`: probabilities, and which actions are safe. This is the
+    logarithmic score (Good 1952) of the event that the action is safe, in nats; 0 is best. How the
+    probability is spread among safe actions does not matter. NaN where no action is safe. An answer
+    that is sure and wrong costs -ln(`LEAST_MASS`) = 9.2.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
     # Rounding may put the mass of a distribution slightly above 1.
@@ -66,9 +69,10 @@ def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
 
 
 def seed_interval(per_seed_means: Floats) -> Estimate:
-    """Return the mean over seeds `(S,)` with Student's 95 % interval, as the paper's error bars.
+    """Return the mean over S seeds, `(S,)`, with Student's 95 % interval.
 
-    With one seed, or seeds that all agree, the ends are NaN.
+    Each value is the mean of one seed; the paper's error bars are made so. With one seed, or if all
+    have the same mean, the ends are NaN.
     """
     return _student(per_seed_means, np.arange(len(per_seed_means)))
 
@@ -78,10 +82,11 @@ def episode_interval(
 ) -> Estimate:
     """Return the mean with Student's t interval over episodes; for shares see `rate_interval`.
 
-    Values are `(E,)`, or `(E, ...)` with more axes such as steps, over which an episode's known
-    values are averaged; an episode that is all NaN is excluded. With `episodes`, (n,), they are
-    `(n,)`, of these episodes: the mean is over values, and the variance is that of a ratio of
-    totals (Cochran 1977, section 6.3). If all episodes are alike the ends are NaN.
+    Values are of E episodes, `(E,)`, or `(E, ...)` with more axes such as steps, over which an
+    episode's known values are averaged; an episode that is all NaN is excluded. With `episodes`,
+    (n,), they are n values `(n,)` of the episodes with these numbers: the mean is over values, and
+    the variance is that of a ratio of totals (Cochran 1977, section 6.3). If all episodes are alike
+    the ends are NaN.
     """
     values = values_by_episode.reshape(
         len(values_by_episode), math.prod(values_by_episode.shape[1:])
@@ -127,11 +132,11 @@ def wilson(rate: float, n: float, level: float = LEVEL) -> tuple[float, float]:
 def seed_rate_interval(values: Floats) -> Estimate:
     """Return the mean of shares over seeds, for fixed episodes, with an interval over other seeds.
 
-    `values` are from 0 to 1, or differences of such, `(S, E)`; NaN is left out. The variance is
-    that between seeds within each episode, pooled, with E (S - 1) degrees of freedom. Two values
-    that deviate from the rest of their episode are added, one each way (as Bonett and Price 2012 do
-    with pairs), since seeds that were not drawn may differ. n is the number of seeds; with one seed
-    the ends are NaN.
+    `values` are from 0 to 1, or differences of such, `(S, E)`, of S seeds by E episodes; NaN is
+    left out. The variance is that between seeds within each episode, pooled, with E (S - 1) degrees
+    of freedom. Two values that deviate from the rest of their episode are added, one each way (as
+    Bonett and Price 2012 do with pairs), since seeds that were not drawn may differ. n is the
+    number of seeds; with one seed the ends are NaN.
     """
     from harness.core.special import stdtrit
 
@@ -171,7 +176,7 @@ def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate
 
 
 def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
-    """Return `paired_difference` with ends that are `errors` standard errors from the mean."""
+    """Return `paired_difference` of the strata `parts`, with ends `errors` standard errors away."""
     value, error = _paired_error(parts)
     n = sum(int((~np.isnan(part)).sum()) for part in parts)
     half = errors * error
@@ -206,10 +211,10 @@ def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
 def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
     """Return the mean paired difference of two sets of shares, with a combined Wilson interval.
 
-    `a` and `b` are `(E,)` or `(E, ...)`, of the same episodes; a pair in which either is NaN is
-    left out. The ends of both `rate_interval`s are combined by the correlation over episodes
-    (Newcombe 1998, method 10; Zou and Donner 2008), with two more pairs that differ, one each way.
-    Wider than `paired_difference`, and kept for results that were computed with it
+    `a` and `b` are of the same E episodes, `(E,)`, or `(E, ...)` with more axes; a pair in which
+    either is NaN is left out. The ends of both `rate_interval`s are combined by the correlation
+    over episodes (Newcombe 1998, method 10; Zou and Donner 2008), with two more pairs that differ,
+    one each way. Wider than `paired_difference`, and kept for results that were computed with it
     (`runs/pinned.py`).
     """
     unknown = np.isnan(a) | np.isnan(b)
@@ -255,7 +260,10 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
-    """Return bootstrap counts of n units, `(1 + times, n)`: ones, then draws with replacement."""
+    """Return how often each of n units is in `times` bootstrap resamples, `(1 + times, n)`.
+
+    The first row is all ones: the units themselves. Each other one counts n draws with replacement.
+    """
     return np.vstack(
         [np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)]
     )

@@ -86,10 +86,10 @@ def aside(what: str) -> Iterator[None]:
 
 
 def is_ours(thing: object) -> bool:
-    """Return whether a thing acts by the harness's own code: its class is one that a module of the
-    harness has, and nothing that the thing has hides a member of it.
+    """Return whether a thing acts by the harness's own code alone.
 
-    What a class states of its module anybody can write.
+    That is so if a module of the harness has its class, and nothing that is set on the thing hides
+    a member of that class. What a class states of its module anybody can write, so it is looked up.
     """
     kind = type(thing)
     hides = [name for name in getattr(thing, "__dict__", ()) if callable(getattr(kind, name, None))]
@@ -97,7 +97,10 @@ def is_ours(thing: object) -> bool:
 
 
 def is_in_harness(named: Any) -> bool:
-    """Return whether a class or function is the one of its name in a module of the harness."""
+    """Return whether a module of the harness has this class or function under its name.
+
+    That is looked up, since an object may state any module and name.
+    """
     module = str(getattr(named, "__module__", ""))
     if not module.startswith("harness."):
         return False

@@ -52,7 +52,10 @@ def node_versions() -> dict[str, str]:
 
 
 def differing(wanted: dict[str, str]) -> str | None:
-    """Describe the first version that differs here from `wanted`; None if all agree."""
+    """Describe the first version that differs here from `wanted`; None if none does.
+
+    `wanted` are versions by package, such as those of `node_versions`.
+    """
     here = node_versions()
     for name in {**wanted, **here}:
         if here.get(name) != wanted.get(name):

@@ -116,7 +116,7 @@ def same(
 
 
 def held(out: Path) -> bool:
-    """Return whether another process is working in an output folder: it holds the lock."""
+    """Return whether another process is working in an output folder, since it holds its lock."""
     try:
         with alone(out / WORK / LOCK, GONE_S):
             return False
