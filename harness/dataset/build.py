@@ -170,10 +170,11 @@ def merge(
     audits: bool = True,
     more: Callable[[int], None] = lambda count: None,
 ) -> dict[str, Any]:
-    """Combine the shards of a dataset into the one that `build` makes without shards.
+    """Combine the shards of a dataset, a folder each, into the one that `build` makes without.
 
-    The bytes are the same. Raises UserError as `build`, or if the folders are not all the shards of
-    one build, a shard is unfinished, or two hold different bytes for the same layout.
+    The bytes are the same. `workers`, `progress`, `audits` and `more` are those of `build`, and the
+    manifest is returned as a dict. Raises UserError as `build`, or if the folders are not all the
+    shards of one build, a shard is unfinished, or two hold different bytes for the same layout.
     """
     starts = shards.read(folders, work.WorkStart)
     config = starts[0].settings

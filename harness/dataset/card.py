@@ -39,7 +39,11 @@ KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool
 
 @dataclass(frozen=True)
 class Table:
-    """Describe a Parquet table of a published dataset: its source, size and reference results."""
+    """Describe a Parquet table of a published dataset: its source, size and reference results.
+
+    `lag_s` is from the moment of a decision to its action, and `rows` counts decision points;
+    `references` has the success of each policy that needs no model, over layouts.
+    """
 
     manifest: Manifest  # of the frozen dataset
     dataset_sha256: str  # digest of the frozen dataset's manifest

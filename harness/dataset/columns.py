@@ -12,7 +12,8 @@ TEXTS, NUMBERS, FLAGS = pa.list_(TEXT), pa.list_(pa.float64()), pa.list_(pa.bool
 class Column(NamedTuple):
     """Describe one column of a published table; a row is a decision point.
 
-    A list has an entry for each of `viewers` or for each of `actions`, in their order.
+    `kind` is its type in Arrow, and `meaning` one line with units. A list has an entry for each of
+    `viewers` or for each of `actions`, in their order.
     """
 
     name: str  # its name in the table

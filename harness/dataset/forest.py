@@ -36,6 +36,10 @@ class Forest:
 
     Decision points are numbered tree by tree, and within a tree by step. An edge is what one or
     several equivalent actions do at a decision point: it leads to another one or ends the episode.
+    `child`, (N, A), is the decision point after each action, -1 if the episode ends; `edge`, (N,
+    A), the index in `edges`; `root`, (E,), each tree's first point; `drivers` the action that each
+    reference driver takes, (N,); and `allowance_s`, (E,), the needless delay that still is a
+    success.
     """
 
     actions: tuple[str, ...]  # the meta-actions
@@ -126,7 +130,10 @@ class Forest:
 
     @cached_property
     def conflicts(self) -> Mapping[str, Floats]:
-        """Least TTC and PET on each edge, as `conflict_measures.columns`, each (edges,)."""
+        """Least time to collision and post-encroachment time on each edge, each (edges,).
+
+        The names are those of `conflict_measures.columns`.
+        """
 
         def number(measure_s: float | UnsetType | None) -> float:
             if measure_s is UNSET:
@@ -171,7 +178,10 @@ class Forest:
 
     @cached_property
     def then_full_view(self) -> Ints:
-        """Last edge of the episode after each action if the full-view driver goes on, (N, A)."""
+        """Last edge of the episode after each action if then the full-view driver goes on, (N, A).
+
+        That is the reference driver that sees everything.
+        """
         last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
         for rows in self._levels_backwards():
             child = self.child[rows]
@@ -185,7 +195,10 @@ class Forest:
 
     @cached_property
     def reference_s(self) -> Floats:
-        """Time (s) at which the full-view driver reaches the goal in each tree, (E,), or inf."""
+        """Time (s) at which the full-view driver reaches the goal in each tree, (E,), or inf.
+
+        That is the reference driver that sees everything.
+        """
         return self.cleared_s[self.last_edge(self.drivers[PRIVILEGED])]
 
     @cached_property
@@ -205,7 +218,7 @@ class Forest:
     def value(self) -> Bools:
         """Whether the episode can still succeed at each decision point, (N,).
 
-        It is what the best policy achieves.
+        So it is the success of the best policy from there on.
         """
         return np.asarray(self.safe.any(axis=-1))
 

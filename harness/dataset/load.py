@@ -47,7 +47,12 @@ TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over al
 
 @dataclass(frozen=True)
 class Scene:
-    """Hold one decision point of a dataset or of a drive: its state and its scene graphs."""
+    """Hold one decision point of a dataset or of a drive: its state and its scene graphs.
+
+    `seat` is the scenario as an agent other than the ego plays it, if such a one decides, else
+    None; `agent` is the index of who decides, 0 for the ego. `notes` keeps what was computed from
+    the scene.
+    """
 
     record: Record  # its record in the dataset
     # results computed from it, by name, kept so that they are computed once
@@ -100,7 +105,7 @@ class Scene:
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
     """Return the indices of scenes by the scenario of the agent that decides in them.
 
-    That scenario is `scenario` where the ego decides.
+    That is the scenario with that agent as its ego; `scenario` itself where the ego decides.
     """
     return places_by(scene.seat or scenario for scene in scenes)
 
@@ -171,7 +176,7 @@ class Dataset:
 
     @property
     def dangerous(self) -> Bools:
-        """Whether each episode has a danger, (E,)."""
+        """Whether each of the E episodes has a danger, (E,)."""
         return np.array([tree.danger.sector is not None for tree in self.trees])
 
     @property
@@ -199,10 +204,11 @@ class Dataset:
         return replace(self, trees=Trees(range(self.manifest.episodes), self.trees.read))
 
     def reference_success(self) -> dict[str, Floats]:
-        """Return the success of each reference policy in each episode, (E,), by name.
+        """Return the success of each reference policy in each of E episodes, (E,), by name.
 
-        It is 0 or 1, and for `uniform` a probability. References are the drivers, `uniform`, and
-        where their actions are known `constant` and `open-loop`.
+        It is 0 or 1, and for `uniform`, which draws actions, a probability. References are the
+        drivers, `uniform`, and where their actions are known `constant` and `open-loop`, which
+        always take the same ones.
         """
         parts: dict[str, list[Floats]] = {}
         action, actions = constant(self.scenario), open_loop(self.scenario)

@@ -44,9 +44,10 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
 
 
 def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
-    """Raise UserError if a dataset has a first scene of `others`, which results are reported on.
+    """Raise UserError if a dataset shares a first scene with `others`, on which results are
+    reported.
 
-    Scenes are equal if their vehicles agree to 0.01 in all numbers, whatever their seeds.
+    Scenes are equal if all numbers of their vehicles, rounded to 0.01, are, whatever their seeds.
     """
     starts = _starts(dataset)
     for other in others:

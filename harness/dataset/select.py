@@ -17,7 +17,12 @@ NONE = "none"  # the `danger` of layouts without one
 
 @dataclass(frozen=True)
 class Selection:
-    """State which episodes of a dataset to evaluate; one must meet all conditions that are set."""
+    """State which episodes of a dataset to evaluate; one must meet all conditions that are set.
+
+    `limit` keeps the first so many of those left; `only` has numbers and ranges such as `3,10:20`,
+    without their ends; `danger` is a sector or `none`; `sample` draws so many by `sample_seed`.
+    None sets no condition.
+    """
 
     limit: int | None = None  # keeps the first so many of those that the other conditions leave
     only: str | None = None  # numbers and ranges such as `3,10:20`; a range leaves out its end

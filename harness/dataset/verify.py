@@ -333,7 +333,8 @@ def unusable(path: Path, problem: str) -> UserError:
 def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -> str:
     """Return in one line where a JSON text does not fit a type.
 
-    `error` is msgspec's, which is used if no better words are found; `what` names the text.
+    `error` is msgspec's, which is used if no better words are found; `text` was decoded as a
+    `kind`, and `what` names it.
     """
     try:
         if isinstance(table := _JSON.decode(text), dict):
