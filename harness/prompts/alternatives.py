@@ -25,8 +25,8 @@ FIRST: Mapping[str, int] = MappingProxyType({})  # the choice of the first alter
 class Mark(NamedTuple):
     """Describe a mark in a template: alternatives to choose from, or parts to put in some order.
 
-    `start` and `end` are its span in the text. It is written `{% either name %}A{% or %}B{%
-    endeither %}`, or with `order`.
+    `start` and `end` are its span in the text, and `parts` the texts. It is written `{% either name
+    %}A{% or %}B{% endeither %}`, or with `order`.
     """
 
     start: int

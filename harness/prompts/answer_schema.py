@@ -23,7 +23,12 @@ EVIDENCE_CHARS = 200
 
 
 class Shape(NamedTuple):
-    """Describe what an answer's JSON must look like; it decides the schema and the parser."""
+    """Describe what an answer's JSON must look like; it decides the schema and the parser.
+
+    `role` is `ego` or `helper`, `actions` are the names of meta-actions in order, and `form` is one
+    of the role's `FORMS`, None for any of them. `extension` has the schemas of further members as
+    JSON, empty for none; `placeholders` are what the prompt shows in place of values.
+    """
 
     role: str  # `ego` or `helper`
     actions: tuple[str, ...]  # meta-action names, in the environment's order
@@ -100,7 +105,7 @@ def closed(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 @lru_cache
 def constrained_schema(shape: Shape) -> Mapping[str, Any]:
-    """Return the JSON Schema by which decoding is constrained, for a shape with a stated form.
+    """Return the JSON Schema by which decoding is constrained, for a shape whose `form` is set.
 
     A helper's evidence is an empty text in it.
     """

@@ -13,7 +13,11 @@ REPAIR = "repair"  # any call with the turn that follows an answer that cannot b
 
 
 class Outside(NamedTuple):
-    """Describe a rendered prompt whose number of tokens is outside the version's budget."""
+    """Describe a rendered prompt whose number of tokens is outside the version's budget.
+
+    `messages` counts those of helpers in it, `call` is a role, `FUSION` or `REPAIR`, and `tokens`
+    its size.
+    """
 
     scene: str  # its id
     viewer: str
@@ -27,7 +31,7 @@ class Sizes:
     """Hold the token counts of all rendered prompts, and those outside the version's budget.
 
     `tokens` lists them by kind of call: `ego`, `helper`, `fusion` (the ego with messages) or
-    `repair`.
+    `repair` (one that asks again after an answer that could not be parsed).
     """
 
     # by call: a role, `FUSION` or `REPAIR`

@@ -35,7 +35,11 @@ CARE = {
 
 @dataclass(frozen=True)
 class Question:
-    """State a choice between actions, or between other options that a client of a server gives."""
+    """State a choice between actions, or between other options that a client of a server gives.
+
+    `state` is what the prompt says of the scene, `instructions` what is asked, and `meanings` what
+    each option means, None where nobody says.
+    """
 
     state: str  # what the prompt says of the scene
     instructions: str  # what is asked, in the scenario's words
@@ -88,10 +92,10 @@ def _meaning(action: str, words: Mapping[str, str]) -> str | None:
 def letter_chat(
     question: Question, messages: Sequence[Mapping[str, str]], order: Sequence[str]
 ) -> tuple[Mapping[str, str], ...]:
-    """Return the chat messages that ask a chat model the same question, to answer by one letter.
+    """Return the chat messages that ask a chat model a decision model's question, by one letter.
 
-    The actions are listed in `order`, after the state, which all orders share. A picture stays with
-    the last of `messages`.
+    The actions are listed in `order`, after the state, which all orders share. `messages` are the
+    prompt's chat about the same scene; a picture stays with the last of them.
     """
     meant = (question.meanings[action] for action in order)
     options = [

@@ -56,7 +56,8 @@ def densest_repair(
 ) -> tuple[Mapping[str, str], ...]:
     """Return the longest two messages that a repair turn adds to a chat.
 
-    They are an answer of the greatest length, and the request to write it again.
+    A repair turn asks again after an answer that could not be parsed. They are an answer of the
+    greatest length, and the request to write it again.
     """
     request = prompt.repair(role, dense(ERROR_CHARS), actions, words)
     answer = dense(prompt.most_answer_tokens(role))

@@ -40,7 +40,11 @@ SETTINGS = (
 
 @dataclass(frozen=True)
 class Hunk:
-    """Describe one change between two texts A and B, with the words around it."""
+    """Describe one change between two texts A and B, with the words around it.
+
+    It begins in line `line_a` of A and `line_b` of B, from 1; `pieces` are what both have, what
+    only A has and what only B has, in reading order.
+    """
 
     line_a: int  # line of A in which it begins, from 1
     line_b: int  # line of B
@@ -59,7 +63,11 @@ class TextChange:
 
 @dataclass(frozen=True)
 class PromptChange:
-    """Hold the differences between two prompt versions A and B; true if there are any."""
+    """Hold the differences between two prompt versions A and B; true if there are any.
+
+    `settings` has name, A's value and B's of each that differs, and `texts` each template's change
+    by the name of its file.
+    """
 
     # name, A's value and B's value of each setting that differs; descriptions are left out
     settings: tuple[tuple[str, Any, Any], ...]
@@ -73,7 +81,9 @@ class PromptChange:
 class Sent:
     """Compare the messages about one scene as versions A and B render them.
 
-    The comparison is before any chat template of a model.
+    `words` and `tokens` count A's and B's, None for tokens without a tokenizer; `parts` are the
+    differences by part, such as the system message. The comparison is before any chat template of a
+    model.
     """
 
     viewer: str  # id of the vehicle that is asked
@@ -94,7 +104,7 @@ def change(a: Prompt, b: Prompt) -> PromptChange:
 
 
 def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
-    """Return a version with the ego's part of one version and the helper's part of another."""
+    """Return a version with the ego's part of the version `ego` and the helper's of `helper`."""
     of_ego, of_helper = (prompt.examples or Examples("") for prompt in (ego, helper))
     examples = Examples(of_ego.scenario or of_helper.scenario, of_ego.ego, of_helper.helper)
     return replace(

@@ -28,7 +28,10 @@ class Example(Struct, frozen=True):
 
 
 class Examples(Struct, frozen=True):
-    """Hold the few-shot examples of a prompt version by role, in the order they are shown in."""
+    """Hold the few-shot examples of a prompt version by role, in the order they are shown in.
+
+    `scenario` is the one that they come from, and may be shown in, unless `everywhere` is true.
+    """
 
     # the scenario that they come from, and the only one in which they may be shown, unless
     # `everywhere`

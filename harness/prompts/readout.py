@@ -55,8 +55,8 @@ def letter_chat(
 ) -> tuple[Mapping[str, str], ...]:
     """Return a chat in which every question asks for the letter of an action.
 
-    `answered` has the likeliest action of each earlier answer of the chat, whose letter replaces
-    the answer.
+    Letters are those of `actions`, in order. `answered` has the likeliest action of each earlier
+    answer of the chat `messages`, whose letter replaces the answer.
     """
     letter, earlier = dict(zip(actions, letters(actions), strict=True)), iter(answered)
 
@@ -69,7 +69,10 @@ def letter_chat(
 
 
 def answer_json(actions: Sequence[str], shares: Sequence[float]) -> str:
-    """Return the JSON of an answer with these shares of the actions, normalised, in millionths."""
+    """Return the JSON of an answer whose probabilities are these shares of the actions.
+
+    They are divided by their sum and rounded to millionths.
+    """
     total = math.fsum(shares)
     p = rounded([share / total for share in shares], parts=10**6)
     return canonical_json({"action_distribution": dict(zip(actions, p, strict=True))})

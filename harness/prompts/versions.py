@@ -48,7 +48,14 @@ OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})
 
 @dataclass(frozen=True)
 class Prompt:
-    """Hold one prompt version: its templates and settings turn scene graphs into chats."""
+    """Hold one prompt version: its templates and settings turn scene graphs into chats.
+
+    `texts` has the templates by role, and `max_answer_tokens` the most tokens of an answer by role;
+    `token_budget` bounds those of a rendered prompt. `helper_answer` and `ego_answer` are the forms
+    of answers that are asked for. `max_objects` and `max_conflicts` (None for all) limit what is
+    listed. `examples` are earlier turns with the right answers, `extension` the schemas of further
+    members of an answer by role, and `image` what picture there is; None for none.
+    """
 
     version: str  # name of its folder
     sha256: str  # digest of its files
@@ -287,7 +294,7 @@ def names(where: Path | None = None) -> list[str]:
 
 
 def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
-    """Return why a version may not be used in a scenario, as a phrase; None if it may."""
+    """Return why a prompt version may not be used in a scenario, as a phrase; None if it may."""
     if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
         return f"speaks of a crossing, which {scenario.name} is not"
     if (
