@@ -20,7 +20,12 @@ MARKS = {"ego": ("maneuver", "action_distribution"), "helper": FIELDS["helper"]}
 
 
 class Answer(Struct, frozen=True):
-    """Hold an answer that was read from an object: its intent, and the repairs that it took."""
+    """Hold an answer that was read from an object: its intent, and the repairs that it took.
+
+    `intent` has the probabilities in the order of the actions, and `mass` their sum as stated; None
+    without any. `message` is a helper's evidence, risk, maneuver and confidence, None of the ego;
+    `extension` has the further members that the prompt asked for, None without.
+    """
 
     intent: values.Intent  # probabilities in the order of the actions
     mass: float | None  # sum of the probabilities as stated; None without any
@@ -165,7 +170,10 @@ def _judgement(
 
 
 def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
-    """Return the intent of one action with a confidence, the rest spread evenly over others."""
+    """Return the intent of one action with a confidence, the rest spread evenly over others.
+
+    `maneuver` is that action and `confidence` its probability; the order is that of `actions`.
+    """
     if len(actions) == 1:
         return (1.0,)
     share = (1 - confidence) / (len(actions) - 1)

@@ -30,7 +30,8 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 class Candidate:
     """Hold an object in a completion that is shaped like an answer.
 
-    `lost` are repairs to drop later: they would report as missing what merely could not be read.
+    `repairs` are those that reading its `members` took. `lost` are repairs to drop later: they
+    would report as missing what merely could not be read.
     """
 
     members: dict[str, Any]  # what it holds

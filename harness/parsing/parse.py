@@ -44,7 +44,13 @@ _ECHO = re.compile(
 
 
 class Parsed(Struct, frozen=True):
-    """Hold the result of parsing one completion: a status, and an intent unless it failed."""
+    """Hold the result of parsing one completion: a status, and an intent unless it failed.
+
+    `repairs` is empty unless the status is recovered. If it failed, `intent` (probabilities in the
+    order of the actions) and `message` (a helper's evidence, risk, recommended maneuver and
+    confidence) are None, and `faults` has all that is wrong. `mass` is the probabilities' sum as
+    written, None without; `reasoning` is the model's thought, None without.
+    """
 
     status: Status  # the outcome
     # the repairs, in the order of `Repair`; empty unless recovered

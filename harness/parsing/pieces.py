@@ -47,7 +47,7 @@ def decoded(value: object) -> tuple[Any, frozenset[Repair]]:
 def fields_of(members: dict[str, Any], role: str, actions: Sequence[str]) -> set[str]:
     """Return the names of the answer's fields that an object has, whatever their spelling.
 
-    Keys that are actions count as `action_distribution`.
+    `role` is `ego` or `helper`. Keys that are actions count as `action_distribution`.
     """
     names = {match(key, FIELDS[role]) for key in members}
     if any(match(key, actions) for key in members):
@@ -142,7 +142,7 @@ def _two_forms(fields: set[str], role: str) -> bool:
 
 
 def are_one(pieces: Sequence[dict[str, Any]], role: str, actions: Sequence[str]) -> bool:
-    """Return whether several objects are pieces of one answer.
+    """Return whether several objects are pieces of one answer of a role, `ego` or `helper`.
 
     That is so if exactly one of them names an action or a distribution, and no field is in two.
     """

@@ -95,7 +95,11 @@ DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
 
 @dataclass(frozen=True)
 class Token:
-    """Describe a token of almost-JSON."""
+    """Describe a token of almost-JSON: JSON with the slips of models, such as comments.
+
+    `text` is as written, with full-width numbers and marks as ASCII; `end` is where the next token
+    may begin, and `repairs` are those that reading it takes.
+    """
 
     # a group of the pattern; `other` for a character that begins no token, `end` at the text's end
     kind: str

@@ -173,7 +173,10 @@ class Failure(Exception):
 
 @contextmanager
 def noted(failures: list[Failure]) -> Iterator[None]:
-    """Append a Failure of one part of an answer to `failures`, so that all parts are read."""
+    """Run code, and append a Failure that it raises to `failures` instead of passing it on.
+
+    So all parts of an answer are read.
+    """
     try:
         yield
     except Failure as failure:
@@ -181,7 +184,7 @@ def noted(failures: list[Failure]) -> Iterator[None]:
 
 
 def joined(failures: Sequence[Failure]) -> Failure:
-    """Return one failure with the faults of all.
+    """Return one failure with the faults of all `failures`.
 
     Its status is the first one's, but an echo of the prompt goes first: it was never meant.
     """

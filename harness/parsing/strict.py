@@ -18,7 +18,10 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 def fitting(text: str, shape: Shape) -> Answer | None:
-    """Return the answer if the text is exactly JSON of this shape that sums to 1; else None."""
+    """Return the answer if the text is exactly JSON of this shape, and its probabilities sum to 1.
+
+    Else None.
+    """
     try:
         value = DECODER.decode(text)
     except (ValueError, RecursionError):
