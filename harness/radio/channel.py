@@ -32,7 +32,12 @@ class Unit(NamedTuple):
 class Site:
     """Hold the true positions of the ego and its H helpers, m, and what blocks each link.
 
-    Arrays have leading batch dimensions, `(...)`; the ego's position is the first of 1+H.
+    Arrays have leading batch dimensions, `(...)`; the ego's position is the first of 1+H, and an
+    absent helper's is NaN. `sight`, `(..., H)`, is CLEAR, VEHICLE or BUILDING, `blocker_m` the
+    height of the tallest vehicle between (0 without one), and `corner_m` the distances of ego and
+    helper to the crossing of their streets, `(..., H, 2)`; NaN if they do not cross. `first_m` is
+    the height of the antenna at the first position, None if it is that of all others. `units` has
+    the sites of roadside units, each with the unit first, then the ego and the helpers.
     """
 
     xy_m: Floats  # positions, `(..., 1+H, 2)`, the ego's first; NaN for an absent helper
@@ -81,7 +86,7 @@ class Site:
         return Site(xy_m, sight, blocker_m, self.corner_m[..., links, :], self.first_m)
 
     def of_helpers(self, places: Ints) -> "Site":
-        """Return the part with the helpers of these indices, `(n, H')`; one may be repeated."""
+        """Return the part with the helpers of these H' indices, `(n, H')`; one may be repeated."""
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return Site(
             np.take_along_axis(self.xy_m, with_ego[..., None], axis=-2),
@@ -97,7 +102,9 @@ class Site:
 class Draws:
     """Hold the channel's uniform random numbers in [0, 1), the same for every operating point.
 
-    `link` and `jitter` are of constant channels; `trips` has the keys of those of physical radios.
+    `link`, `(..., H, 2)`, and `jitter`, `(..., H)`, are of H helpers' requests and replies on
+    channels of constant loss. `trips` has the keys of further draws, those of physical radios; None
+    if there are none. `given` are draws of packets, `(..., 1+2H)`, in place of those of `trips`.
     """
 
     # draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an
@@ -114,7 +121,7 @@ class Draws:
         return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at), given)
 
     def of_helpers(self, places: Ints) -> "Draws":
-        """Return the draws of the helpers with these indices, `(n, H')`.
+        """Return the draws of the helpers with these H' indices, `(n, H')`.
 
         A repeated helper has the same link.
         """
@@ -123,7 +130,7 @@ class Draws:
 
     @cached_property
     def packet(self) -> Floats:
-        """Return draws for loss of each helper's request and reply, `(..., H, 2)`.
+        """Return draws for loss of each of H helpers' request and reply, `(..., H, 2)`.
 
         They are new at every step.
         """
@@ -155,7 +162,7 @@ class Draws:
 
     @cached_property
     def latency(self) -> Floats:
-        """Return draws for the latency of each helper's request and reply, `(..., H, 2)`.
+        """Return draws for the latency of each of H helpers' request and reply, `(..., H, 2)`.
 
         They are new at every step.
         """
@@ -198,7 +205,11 @@ NO_SITE = (
 class Links:
     """Hold what a channel must know of the links between the ego and its H helpers, (..., H).
 
-    `ready_s` is when a helper has heard the request and has its own answer, s after the request.
+    `asked` and `in_radius` say which helpers are asked, and are present and near enough to be;
+    `rounds` which of these open a round of questions of their own. `ready_s` is when a helper has
+    heard the request and has its own answer, s after the request. `payload_bits` and `request_bits`
+    are the sizes of reply and request. `site` has the positions; None if the channel or the world
+    has none.
     """
 
     # which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN
@@ -242,7 +253,10 @@ REPLY: Way = 1
 
 
 class Broadcast(NamedTuple):
-    """Hold when a broadcast request is received and how long it is on air, s."""
+    """Hold when a broadcast request is received and how long it is on air, s.
+
+    `heard_s` is from the decision to ask, `(...)` or one number; NaN if it depends on the link.
+    """
 
     # seconds from the decision to ask until the helpers have the request, `(...)` or one number;
     # NaN if it depends on the link (`ByLink`)
@@ -254,7 +268,8 @@ class Delivery(NamedTuple):
     """Hold which of H helpers' replies are received on a channel, when, and their airtime.
 
     `up` is whether request and reply are received, `delay_s` is from the request to the reply's
-    end, `loss` that of one transmission, (..., H) each.
+    end, `loss` the probability that one transmission is lost, and `airtime_s` how long the reply
+    occupies the medium (NaN if not known), (..., H) each.
     """
 
     # whether request and reply are received, `(..., H)`; anything for helpers that were not asked
@@ -277,7 +292,10 @@ class Channel(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when helpers have received a broadcast of so many bits, `(...)` or one number."""
+        """Return when helpers have received a broadcast of so many bits, and its airtime.
+
+        `bits` is `(...)` or one number, and so are the times.
+        """
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Return whether, and when, each helper's request and reply are received."""
@@ -303,9 +321,10 @@ class Physical(Channel, Protocol):
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that a message is lost on each link, `(..., H)`.
+        """Return the probability that a message is lost on each of H links, `(..., H)`.
 
-        `shadow` is the link's shadowing, standard normal, `(..., H)`.
+        `site` has the positions, `shadow` is each link's shadowing, standard normal, `(..., H)`,
+        and `bits` the message's size.
         """
 
     def busy_ratio(self) -> float:
@@ -317,7 +336,7 @@ class ByLink(Physical, Protocol):
     """Describe a physical channel on which a message's latency depends on its link."""
 
     def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
-        """Return the seconds from the wish to send until reception on each link, `(..., H)`.
+        """Return the seconds from the wish to send until reception on each of H links, `(..., H)`.
 
         `way` is `REQUEST` or `REPLY`, which chooses the draws of `draws.latency` they may depend
         on.
@@ -325,10 +344,11 @@ class ByLink(Physical, Protocol):
 
 
 def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:
-    """Return when each reply's slot on a serial medium ends, s, `(..., H)`.
+    """Return when the slot of each of H replies on a serial medium ends, s, `(..., H)`.
 
-    Replies are served in the order in which they are ready, of equal ones the nearest first.
-    `slot_s` is a slot's length, `ready_s` when a helper may send, `range_m` its distance.
+    A serial medium carries one reply after another: in the order in which they are ready, of equal
+    ones the nearest first. `slot_s` is a slot's length, `ready_s` when a helper may send, `range_m`
+    its distance.
     """
     order = np.lexsort((range_m, ready_s), axis=-1)
     served_slot_s = np.take_along_axis(slot_s, order, axis=-1)

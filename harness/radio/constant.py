@@ -20,7 +20,11 @@ from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 class Radio:
     """Define a channel with one nominal latency and one loss for all links, as the paper has it.
 
-    Both are assumptions; there is no link budget.
+    Both are assumptions; there is no link budget. `latency_s` is that of one exchange, request
+    included, and `jitter_s` the largest delay that a reply has beside it. With `access` `serial`
+    replies are sent one after another, with `parallel` all at once. With `density_coupled` the loss
+    follows from the number of vehicles near; with `roadside_edge` a reply has a second path, by a
+    roadside unit.
     """
 
     # nominal seconds of one exchange, the request included, without serialisation
@@ -76,9 +80,10 @@ def density_coupled_loss(n_active: Ints) -> Floats:
 
 
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
-    """Return which helpers' request and reply are both received, `(..., H)`.
+    """Return which of H helpers' request and reply are both received, `(..., H)`.
 
     The probability is (1 - loss)^2. `uniforms` are draws of request and reply, `(..., H, 2)`. With
-    a roadside edge a reply has a second path, so that it is lost with probability loss^2.
+    a roadside edge, an antenna beside the road, a reply has a second path, so that it is lost with
+    probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

@@ -49,8 +49,9 @@ class Trips:
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
         """Return the shadowing of the link to each of H helpers, `(..., H)`, standard normal.
 
-        `xy_m` are positions of the ego and its helpers, m, `(..., 1+H, 2)`. The correlation is 1/e
-        when both ends have moved `decorrelation_m` (root of the sum of squares).
+        Shadowing is the slow change of received power by what stands around. `xy_m` are positions
+        of the ego and its helpers, m, `(..., 1+H, 2)`. The correlation is 1/e when both ends have
+        moved `decorrelation_m` (root of the sum of squares).
         """
         helpers = xy_m.shape[-2] - 1
         waves, place = self._once_a_pair(_waves, helpers)

@@ -6,7 +6,7 @@ from typing import Any
 
 
 def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
-    """Return a sentence for each setting outside the range for which the model was validated.
+    """Return a sentence for each setting outside the range for which a channel model was validated.
 
     `limits` has the least and largest value by the setting's name.
     """

@@ -17,7 +17,11 @@ Milliseconds = Annotated[float, between(0, 1000 * LONGEST_S)]
 
 @dataclass(frozen=True)
 class Network:
-    """Hold measured quantiles of round trips to a cloud, without the time of its answer."""
+    """Hold measured quantiles of round trips to a cloud, without the time of its answer.
+
+    `quantiles_ms` has their milliseconds by percentage, from 0 to 100; `status` says whether they
+    are cited from a publication, measured by oneself, or assumed.
+    """
 
     description: str  # one sentence for lists
     source: str  # who measured the round trips, where and how many

@@ -31,7 +31,12 @@ MODELS = Shipped[Any]("swarmdrive.channel_models", object, {"constant": Radio})
 
 @dataclass(frozen=True)
 class Profile:
-    """Hold the content of a channel profile, a file of `channels/`: model, parameters, source."""
+    """Hold the content of a channel profile, a file of `channels/`: model, parameters, source.
+
+    `status` says whether the numbers are measured on radios, cited from a publication, modelled, or
+    assumed. `limits` has the least and largest value of some parameters for which the source
+    validated the model.
+    """
 
     model: str  # one of `MODELS`
     description: str  # one sentence for lists

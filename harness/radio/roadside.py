@@ -28,17 +28,18 @@ class Relay(Wrapped):
     """Wrap a channel by a roadside unit that repeats replies; requests go directly.
 
     A reply arrives if it reaches the ego, or the unit and from there the ego. The ego takes the one
-    that comes first: the direct one, unless latencies depend on the link. Copies are sent whether
-    or not the ego needs them, since the unit cannot know, and do not wait for other messages.
+    that comes first: the direct one, unless latencies depend on the link. The unit repeats every
+    reply, needed or not, since it cannot know, `delay_s` seconds after that reply has ended, and
+    what it sends does not wait for other messages.
     """
 
     unit: Unit  # the unit
     delay_s: float  # time from a reply's end at the unit until its copy is to be sent
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Return which replies arrive, directly or by the unit, and when the first copy does.
+        """Return which replies arrive, directly or by the unit, and when the first of both does.
 
-        A lost reply keeps its slot on the medium, and that of its copy if there is one.
+        A lost reply keeps its slot on the medium, and that of its repetition if there is one.
         """
         up, delay_s, loss, airtime_s = delivered(self.channel, links, draws)
         has_request = draws.packet[..., 0] >= link_loss(
@@ -75,8 +76,11 @@ class Relay(Wrapped):
 class Consulted(NamedTuple):
     """Hold the result of asking H helpers, with times in s from the start of the ego's request.
 
-    `up` and `fused` say which replies (..., H) were received and were in time for fusion; `acts_s`
-    is when the ego stops waiting, (...).
+    `asked`, `up` and `fused` say which helpers were asked, whose replies were received, and which
+    of these were in time for fusion, (..., H); `end_s`, (..., H), is when each reply ends, inf
+    without one; `acts_s` is when the ego stops waiting, (...). `loss` is the probability that a
+    reply is lost. `requests`, `request_bits`, `policy_bits` and `airtime_s`, (...), sum what was
+    sent.
     """
 
     # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
@@ -162,5 +166,8 @@ def by_unit(
 
 
 def link_loss(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
-    """Return the probability that one transmission of so many bits is lost, `(..., H)`."""
+    """Return the probability that one transmission of so many bits is lost, on each of H links.
+
+    It is `(..., H)`; `site` has the positions and `draws` the links' shadowing.
+    """
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

@@ -104,9 +104,9 @@ def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast
 
 
 def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) -> Floats:
-    """Return when each receiver has a broadcast, in s from the wish to send, `(..., H)`.
+    """Return when each of H receivers has a broadcast, in s from the wish to send, `(..., H)`.
 
-    It is `(..., 1)` if all have it at once.
+    `request` is what the channel said of it. It is `(..., 1)` if all have it at once.
     """
     model = innermost(channel)
     if isinstance(model, ByLink):
