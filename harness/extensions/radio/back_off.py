@@ -30,8 +30,9 @@ def begin_per_s(busy: Floats | float, packet_s: float) -> Floats | float:
 def free_share(busy: Floats | float, packet_s: float, aifs_s: float) -> Floats:
     """Return the share of time in which a vehicle that hears this busy ratio may begin to send.
 
-    It is the idle time without the AIFS of each gap, whose lengths are assumed to be exponential.
-    `packet_s` is a packet's time on air; the shape is that of `busy`.
+    It is the idle time without the first `aifs_s` of each gap, for which the medium must be idle
+    (AIFS); the lengths of gaps are assumed to be exponential. `packet_s` is a packet's time on air;
+    the shape is that of `busy`.
     """
     return (1 - np.asarray(busy)) * np.exp(-aifs_s * begin_per_s(busy, packet_s))
 
@@ -39,7 +40,9 @@ def free_share(busy: Floats | float, packet_s: float, aifs_s: float) -> Floats:
 def mean_access_s(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
     """Return the mean access delay in s, from the wish to send until the medium is taken.
 
-    A packet on air ends first; then the medium must be idle for an AIFS, and for each slot of the
+    `busy` is the channel busy ratio, the share of time in which the medium is sensed as busy,
+    `packet_s` a packet's time on air and `aifs_s` the time that the medium must be idle first. A
+    packet on air ends first; then the medium must be idle for that, and for each slot of the
     back-off (uniform from 0 to `window` slots). A packet in between costs its airtime and another
     AIFS. Packets begin at random in idle time.
     """
@@ -92,7 +95,9 @@ def same_slot(
     collide more often than if they began at random. The model follows the mean number of vehicles
     with each back-off count, slot by slot from one busy period to the next. Numbers are assumed to
     be Poisson; the vehicles that a busy period leaves waiting are a fixed point. `per_slot` counts
-    the packets of all vehicles that arrive in a slot; back-off is uniform from 0 to `window` slots.
+    the packets of all vehicles that arrive in a slot. `packet_slots` and `aifs_slots` are the time
+    on air and the idle time before a back-off counts down, in slots; back-off is uniform from 0 to
+    `window` slots.
     """
     counts = window + 1
     slot, count = np.arange(counts + 1)[:, None], np.arange(counts)
@@ -117,7 +122,7 @@ def crowding(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
     """Return how many times as often packets begin in one slot as if they began at random.
 
     It is for vehicles which all hear each other and together cause this busy ratio; above
-    `SATURATED` it is constant.
+    `SATURATED` it is constant. The arguments are those of `mean_access_s`.
     """
     packet_slots = packet_s / SLOT_S
     per_slot = min(busy, SATURATED) / packet_slots

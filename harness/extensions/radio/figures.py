@@ -83,11 +83,11 @@ def reception(
 
 @styled
 def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], title: str) -> Figure:
-    """Draw the loss of one transmission against vehicles in the radius:
-    radios beside the paper's line.
+    """Draw the loss of one transmission against vehicles in the radius: radios beside the paper's
+    line.
 
     Args:
-        vehicles: `(n,)`, sender and receiver included.
+        vehicles: numbers of vehicles, `(n,)`, sender and receiver included.
         losses: losses by the name of a radio, `(n,)`, and the paper's line as `paper`.
         title: what the losses are of.
     """

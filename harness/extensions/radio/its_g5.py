@@ -58,7 +58,7 @@ IMPLEMENTATION = 0.37  # share of Shannon's rate that is reached: Wu et al., arX
 
 
 class Hazards(NamedTuple):
-    """Hold the mean number of packets that spoil one, as tables (D, P).
+    """Hold the mean number of packets that spoil one, as tables of D distances by P powers, (D, P).
 
     Rows are distances in steps of `STEP_M`, columns received powers in steps of `STEP_DB`. `before`
     counts packets on air earlier, `during` later ones for each second of airtime.
@@ -75,6 +75,9 @@ class ItsG5(Transceiver):
     """Model 802.11p (ITS-G5) under background traffic of packets of one size and rate.
 
     It is the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022); fields are its settings.
+    `aifs_slots` are the slots in which the medium must be idle before a back-off, which is uniform
+    from 0 to `contention_window` slots; `sensing_dbm` is the least power that is sensed, and
+    `curve` the name of a curve of block errors.
     """
 
     # carrier frequency, here the control channel's

@@ -20,7 +20,11 @@ CODINGS = {4: ("lte-qpsk-0.7-190B", 10), 2: ("lte-qpsk-0.5-190B", 12)}
 
 @dataclass(frozen=True)
 class LteMode4(Sidelink):
-    """Model LTE-V2X Mode 4 in a 10 MHz channel, where vehicles choose resources by sensing."""
+    """Model LTE-V2X Mode 4 in a 10 MHz channel, where vehicles choose resources by sensing.
+
+    `subchannels` packets fit beside each other into a slot of 1 ms, by their coding. `ranks` says
+    that vehicles rank the resources left by received power.
+    """
 
     # packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7, or 2
     # at 0.5

@@ -53,7 +53,9 @@ LENGTHS = {"open": (0, 128), "opaque": (0, 128, 256)}
 class Counts(NamedTuple):
     """Hold how much a message lists; numbers or arrays, which broadcast.
 
-    A message uses those that apply to it.
+    A message uses those that apply to it: `objects` of a CPM or SDSM, `points` of the path behind
+    of a CAM or BSM, `actions` and `text_bytes` of an intent, and `helpers` whom a request asks.
+    `optional` says whether objects have what their standard leaves open.
     """
 
     objects: Count = 0  # listed in a CPM or SDSM
@@ -134,7 +136,10 @@ def message_bits(name: str, content: Counts) -> Floats:
 
 
 def shares(name: str, content: Counts) -> list[Share]:
-    """Return the bits of each member of a message; the last entry is the padding to an octet."""
+    """Return the bits of each member of a message; the last entry is the padding to an octet.
+
+    `name` is one of `NAMES`, such as CPM, and `content` what it lists.
+    """
     counts = {**content._asdict(), "path": np.asarray(content.points) > 0}
     members = list(_shares(name, counts, 1.0, ()))
     return [*members, Share(("filling",), -_total(members) % 8, "X.691 11.1")]
@@ -145,7 +150,7 @@ def packet_bits(
 ) -> Floats:
     """Return the size of a message of so many bits with envelope and headers, bits; 0 stays 0.
 
-    The arguments are those of `wraps`.
+    `name` is one of `NAMES`, such as CPM; the other arguments are those of `wraps`.
     """
     bits = np.asarray(bits, dtype=float)
     return np.where(bits > 0, bits + _total(wraps(name, bits, since_certificate_s, headers)), 0.0)
@@ -185,7 +190,10 @@ def wraps(
 
 
 def size(name: str, content: Counts) -> Size:
-    """Return the size of a message in bits: alone, with its envelope, and with headers."""
+    """Return the size of a message in bits: alone, with its envelope, and with headers.
+
+    `name` is one of `NAMES`, such as CPM, and `content` what it lists.
+    """
     bits = message_bits(name, content)
     signed, packet = packet_bits(name, bits, headers=False), packet_bits(name, bits)
     return Size(bits, signed - bits, packet - signed, packet, packet_bits(name, bits, np.inf))
@@ -194,7 +202,8 @@ def size(name: str, content: Counts) -> Size:
 def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
     """Return the mean size of a vehicle's beacons (CAM or BSM), bytes, rounded up.
 
-    They have no path history. Now and then one has the certificate, by `CERTIFICATE_EVERY_S`.
+    `encoding` names the standard, and `rate_hz` is beacons a second. They have no path history. Now
+    and then one has the certificate, by `CERTIFICATE_EVERY_S`.
     """
     beacon = size(NAMES[encoding]["beacon"], Counts())
     every = max(1, math.ceil(CERTIFICATE_EVERY_S[encoding] * rate_hz))
@@ -203,7 +212,7 @@ def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
 
 @dataclass(frozen=True)
 class Standard:
-    """A standard's messages as an `encoding` of conditions."""
+    """A standard's messages, for the value of a condition's setting `encoding` that names it."""
 
     encoding: Encoding
 

@@ -42,7 +42,13 @@ CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
 
 @dataclass(frozen=True)
 class NrMode2(Sidelink):
-    """Model NR-V2X Mode 2 in one resource pool, where vehicles choose resources by sensing."""
+    """Model NR-V2X Mode 2 in one resource pool, where vehicles choose resources by sensing.
+
+    A packet takes as many sub-channels of `subchannel_blocks` resource blocks as it needs, in a
+    slot of 1 ms / 2^`numerology`. A message takes a slot from `t1_slots` to `t2_slots` after it is
+    ready; `mcs` is its modulation and coding, and `efficiency` the share of Shannon's bound of a
+    coding without a curve.
+    """
 
     environment: Environment = "tr37885-highway"
     frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89

@@ -25,7 +25,12 @@ NEAREST_M = 3.0
 
 @dataclass(frozen=True)
 class Propagation:
-    """Define path loss, blockage and shadowing, with heights and widths as settings of a radio."""
+    """Define path loss, blockage and shadowing, with heights and widths as settings of a radio.
+
+    `environment` is the law of links without a building between. `environment_height_m` is taken
+    from `antenna_m` for the effective height, `blocker_m` is the height of a blocking vehicle that
+    no scene gives, and `street_m` and `wall_m` describe the street at a corner.
+    """
 
     # law of links without a building between, with its LOS probabilities and decorrelation
     environment: Environment = "winner-b1"
@@ -106,9 +111,10 @@ class Propagation:
     ) -> tuple[Floats, Floats]:
         """Return mean and standard deviation, `(...)`, of a blocking vehicle's additional loss, dB.
 
-        By TR 37.885, 6.2.1, it is max(0, X) with X normal in dB: mean 9 and deviation 4.5 if both
-        antennas are lower than the blocker, 5 and 4 if only one is. There is none if both are
-        higher. Beyond 541 m the mean grows by 15 log10 d - 41.
+        `blocker_m` is its height, None for the model's own, and `first_m` the height of one
+        antenna, if it is not `antenna_m`. By TR 37.885, 6.2.1, the loss is max(0, X) with X normal
+        in dB: mean 9 and deviation 4.5 if both antennas are lower than the blocker, 5 and 4 if only
+        one is. There is none if both are higher. Beyond 541 m the mean grows by 15 log10 d - 41.
         """
         blocker_m = self.blocker_m if blocker_m is None else blocker_m
         other_m = self.antenna_m if first_m is None else first_m
@@ -165,9 +171,9 @@ class Propagation:
     def decorrelation_m(self) -> float:
         """Return where shadowing's correlation is 1/e: at 25 m on a highway, else at 10 m.
 
-        TR 37.885, 6.2.1, and TR 36.885 for `winner-b1`. In a town the former has 13 m for links
-        without line of sight; here these have 10 m as well, so that shadowing does not jump when
-        sight is lost.
+        It is by TR 37.885, 6.2.1, and by TR 36.885 for `winner-b1`. In a town TR 37.885 has 13 m
+        for links without line of sight; here these have 10 m as well, so that shadowing does not
+        jump when sight is lost.
         """
         return 25.0 if self.environment == "tr37885-highway" else 10.0
 

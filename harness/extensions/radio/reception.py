@@ -218,7 +218,7 @@ class Compared:
 
     @property
     def mean_difference(self) -> float:
-        """Return the mean absolute difference in reception over the curve's points, 0 to 1."""
+        """Return the mean absolute difference of model and curve at its points, 0 to 1."""
         return float(np.abs(self.reception - self.curve.reception).mean())
 
     @property
@@ -240,7 +240,12 @@ def compared(channel: Channel, curve: Curve, where: str) -> Compared:
 
 @dataclass(frozen=True)
 class Check:
-    """Hold a channel's comparison with its own simulated messages and with published curves."""
+    """Hold a channel's comparison with its own simulated messages and with published curves.
+
+    `n` is the number of messages at each distance, and `busy_ratio` the share of time in which its
+    channel is sensed as busy; None if it has none. `waits` are the gaps between packets of a
+    vehicle, none for a radio that sends none.
+    """
 
     n: int  # messages at each distance
     busy_ratio: float | None  # of its channel, under the background load
@@ -250,7 +255,10 @@ class Check:
 
     @property
     def mean_difference(self) -> float:
-        """Return the mean absolute difference from the curves, equally weighted, 0 to 1."""
+        """Return the mean absolute difference of reception from the curves, equally weighted.
+
+        It is from 0 to 1.
+        """
         return float(np.mean([curve.mean_difference for curve in self.curves]))
 
 

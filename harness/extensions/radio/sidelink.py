@@ -40,7 +40,9 @@ CELLS = 160
 class Sidelink(Transceiver):
     """Model the common part of the sidelink radios LTE Mode 4 and NR Mode 2.
 
-    Its fields and those of `Transceiver` are settings of both.
+    Its fields and those of `Transceiver` are settings of both. `keep` is the probability that a
+    vehicle keeps its resource when it might choose another, and `transmissions` how often it sends
+    each block. A message takes a random slot from `t1_slots` to `t2_slots` after it is ready.
     """
 
     rate_hz: Annotated[float, between(0.1, 1000)] = 10.0  # packets that each vehicle sends a second

@@ -18,8 +18,8 @@ def rows_of(
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
     """Return the column names of a CSV file, and its rows with their line numbers.
 
-    Raises UserError if it is no table, lacks a column that is `needed`, or has one that is not
-    `known_columns`.
+    A row is a dict by column. Raises UserError if it is no table, lacks a column that is `needed`,
+    or has one that is not in `known_columns`.
     """
     file = printable(path)
     try:

@@ -53,7 +53,11 @@ What = Literal["reception", "p50_s", "p95_s"]
 
 
 class Point(NamedTuple):
-    """Hold a row of a table of reception: distance, reception, obstacle and latency."""
+    """Hold a row of a table of reception: distance, reception, obstacle and latency.
+
+    `reception` is the share of packets received at `distance_m`. `sight` is one of `SIGHTS`, and
+    `latency_s` the time from the wish to send until reception; each is None in a table without it.
+    """
 
     distance_m: float  # distance between sender and receiver
     reception: float  # share of packets received
@@ -117,7 +121,7 @@ class Trace:
 
     @property
     def spread(self) -> bool:
-        """Return whether the table has two percentiles of latency."""
+        """Return whether the table has two percentiles of latency (`Spread`) for each distance."""
         return any(isinstance(point.latency_s, Spread) for point in self.receptions.points)
 
     def percentiles_s(self, distance_m: Floats, sight: Ints | int) -> tuple[Floats, Floats]:

@@ -20,7 +20,12 @@ STEP_M, STEP_DB = 10.0, 0.5
 
 @dataclass(frozen=True)
 class Transceiver(Propagation, Physical):
-    """Model the radio of all vehicles under background traffic of one packet size and rate."""
+    """Model the radio of all vehicles under background traffic of one packet size and rate.
+
+    `density_per_km` is the number of background vehicles on a kilometre of road, each of which
+    sends `rate_hz` packets a second. `sensing_dbm` is the least power of a packet that is received
+    or sensed.
+    """
 
     # background vehicles on one kilometre of road, all lanes and both directions together
     density_per_km: Annotated[float, between(0, 10000)] = 100.0
@@ -78,9 +83,10 @@ class Transceiver(Propagation, Physical):
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
-        """Return the probability that a message is lost on each link, `(..., H)`.
+        """Return the probability that a message is lost on each of H links, `(..., H)`.
 
-        `shadow` is the link's shadowing, standard normal. Values for absent helpers mean nothing.
+        `site` has the positions, `bits` is the message's size, and `shadow` the link's shadowing,
+        standard normal. Values for absent helpers mean nothing.
         """
         return self._lost(self._fate_at(site, shadow), bits)
 
