@@ -30,7 +30,10 @@ OF_EGO = ("target_speeds", "target_speed", "speed_index", "route")
 
 
 def named(env: str, config: Any = None) -> str:
-    """Return the scenario name of a gymnasium id such as `merge-v0`, with changes of its config."""
+    """Return the scenario name of a gymnasium id such as `merge-v0`, with changes of its config.
+
+    `config` are the changed keys with their values; None for none.
+    """
     return f"{PREFIX}{env}" + (f"{CHANGES}{canonical_json(config)}" if config else "")
 
 
@@ -234,7 +237,7 @@ def config(name: str) -> dict[str, Any]:
 
 
 def meta_actions(name: str, env: Any) -> Any:
-    """Return the action type of an environment's ego.
+    """Return the action type of the ego of `env`; `name` is for messages.
 
     Raises UserError unless it is `DiscreteMetaAction` with at least SLOWER, IDLE and FASTER.
     """
@@ -258,9 +261,9 @@ def meta_actions(name: str, env: Any) -> Any:
 
 
 def numbered(env: Any, kind: Any, action: str) -> Any:
-    """Return the value that stands for an action in `env.step`; other agents of it take IDLE.
+    """Return the value that stands for an action in `env.step`; other agents of `env` take IDLE.
 
-    `kind` is the ego's action type.
+    `kind` is the ego's action type, as `meta_actions` returns it.
     """
     if kind is env.action_type:
         return kind.actions_indexes[action]

@@ -15,7 +15,7 @@ ENV, CONFIG = "env", "env_config"  # the options of commands that take a scenari
 
 
 class Environments:
-    """Read names such as `env:merge-v0:config={...}`."""
+    """Read names of environments of highway-env, such as `env:merge-v0:config={...}`."""
 
     heading = "Environments"
     options: ClassVar[Mapping[str, str]] = {

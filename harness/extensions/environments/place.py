@@ -30,7 +30,8 @@ HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the midd
 class Parameters(Common):
     """Hold the parameters of a highway-env environment as a scenario.
 
-    Raises UserError if `decisions` or `helpers` is not from 1 to 9.
+    `helpers` is the number of vehicles beside the ego that can be asked: other controlled ones
+    first, then the nearest. Raises UserError if `decisions` or `helpers` is not from 1 to 9.
     """
 
     braking_mps2: float = 20.0  # hardest braking; highway-env's own controller has no limit
@@ -56,7 +57,9 @@ class Parameters(Common):
 class Place:
     """Hold what is the same for every seed of a highway-env environment: paths, road, actions.
 
-    `ends` has the x, y, x, y (m) of each lane's ends, and `kind` is the environment's class name.
+    `routes` are the paths through its network, `road` describes them and the ego's goal for the
+    harness, and `actions` are the ego's. `ends` has the x, y, x, y (m) of each lane's ends, and
+    `kind` is the environment's class name.
     """
 
     routes: Routes  # the paths of its network

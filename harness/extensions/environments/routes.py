@@ -29,7 +29,8 @@ TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the ri
 class Routes:
     """Hold all paths through a highway-env network, by key (start node, name of the route).
 
-    `ways` has the keys of each route's parallel paths, from left to right.
+    A route is the sequence of roads that a path takes; `ways` has, for each, the keys of its
+    parallel paths, from left to right.
     """
 
     network: Any  # highway-env's network

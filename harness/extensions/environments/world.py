@@ -43,7 +43,12 @@ MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
 @dataclass
 class EnvironmentWorld(OwnWorld):
-    """Simulate one episode in an environment of highway-env."""
+    """Simulate one episode in an environment of highway-env.
+
+    `everybody` are its vehicles in the order of their ids, the ego first. `taken` has the frame and
+    the name of each action so far, and `failed` says whether the environment has ended the episode
+    without success.
+    """
 
     env: Any = None  # highway-env's environment
     # highway-env's class constants as this environment wants them
@@ -97,7 +102,10 @@ class EnvironmentWorld(OwnWorld):
 
     @classmethod
     def stated(cls, scenario: Scenario) -> dict[str, Any]:
-        """Return the environment's whole configuration, which its name and package decide."""
+        """Return the environment's whole configuration, by key, for a dataset's manifest.
+
+        Its name and package decide what that is.
+        """
         return config(scenario.name)
 
     @property
