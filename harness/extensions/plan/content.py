@@ -18,7 +18,7 @@ NO_AGENTS = (
 
 
 class OfPlan(Content):
-    """The content `plan`: the action probabilities by which the sender, an agent, acts itself."""
+    """The content `plan` of messages: the action probabilities by which an agent acts itself."""
 
     holds = frozenset((PLANS,))
     needs = (PLANS,)

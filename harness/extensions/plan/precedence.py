@@ -20,9 +20,10 @@ from harness.core.arrays import Floats
 class Precedence:
     """A consensus rule in which an agent waits for a near one of lower rank that plans to go on.
 
-    To wait is to take action 0, the most careful one; else the agent acts by its own intent. An
-    agent that itself plans action 0, stands, or has passed the conflict makes nobody wait. Equal
-    ranks go by the vehicles' numbers in the world.
+    `rank` returns the rank of the ego and its H helpers, `(..., 1+H)`; two are near if they reach
+    the conflict less than `apart_s` seconds apart. To wait is to take action 0, the most careful
+    one; else the agent acts by its own intent. An agent that itself plans action 0, stands, or has
+    passed the conflict makes nobody wait. Equal ranks go by the vehicles' numbers in the world.
     """
 
     rank: Callable[[Plans], Floats]  # of each vehicle, `(..., 1+H)`; the lowest goes first

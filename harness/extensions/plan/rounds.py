@@ -31,7 +31,7 @@ MOST_ROUNDS = 3
 
 
 class Negotiated(Part, frozen=True, kw_only=True):
-    """How often agents tell each other their plans before they act."""
+    """How often agents tell each other their plans before they act: `rounds`, 1 for once."""
 
     behind: ClassVar[str] = "fallback"
 
@@ -69,9 +69,9 @@ def further_rounds(
     Returns the last plans that each agent knows, and one exchange that sums all rounds.
 
     Args:
-        point: the condition.
-        sent_intents: what was sent in the first round, in decisions (n,).
-        heard: the exchange of the first round.
+        point: the operating point, on which a decision depends besides scene and model.
+        sent_intents: what was sent in the first round, in n decisions, (n,).
+        heard: the exchange of the first round: which messages arrived, and when.
         fused: returns the decisions by an exchange and the intents known after it.
     """
     from harness.coordination.exchange import exchange
