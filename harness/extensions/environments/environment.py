@@ -120,7 +120,7 @@ def reset(name: str, seed: int) -> Any:
     env = _create(name)
     _constants().restore()
     try:
-        with watched(shown(name)), strangers(shown(name)):
+        with watched(label(name)), strangers(label(name)):
             env.reset(seed=seed)
     except UserError:
         raise
@@ -175,7 +175,7 @@ def _create(name: str) -> Any:
         raise UserError(f"{label(name)}: give its version too, as in merge-v0")
     _constants().restore()
     try:
-        with watched(shown(name)), strangers(shown(name)):
+        with watched(label(name)), strangers(label(name)):
             env = gymnasium.make(env_id, disable_env_checker=True).unwrapped
     except UserError:
         raise
