@@ -149,7 +149,7 @@ def _checked_means(path: Path, silent: bool) -> dict[str, object]:
     suite = read(path)
     wrong = list(of_suite(suite))
     if not silent:
-        means = amount(len(suite.stated), "mean")
+        means = amount(len(suite.stated_scores), "mean")
         typer.echo(
             f"{printable(path)}: {'not ' * bool(wrong)}equal: {means}, computed again from its runs"
         )
@@ -158,7 +158,7 @@ def _checked_means(path: Path, silent: bool) -> dict[str, object]:
     return {
         "suite": str(path),
         "equal": not wrong,
-        "figures": len(suite.stated),
+        "figures": len(suite.stated_scores),
         "differences": wrong,
     }
 

@@ -43,7 +43,7 @@ class Answers:
         self._spans: list[tuple[int, int]] = []
         of_scene: dict[str, list[int]] = {}  # places in `_spans`
         keys: set[str] = set()
-        scene, start, known = None, 0, roles()
+        scene, start, role_names = None, 0, roles()
         for line in BytesIO(lines):
             stop = start + len(line)
             for answer in _ANSWER.decode_lines(line):  # one; none in a blank line
@@ -53,9 +53,9 @@ class Answers:
                     min(answer.intent) >= 0 and abs(sum(answer.intent) - 1) <= ROUNDING
                 ):
                     raise ValueError(f"answer {answer.id} has an intent that is no distribution")
-                if answer.role not in known:
+                if answer.role not in role_names:
                     raise ValueError(
-                        f"answer {answer.id} has role {answer.role}; known: {', '.join(known)}"
+                        f"answer {answer.id} has role {answer.role}; known: {', '.join(role_names)}"
                     )
                 if any(mark in answer.viewer for mark in MARKS):
                     raise ValueError(f"answer {answer.id} is of a viewer that no vehicle is")

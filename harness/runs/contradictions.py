@@ -44,13 +44,13 @@ def refuse(run: Run | SuiteRun) -> None:
     if isinstance(run, SuiteRun):
         for member in run.runs.values():
             refuse(member)
-    found = list(of_suite(run) if isinstance(run, SuiteRun) else contradictions(run))
-    if found:
-        more = f", and {len(found) - 1} more" if len(found) > 1 else ""
-        shown = printable(run.path)
+    sentences = list(of_suite(run) if isinstance(run, SuiteRun) else contradictions(run))
+    if sentences:
+        more = f", and {len(sentences) - 1} more" if len(sentences) > 1 else ""
+        name = printable(run.path)
         raise UserError(
-            f"{shown} contradicts itself: {found[0]}{more}; make the run again, or list all by "
-            f"`harness run check {shown}`"
+            f"{name} contradicts itself: {sentences[0]}{more}; make the run again, or list all by "
+            f"`harness run check {name}`"
         )
 
 
@@ -90,15 +90,17 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
         yield f"{SUITE} has two families of the same scenes"
     older = next((run for run in suite.runs.values() if not current(run)), None)
     columns = ("value",) if older else _COLUMNS
-    stated = {_key(older, score) if older else score.key: score for score in suite.stated}
+    stated_scores = {
+        _key(older, score) if older else score.key: score for score in suite.stated_scores
+    }
     computed = {score.key: score for score in suite.scores}
-    for key in dict.fromkeys((*stated, *computed)):
+    for key in dict.fromkeys((*stated_scores, *computed)):
         if key not in computed:
-            yield f"{SUMMARY} has {_figure(stated[key])}, which is no mean over its runs"
-        elif key not in stated:
+            yield f"{SUMMARY} has {_figure(stated_scores[key])}, which is no mean over its runs"
+        elif key not in stated_scores:
             yield f"{SUMMARY} lacks {key[1]} in {printable(key[0])} ({key[2]})"
         else:
-            yield from _otherwise(stated[key], computed[key], columns, "its runs make")
+            yield from _otherwise(stated_scores[key], computed[key], columns, "its runs make")
 
 
 def _scores(run: Run) -> Iterator[Score]:
@@ -126,11 +128,13 @@ def current(run: Run) -> bool:
 
 def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
     """Yield which figures are others than those computed, are none of them, or are not there."""
-    own, here = METRICS.own, {score.key: score for score in computed}
-    stated = {score.key: score for score in run.scores}
-    for key, score in stated.items():
+    of_harness, here = METRICS.of_harness, {score.key: score for score in computed}
+    stated_scores = {score.key: score for score in run.scores}
+    for key, score in stated_scores.items():
         other = here.get(key)
-        if score.metric not in own or (other is None and own[score.metric].superseded):
+        if score.metric not in of_harness or (
+            other is None and of_harness[score.metric].superseded
+        ):
             continue  # `unchecked` says so
         if other is None:
             yield f"{SUMMARY} has {_figure(score)}, which its other tables do not have"
@@ -138,7 +142,7 @@ def _of_scores(run: Run, computed: Iterable[Score]) -> Iterator[str]:
             none = not current(run) and score.low is None and score.high is None and _narrow(other)
             columns = ("value", "n", "n_excluded") if none else _COLUMNS
             yield from _otherwise(score, other, columns, "its other tables make")
-    may_lack = set() if current(run) else LATER - {key[1] for key in stated}
+    may_lack = set() if current(run) else LATER - {key[1] for key in stated_scores}
     for key in _lacking(run, here.values()):
         if key[1] not in may_lack:
             yield f"{SUMMARY} lacks {key[1]} in {printable(key[0])} ({key[2]})"
@@ -148,9 +152,9 @@ def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
     """Yield which figures of the harness a run lacks,
     under their earlier kind of interval as well.
     """
-    stated = {_key(run, score) for score in run.scores}
+    stated_keys = {_key(run, score) for score in run.scores}
     for score in computed:
-        if score.metric in METRICS.own and _key(run, score) not in stated:
+        if score.metric in METRICS.of_harness and _key(run, score) not in stated_keys:
             yield score.key
 
 
@@ -158,7 +162,9 @@ def unchecked(run: Run) -> Iterator[str]:
     """Yield sentences on a run's figures that cannot be checked, and on those it may lack."""
     figures = {score.key: score for score in run.scores}
     here = {} if current(run) else {score.key: score for score in _scores(run)}
-    held = {key for key in figures if key[1] in METRICS.own and (current(run) or key in here)}
+    held = {
+        key for key in figures if key[1] in METRICS.of_harness and (current(run) or key in here)
+    }
     if names := dict.fromkeys(key[1] for key in figures if key not in held):
         what = "a package's metrics, or an earlier harness's"
         yield f"{_listed(names)}: as summary.csv states, and not checked, since they are {what}."
@@ -183,14 +189,14 @@ def _key(run: Run, score: Score) -> Key:
     return (score.condition, score.metric, PAIRED) if gain and not current(run) else score.key
 
 
-def _otherwise(stated: Score, other: Score, columns: Sequence[str], whose: str) -> Iterator[str]:
+def _otherwise(score: Score, other: Score, columns: Sequence[str], whose: str) -> Iterator[str]:
     """Yield which numbers of a figure are others than those computed;
     `whose` these are, in words.
     """
     for what in columns:
-        a, b = getattr(stated, what), getattr(other, what)
+        a, b = getattr(score, what), getattr(other, what)
         if not close(a, b):
-            yield f"{SUMMARY} has {_figure(stated, what)}, and {whose} it {b}"
+            yield f"{SUMMARY} has {_figure(score, what)}, and {whose} it {b}"
 
 
 def _narrow(score: Score) -> bool:
@@ -230,10 +236,12 @@ def _of_episodes(run: Run) -> Iterator[str]:
         )
 
 
-def differing(stated: Sequence[Episode], computed: Sequence[Episode]) -> Iterator[tuple[str, int]]:
+def differing(
+    stated_rows: Sequence[Episode], computed_rows: Sequence[Episode]
+) -> Iterator[tuple[str, int]]:
     """Yield the columns in which two tables of the same episodes differ, and in how many rows."""
     for name in Episode.__struct_fields__:
-        pairs = zip(stated, computed, strict=True)
+        pairs = zip(stated_rows, computed_rows, strict=True)
         wrong = sum(not close(getattr(a, name), getattr(b, name)) for a, b in pairs)
         if wrong:
             yield name, wrong

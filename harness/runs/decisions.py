@@ -300,10 +300,10 @@ class Decisions:
         return Decisions(table, self.actions, self.helpers)
 
     def rounded(self) -> "Decisions":
-        known = {**DECIMALS, **dict.fromkeys(added_columns(), DECIMALS_ADDED)}
+        decimals_by_name = {**DECIMALS, **dict.fromkeys(added_columns(), DECIMALS_ADDED)}
         decimals = {
             column: digits
-            for name, digits in known.items()
+            for name, digits in decimals_by_name.items()
             for column in self.table.column_names
             if column == name or (name not in COLUMNS and column.startswith(f"{name}_"))
         }

@@ -94,13 +94,13 @@ class Pool:
         """Correct each half of its own where success is balanced;
         one that cannot be stays as it is.
         """
-        parts, known = success.parts, self.known[self.answered]
+        parts, covariates = success.parts, self.known[self.answered]
         pools = [self.known]
         if len(parts) > 1:
             pools = [self.known[self.dangerous], self.known[~self.dangerous]]
         estimates = [plain(part) for part in parts]
         better = [
-            corrected(estimate, values[part], known[part], pool, least, level)
+            corrected(estimate, values[part], covariates[part], pool, least, level)
             for estimate, part, pool in zip(estimates, parts, pools, strict=True)
         ]
         if not any(better):

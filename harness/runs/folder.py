@@ -287,9 +287,9 @@ def read(path: Path) -> Run:
     file = path / "run.json"
     if not file.is_file():
         raise UserError(f"{printable(path)} is {_other_than_run(path)}")
-    stated: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
-    formats.checked(stated.get("format") if isinstance(stated, dict) else None, file)
-    return Run(path, whole(file, lambda file: msgspec.convert(formats.upgraded(stated), Manifest)))
+    record: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
+    formats.checked(record.get("format") if isinstance(record, dict) else None, file)
+    return Run(path, whole(file, lambda file: msgspec.convert(formats.upgraded(record), Manifest)))
 
 
 def _other_than_run(path: Path) -> str:

@@ -188,7 +188,7 @@ EPISODE: Mapping[str, Added] = {
 SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way", "journeys")
 
 
-def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
+def upgraded(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of an older `run.json`, or of a run's first record, in today's form.
 
     Values of a wrong type are left as they are, for the reader to refuse. 2026-11-27: a driven
@@ -196,17 +196,17 @@ def upgraded(stated: Mapping[str, Any]) -> dict[str, Any]:
     parameters. 2026-11-29: `kept` has the table `calibrations`, which stood beside it; what became
     settings of extensions stands where it stood in files (`as_file`), and in tables of theirs here.
     """
-    if isinstance(calibrations := stated.get("calibrations"), dict) and "kept" not in stated:
-        stated = {**stated, "kept": {"calibrations": calibrations} if calibrations else {}}
-    if "beside" not in stated:
-        theirs = extensions.beside()
-        opened = {name: stated[name] for name in theirs if stated.get(name) is not None}
-        others = {name: value for name, value in stated.items() if name not in theirs}
-        stated = {**_without_gone(others), "beside": opened}
-    if isinstance(table := stated.get("settings"), Mapping):
-        stated = {**stated, "settings": gathered(table)}
+    if isinstance(calibrations := record.get("calibrations"), dict) and "kept" not in record:
+        record = {**record, "kept": {"calibrations": calibrations} if calibrations else {}}
+    if "beside" not in record:
+        names_beside = extensions.beside()
+        opened = {name: record[name] for name in names_beside if record.get(name) is not None}
+        others = {name: value for name, value in record.items() if name not in names_beside}
+        record = {**_without_gone(others), "beside": opened}
+    if isinstance(table := record.get("settings"), Mapping):
+        record = {**record, "settings": gathered(table)}
     older = {key: SETTINGS[name].absent for key, name in BESIDE.items() if name in SETTINGS}
-    settings = _agent(_with(MANIFEST, {**older, **stated}))
+    settings = _agent(_with(MANIFEST, {**older, **record}))
     if isinstance(model := settings.get("identity"), dict):
         settings["identity"] = identity(model)
     for name, upgrade in (("helpers", _agent), ("conditions", _condition)):
@@ -232,11 +232,11 @@ def gathered(settings: Mapping[str, Any]) -> dict[str, Any]:
     Raises UserError for one of an extension that is not installed.
     """
     beside = extensions.beside()
-    theirs = {name: settings[name] for name in beside if settings.get(name) is not None}
+    entries = {name: settings[name] for name in beside if settings.get(name) is not None}
     others = {name: value for name, value in settings.items() if name not in beside}
     table = _without_gone(others)
-    stated = table.get(EXTENSIONS, {})
-    return {**table, EXTENSIONS: {**stated, **theirs} if isinstance(stated, Mapping) else stated}
+    inner = table.get(EXTENSIONS, {})
+    return {**table, EXTENSIONS: {**inner, **entries} if isinstance(inner, Mapping) else inner}
 
 
 def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -268,12 +268,12 @@ def as_file(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 def settings_as_file(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return a table of settings as `as_file` has it."""
-    theirs, beside = settings[EXTENSIONS], extensions.beside()
+    of_extensions, beside = settings[EXTENSIONS], extensions.beside()
     table: dict[str, Any] = {}
     for name, value in settings.items():
         table[name] = value
-        table |= _behind(name, theirs)
-    table[EXTENSIONS] = {name: value for name, value in theirs.items() if name not in beside}
+        table |= _behind(name, of_extensions)
+    table[EXTENSIONS] = {name: value for name, value in of_extensions.items() if name not in beside}
     return table
 
 
@@ -283,27 +283,27 @@ def _behind(name: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
     return {each: values.get(each) for each, setting in beside if setting.behind == name}
 
 
-def _table(stated: Mapping[str, Any]) -> Any:
+def _table(record: Mapping[str, Any]) -> Any:
     """Return the table of settings; of an older run, which has none,
     it is made of what stands beside it.
 
     Raises ValueError if it says otherwise than what stands beside it.
     """
-    beside = {name: stated[key] for key, name in BESIDE.items() if key in stated}
+    beside = {name: record[key] for key, name in BESIDE.items() if key in record}
     # which the reader finds, and names
     with suppress(KeyError, TypeError, AttributeError, IndexError):
-        beside |= _opened(stated)
-    table = stated.get("settings", beside)
+        beside |= _opened(record)
+    table = record.get("settings", beside)
     if not isinstance(table, Mapping):
         return table  # for the reader to refuse
-    said = _flat(table)
-    card = stated.get("model")
+    flat = _flat(table)
+    card = record.get("model")
     places = [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
     for name, there in _flat(beside).items():
-        typed = said.get(name, there)
+        typed = flat.get(name, there)
         is_place = name == "model" and typed is not None and typed in places
         if typed != there and not (name in TYPED and (is_place or _may_be(typed, there))):
-            both = f"{printable(said[name], 60)}, and beside them it is {printable(there, 60)}"
+            both = f"{printable(flat[name], 60)}, and beside them it is {printable(there, 60)}"
             raise ValueError(f"its settings have {name} {both}")
     return _with(SETTINGS, table)
 
@@ -331,21 +331,21 @@ def _is_called(text: str, name: str) -> bool:
     return text == name or bare in (place.name, place.stem) or text.startswith(f"{name}:")
 
 
-def _opened(stated: Mapping[str, Any]) -> dict[str, Any]:
+def _opened(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that opened what a run states, each as it is called there."""
-    seeds, world, helpers = (stated[name] for name in ("seeds", "world", "helpers"))
-    opened = dict.fromkeys(extensions.beside()) | stated["beside"]
-    theirs = {name: _name_of(value) for name, value in opened.items()}
+    seeds, world, helpers = (record[name] for name in ("seeds", "world", "helpers"))
+    opened = dict.fromkeys(extensions.beside()) | record["beside"]
+    names = {name: _name_of(value) for name, value in opened.items()}
     scenes = {"kind": world["kind"], "dataset": world.get("path"), **world.get("selection", {})}
     if "scenario" in world:
         scenes |= {"scenario": world["scenario"]["name"], "first_seed": world["first_seed"]}
     return {
-        **{name: stated[name] for name in ("answer", "thinking", "image", "flip", "sums")},
-        "model": stated["model"]["name"],
-        "prompt": stated["prompt"]["version"],
+        **{name: record[name] for name in ("answer", "thinking", "image", "flip", "sums")},
+        "model": record["model"]["name"],
+        "prompt": record["prompt"]["version"],
         "seeds": ",".join(map(str, seeds)) if len(seeds) > 1 else f"{seeds[0]}:{seeds[0] + 1}",
-        "condition": [point["name"] for point in stated["conditions"]],
-        EXTENSIONS: {name: value for name, value in theirs.items() if value is not None},
+        "condition": [point["name"] for point in record["conditions"]],
+        EXTENSIONS: {name: value for name, value in names.items() if value is not None},
         "world": scenes,
         "helpers": {
             "model": ",".join(helper["model"]["name"] for helper in helpers),
@@ -373,12 +373,12 @@ def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def versions(stated: Mapping[str, str]) -> dict[str, str]:
+def versions(stated_versions: Mapping[str, str]) -> dict[str, str]:
     """Return the versions that a run states, with those added that an older run lacks."""
-    return _with(VERSIONS, stated)
+    return _with(VERSIONS, stated_versions)
 
 
-def identity(stated: Mapping[str, Any]) -> dict[str, Any]:
+def identity(stated_identity: Mapping[str, Any]) -> dict[str, Any]:
     """Return what identifies a run's models, with the version of their answers.
 
     2026-11-26: `answers` replaced what engines without weights said of their version. All older
@@ -386,36 +386,36 @@ def identity(stated: Mapping[str, Any]) -> dict[str, Any]:
     """
     kept = {
         name: value
-        for name, value in stated.items()
+        for name, value in stated_identity.items()
         if name not in ("proxy_model_version", "harness")
     }
-    if isinstance(helpers := stated.get("helpers"), list):
+    if isinstance(helpers := stated_identity.get("helpers"), list):
         kept["helpers"] = [
             identity(helper) if isinstance(helper, dict) else helper for helper in helpers
         ]
     return {"answers": 1, **kept}
 
 
-def _with(added: Mapping[str, Added], stated: Mapping[str, Any]) -> dict[str, Any]:
-    return {**stated, **{name: entry.absent for name, entry in added.items() if name not in stated}}
+def _with(added: Mapping[str, Added], table: Mapping[str, Any]) -> dict[str, Any]:
+    return {**table, **{name: entry.absent for name, entry in added.items() if name not in table}}
 
 
-def _agent(stated: Mapping[str, Any]) -> dict[str, Any]:
-    agent = _with(AGENT, stated)
+def _agent(table: Mapping[str, Any]) -> dict[str, Any]:
+    agent = _with(AGENT, table)
     if isinstance(model := agent.get("model"), dict):
         agent["model"] = _with(MODEL, model)
     return agent
 
 
-def _condition(stated: Mapping[str, Any]) -> dict[str, Any]:
+def _condition(table: Mapping[str, Any]) -> dict[str, Any]:
     """2026-11-23: `edge` replaced `roadside_edge`, which sent replies once more, as `relay` does.
 
     2026-11-29: settings of extensions are left out where they do nothing.
     """
     from harness.coordination.operating_point import as_here  # imports NumPy, as above
 
-    renamed = {name: value for name, value in stated.items() if name != "roadside_edge"}
-    if stated.get("roadside_edge") is True:
+    renamed = {name: value for name, value in table.items() if name != "roadside_edge"}
+    if table.get("roadside_edge") is True:
         renamed["edge"] = "relay"
     return as_here(_with(CONDITION, renamed))
 

@@ -24,7 +24,7 @@ class Scored(Protocol):
     def scores(self) -> "Sequence[Score]": ...
 
 
-def leading(*names: Container[str]) -> str:
+def headline_metric(*names: Container[str]) -> str:
     """Return the headline metric: balanced success if every container of metric names has it.
 
     Otherwise it is the plain success rate.
@@ -34,10 +34,10 @@ def leading(*names: Container[str]) -> str:
 
 def lead_of(*runs: Scored) -> str:
     """Return the headline metric of runs: balanced success if all of them have it, else success."""
-    stated = []
+    names_by_run = []
     for run in runs:
-        stated.append({score.metric for score in run.scores if score.value is not None})
-    return leading(*stated)
+        names_by_run.append({score.metric for score in run.scores if score.value is not None})
+    return headline_metric(*names_by_run)
 
 
 def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:

@@ -18,7 +18,7 @@ from harness.core.files import BROKEN, opened, text_of
 from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
 from harness.runs import formats
 from harness.runs.doubts import OFF_LAG, doubted
-from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, best_of, leading
+from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, best_of, headline_metric
 
 # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 DEPTH = 2
@@ -237,7 +237,7 @@ def _with_success(
     """Return an entry as finished, with the best condition of a summary;
     `runs` are those it is of.
     """
-    metric = leading({row["metric"] for row in rows})
+    metric = headline_metric({row["metric"] for row in rows})
     kinds = {row["interval"] for row in rows if row["metric"] == metric}
     kind = ANY_TIME if ANY_TIME in kinds else "episodes"
     of_metric = [row for row in rows if (row["metric"], row["interval"]) == (metric, kind)]

@@ -150,7 +150,7 @@ class Metrics(Plugins[Metric]):
     }
 
     @cached_property
-    def own(self) -> Mapping[str, Metric]:
+    def of_harness(self) -> Mapping[str, Metric]:
         """Return the metrics that the harness defines, by name, in the order of a summary's rows.
 
         Those that other packages add are left out.
@@ -170,10 +170,10 @@ class Metrics(Plugins[Metric]):
         return [name for name in entries if self.is_ours(name) and name not in self.built_in]
 
     def __getitem__(self, name: str) -> Metric:
-        return self.own[name] if name in self.own else super().__getitem__(name)
+        return self.of_harness[name] if name in self.of_harness else super().__getitem__(name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter({**self.own, **self._entries()})
+        return iter({**self.of_harness, **self._entries()})
 
     def check(self, name: str, plugin: Metric) -> None:
         functions = [each for each in (plugin.decisions, plugin.episodes) if each]
@@ -260,12 +260,12 @@ def _column(name: str) -> Callable[[Columns], Floats]:
     return lambda d: d[name]
 
 
-def _stated(name: str) -> Callable[[Answers], Floats]:
+def _of_field(name: str) -> Callable[[Answers], Floats]:
     """Build the function of one field of answers, NaN where it is not stated."""
 
     def values(answers: Answers) -> Floats:
-        stated = [getattr(answer, name) for answer in answers]
-        return np.array([np.nan if v is None or v is UNSET else v for v in stated], dtype=float)
+        numbers = [getattr(answer, name) for answer in answers]
+        return np.array([np.nan if v is None or v is UNSET else v for v in numbers], dtype=float)
 
     return values
 
@@ -324,7 +324,7 @@ def _of_answers(roles: Sequence[Role]) -> Iterator[Metric]:
                 "flip_rate",
                 "share of read-outs whose likeliest action changes with the order of the list",
                 "lower",
-                _stated("flipped"),
+                _of_field("flipped"),
             ),
         ),
         (
@@ -368,7 +368,7 @@ def _of_answers(roles: Sequence[Role]) -> Iterator[Metric]:
     )
     for role in roles:
         for name, meaning, unit, better, most in lengths:
-            values = _stated(name)
+            values = _of_field(name)
             label = _label(name, role)
             yield Metric(
                 f"{name}_{role}",
@@ -930,8 +930,8 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
 
     Raises UserError if a package's metric does not load.
     """
-    own = (metric for metric in METRICS.values() if metric.decisions or metric.episodes)
-    return tuple(metric for metric in own if metric.world in (None, world))
+    by_row = (metric for metric in METRICS.values() if metric.decisions or metric.episodes)
+    return tuple(metric for metric in by_row if metric.world in (None, world))
 
 
 @lru_cache(1024)
@@ -1034,22 +1034,22 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
     """Return a metric's values, (n,). Those of a package that fails are unknown,
     and a line says so.
     """
-    if metric is METRICS.own.get(metric.name):
+    if metric is METRICS.of_harness.get(metric.name):
         return values()
     what = f"metric {printable(metric.name)} of a package"
     try:
         with aside(what):
-            found = values()
-        if found.shape != (n,):
-            raise ValueError(f"it has values of shape {found.shape}, not ({n},)")
-        if not ((found >= 0) & (found <= metric.most) | np.isnan(found)).all():
+            numbers = values()
+        if numbers.shape != (n,):
+            raise ValueError(f"it has values of shape {numbers.shape}, not ({n},)")
+        if not ((numbers >= 0) & (numbers <= metric.most) | np.isnan(numbers)).all():
             raise ValueError(f"it has values beyond 0 to {metric.most:g}")
     except Exception as error:  # a stranger's code
-        shown = one_line(error).removeprefix(f"{what} ") or type(error).__name__
+        reason = one_line(error).removeprefix(f"{what} ") or type(error).__name__
         # though figures are computed part by part
-        say_once(f"{what}: {shown}; its figure is unknown")
+        say_once(f"{what}: {reason}; its figure is unknown")
         return np.full(n, np.nan)
-    return found
+    return numbers
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
@@ -1065,9 +1065,9 @@ def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
     `places` has the index of each value, from 0 to n - 1.
     """
-    known = ~np.isnan(values)
-    count = np.bincount(places[known], minlength=n)
-    total = sum_by_place(values[known], places[known], n)
+    is_known = ~np.isnan(values)
+    count = np.bincount(places[is_known], minlength=n)
+    total = sum_by_place(values[is_known], places[is_known], n)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
@@ -1145,12 +1145,12 @@ def known_in(values: Mapping[str, Floats]) -> list[str]:
 
     Metrics of one half (with or without a danger) are stated only if there are episodes of both.
     """
-    known = {name for name, v in values.items() if not (entry(name).optional and np.isnan(v).all())}
-    both = known.issuperset(entry(BALANCED).halves)
+    names = {name for name, v in values.items() if not (entry(name).optional and np.isnan(v).all())}
+    both = names.issuperset(entry(BALANCED).halves)
     return [
         m.name
         for m in METRICS.values()
-        if (m.name in known or m.halves) and (both or not (m.half or m.halves))
+        if (m.name in names or m.halves) and (both or not (m.half or m.halves))
     ]
 
 

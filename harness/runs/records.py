@@ -233,7 +233,7 @@ class Latency(Struct, frozen=True, omit_defaults=True):
             )
         if self.speeds:
             of_source = timer(self.source)
-            speeds = tuple(of_source.speed(stated) for stated in self.speeds)
+            speeds = tuple(of_source.speed(speed) for speed in self.speeds)
             structs.force_setattr(self, "speeds", speeds)
 
     def helper_times_s(self) -> tuple[Seconds, ...]:
@@ -630,9 +630,11 @@ class Manifest(Struct, frozen=True, kw_only=True):
         if any(not isinstance(helper.get("thinking", False), bool) for helper in self.helpers):
             raise ValueError("helpers: thinking is neither true nor false")
         for point in self.conditions:
-            known = {name: point[name] for name in _condition().__struct_fields__ if name in point}
+            core_settings = {
+                name: point[name] for name in _condition().__struct_fields__ if name in point
+            }
             try:
-                convert(known, _condition(), "conditions")
+                convert(core_settings, _condition(), "conditions")
             except UserError as mistake:
                 raise ValueError(str(mistake)) from None
         names = tuple(point["name"] for point in self.conditions)

@@ -94,8 +94,8 @@ class Judged:
         `optimal` is a mask (n, A), `episode` (n,) the index of each decision's episode.
         """
         hits = right(p, optimal)
-        known = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
-        return cls(p.max(axis=-1)[known], hits[known], episode[known])
+        is_judged = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
+        return cls(p.max(axis=-1)[is_judged], hits[is_judged], episode[is_judged])
 
     @classmethod
     def joined(cls, parts: Sequence["Judged"], sizes: Sequence[int]) -> "Judged":
@@ -170,12 +170,12 @@ def estimates(
     `older` selects the rules of version 1: any number of episodes is enough, and a figure whose
     resamples are all alike has an interval of no width.
     """
-    known = [figure for figure in figures if _known(figure, judged, older)]
+    known_figures = [figure for figure in figures if _is_known(figure, judged, older)]
     values = []
-    for sums in _sums(judged, episodes) if known else ():
-        values.append([figure(*sums) for figure in known])
-    found = iter(_estimate(parts, judged, episodes, older) for parts in zip(*values, strict=True))
-    return [next(found) if figure in known else _unknown(episodes) for figure in figures]
+    for sums in _sums(judged, episodes) if known_figures else ():
+        values.append([figure(*sums) for figure in known_figures])
+    results = iter(_estimate(parts, judged, episodes, older) for parts in zip(*values, strict=True))
+    return [next(results) if figure in known_figures else _unknown(episodes) for figure in figures]
 
 
 def difference(
@@ -188,7 +188,7 @@ def difference(
     """
     both = np.intersect1d(a.episode, b.episode)
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))
-    if not (_known(figure, a) and _known(figure, b)):
+    if not (_is_known(figure, a) and _is_known(figure, b)):
         return math.nan, math.nan, _unknown(episodes)
     of_a = np.concatenate([figure(*sums) for sums in _sums(a, episodes)])
     of_b = np.concatenate([figure(*sums) for sums in _sums(b, episodes)])
@@ -203,7 +203,7 @@ def _unknown(episodes: int) -> Estimate:
     return Estimate(math.nan, math.nan, math.nan, 0, episodes)
 
 
-def _known(figure: Figure, judged: Judged, older: bool = False) -> bool:
+def _is_known(figure: Figure, judged: Judged, older: bool = False) -> bool:
     if figure is decisions:
         return len(judged.sure) > 0
     least_episodes = 1 if older else LEAST_EPISODES

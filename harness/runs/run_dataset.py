@@ -22,12 +22,12 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
     and by its name; if the user names a folder, `given`, only there. Raises UserError if it is not
     found, has another digest or is damaged.
     """
-    stated = run.manifest.world
-    assert isinstance(stated, FrozenScenes)
+    scenes = run.manifest.world
+    assert isinstance(scenes, FrozenScenes)
     folders: list[Path] = []
-    for path in [given] if given else dict.fromkeys(_datasets(run, stated)):
+    for path in [given] if given else dict.fromkeys(_datasets(run, scenes)):
         if given or _holds(path):
-            if _sha256_of(path) == stated.sha256:
+            if _sha256_of(path) == scenes.sha256:
                 return load(path)
             folders.append(path)
     repair = "restore it, give its folder to a command that has --dataset, or run again"
@@ -36,27 +36,27 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
         sha256 = _sha256_of(folders[0]) or read_manifest(folders[0])[1]
         raise UserError(
             f"dataset {printable(folders[0])} is not the one that {printable(run.path)} was made "
-            f"on (sha256 {sha256}, not {printable(stated.sha256)}); {repair}"
+            f"on (sha256 {sha256}, not {printable(scenes.sha256)}); {repair}"
         )
     raise UserError(
-        f"{printable(run.path)} was made on dataset {printable(stated.name, 40)}, which is neither "
-        f"at {printable(stated.path)}, seen from here or from a folder above the run, nor known by "
+        f"{printable(run.path)} was made on dataset {printable(scenes.name, 40)}, which is neither "
+        f"at {printable(scenes.path)}, seen from here or from a folder above the run, nor known by "
         f"its name; {repair}"
     )
 
 
-def _datasets(run: Run, stated: FrozenScenes) -> Iterator[Path]:
+def _datasets(run: Run, scenes: FrozenScenes) -> Iterator[Path]:
     """Yield where a run's dataset may lie."""
-    path = Path(stated.path)
+    path = Path(scenes.path)
     yield path
     with suppress(UserError):
-        yield find(stated.name)
+        yield find(scenes.name)
     # The run may have moved together with its dataset, or be read from another folder.
     parts = [part for part in path.parts if part not in (path.anchor, "..")][-DEEPEST:]
     for above in run.path.resolve().parents:
         yield above / path
         yield from (above.joinpath(*parts[at:]) for at in range(len(parts)))
-        yield above / "datasets" / stated.name
+        yield above / "datasets" / scenes.name
 
 
 def _sha256_of(path: Path) -> str | None:

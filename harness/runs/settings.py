@@ -56,8 +56,8 @@ def option(
         same: what of it must be equal when a stopped run resumes: `ITSELF`, `OPENED` or `NOTHING`.
         compared: whether a comparison of two runs reports it.
     """
-    said = {"help": text, "panel": panel, "only": only, "listed": listed}
-    return Meta(extra={**said, "same": same, "compared": compared})
+    in_command = {"help": text, "panel": panel, "only": only, "listed": listed}
+    return Meta(extra={**in_command, "same": same, "compared": compared})
 
 
 class HelperSettings(Struct, frozen=True, kw_only=True):
@@ -473,8 +473,8 @@ def _options(
         if meta.extra["only"] in ("", only):
             name = f"helper_{field.name}" if table == "helpers" else field.name
             path = (table, field.name) if table else (field.name,)
-            said = [meta.extra[key] for key in ("help", "panel", "listed", "same", "compared")]
-            yield Option(path, name, _kind(plain), field.default, *said)
+            facts = [meta.extra[key] for key in ("help", "panel", "listed", "same", "compared")]
+            yield Option(path, name, _kind(plain), field.default, *facts)
 
 
 def _kind(plain: Any) -> Any:
@@ -581,7 +581,7 @@ def of_words(typed: Sequence[str]) -> Settings:
 
 def text_of(settings: Settings) -> str:
     """Return the text of a `run.toml` with every setting that has a value, defaults included."""
-    beside = [word for own in _only_typed(settings).values() for word in own]
+    beside = [word for words in _only_typed(settings).values() for word in words]
     again = _again(settings, Path(FILE), beside)
     lines = [f"# The settings of a run. `{again}` runs it again; an option beside it wins."]
     tables: dict[str, list[str]] = {
@@ -647,16 +647,16 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             "which runs have since 0.3; for another, type the command in its run.json"
         )
     tables = _placed(toml(file, where), world, where)
-    stated = convert(formats.gathered(tables), Settings, where)
-    settings = changed(_as_driven(stated, file.parent), given)
+    file_settings = convert(formats.gathered(tables), Settings, where)
+    settings = changed(_as_driven(file_settings, file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
     _check_extensions(settings, where)
     if file.name == FILE and (file.parent / "run.json").is_file():
-        _say_otherwise(changed(stated, given), file, given)
-    own = {name: words for name, words in _only_typed(settings).items() if name not in given}
-    if own:
-        flag, value, *_ = beside = [word for words in own.values() for word in words]
+        _say_otherwise(changed(file_settings, given), file, given)
+    typed_only = {name: words for name, words in _only_typed(settings).items() if name not in given}
+    if typed_only:
+        flag, value, *_ = beside = [word for words in typed_only.values() for word in words]
         for model in value.split(","):
             if lost := card_to_copy(model.strip()):
                 raise UserError(f"{where}: {lost}")
@@ -679,8 +679,8 @@ def otherwise(folder: Path, made_with: Settings) -> str | None:
     where = f"settings {printable(file)}"
     try:
         tables = _placed(toml(file, where), type(made_with.world), where)
-        stated = convert(formats.gathered(tables), Settings, where)
-        before, now = difference(made_with, stated)
+        file_settings = convert(formats.gathered(tables), Settings, where)
+        before, now = difference(made_with, file_settings)
     except UserError as error:
         return f"{error}."
     if before == now:
@@ -704,14 +704,14 @@ def _say_otherwise(settings: Settings, file: Path, given: Mapping[str, Any]) -> 
 
 def _check_extensions(settings: Settings, where: str) -> None:
     """Raise UserError if a file sets what no extension has, or to another kind of value."""
-    known = of_extensions()
+    known_settings = of_extensions()
     for name, value in settings.extensions.items():
-        if name not in known:
+        if name not in known_settings:
             raise UserError(
                 f"{where}: {printable(name)} is a setting of an extension that is not installed; "
                 "install that, or leave the setting out"
             )
-        kind = known[name].kind
+        kind = known_settings[name].kind
         if type(value) is not kind and not (kind is float and type(value) is int):
             raise UserError(f"{where}: {name} = {printable(repr(value))}; allowed: {kind.__name__}")
 
@@ -729,8 +729,8 @@ def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str
             raise UserError(
                 f"{where}: {key} stands in a table; write {inner[0]} below a line [{table}] instead"
             )
-    its = tables.get("world", {})
-    return {**tables, "world": {"kind": kind, **its}} if isinstance(its, dict) else tables
+    section = tables.get("world", {})
+    return {**tables, "world": {"kind": kind, **section}} if isinstance(section, dict) else tables
 
 
 def _as_driven(settings: Settings, run: Path) -> Settings:
@@ -751,8 +751,10 @@ def _as_driven(settings: Settings, run: Path) -> Settings:
     world = run_of(run).manifest.world
     if not isinstance(world, ClosedLoop) or world.scenario["name"] != name:
         return settings
-    its = scenarios.of_manifest(name, world.scenario["parameters"])
-    scenes = [f"{key}={getattr(its.parameters, key)}" for key in missing if key in its.dials]
+    scenario = scenarios.of_manifest(name, world.scenario["parameters"])
+    scenes = [
+        f"{key}={getattr(scenario.parameters, key)}" for key in missing if key in scenario.dials
+    ]
     return changed(
         settings, {"scenario": f"{name}:{','.join([*([typed] if typed else []), *scenes])}"}
     )

@@ -46,12 +46,12 @@ def read(out: Path) -> dict[str, bytes]:
     return {file.relative_to(kept).as_posix(): bytes_of(file, "text") for file in files}
 
 
-def prompt_of(run: Run, stated: Mapping[str, Any]) -> Prompt | None:
+def prompt_of(run: Run, prompt_record: Mapping[str, Any]) -> Prompt | None:
     """Return a prompt version with the digest that a run states: the installed one or its own copy.
 
-    `stated` has the keys `version` and `sha256`. None if neither has this digest.
+    `prompt_record` has the keys `version` and `sha256`. None if neither has this digest.
     """
-    version, sha256 = stated["version"], stated["sha256"]
+    version, sha256 = prompt_record["version"], prompt_record["sha256"]
     if prompt := versions.as_it_was(version, sha256):
         return prompt
     kept = run.path / SOURCES / PROMPTS

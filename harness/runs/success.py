@@ -39,10 +39,12 @@ class Success:
     dangerous: Bools  # which of them have a danger, (E,)
 
     @classmethod
-    def of(cls, episodes: Sequence[Episode], lead: str) -> "Success":
+    def of(cls, episodes: Sequence[Episode], headline_metric: str) -> "Success":
         """Return the rule for these episodes, one record of each, with this headline metric."""
         return cls(
-            np.array([lead == BALANCED and episode.danger != "none" for episode in episodes])
+            np.array(
+                [headline_metric == BALANCED and episode.danger != "none" for episode in episodes]
+            )
         )
 
     @property
@@ -119,8 +121,8 @@ class Success:
         """
         best = max(successes, key=lambda name: self.mean(successes[name]))
         rest = [name for name in successes if name != best]
-        found = [self.p_value(successes[best], successes[name]) for name in rest]
-        p_values = [1.0 if p is None else p for p in found]
+        raw_p_values = [self.p_value(successes[best], successes[name]) for name in rest]
+        p_values = [1.0 if p is None else p for p in raw_p_values]
         corrected = multiplicity.holm(p_values, comb(len(successes), 2))
         close = [name for name, p in zip(rest, corrected, strict=True) if p > multiplicity.LEVEL]
         return [best, *close]
@@ -166,15 +168,15 @@ class Success:
 
 
 def by_condition(
-    grid: Grid, episodes: Sequence[Episode], lead: str = BALANCED
+    grid: Grid, episodes: Sequence[Episode], headline_metric: str = BALANCED
 ) -> tuple[Success, dict[str, Floats]]:
     """Return the success rule of a run's episodes, and their success (S, E) by condition.
 
-    `episodes` are in the order of the grid; `lead` is the headline metric. The axes are S channel
-    seeds and E episodes.
+    `episodes` are in the order of the grid; `headline_metric` is plain or balanced success. The
+    axes are S channel seeds and E episodes.
     """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
-    return Success.of(episodes[: len(grid.episodes)], lead), values
+    return Success.of(episodes[: len(grid.episodes)], headline_metric), values
 
 
 def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
@@ -193,8 +195,8 @@ def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
 
 def is_gain(score: Score, conditions: Container[str]) -> bool:
     """Return whether a score is a paired gain over `BASELINE` between two of these conditions."""
-    known = score.condition in conditions and BASELINE in conditions
-    return known and score.interval == PAIRED and score.metric in GAINS.values()
+    has_conditions = score.condition in conditions and BASELINE in conditions
+    return has_conditions and score.interval == PAIRED and score.metric in GAINS.values()
 
 
 # of each family: how success counts, and both, (S, E)

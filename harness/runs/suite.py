@@ -91,7 +91,7 @@ class SuiteRun:
         return tuple(self._means())
 
     @cached_property
-    def stated(self) -> tuple[Score, ...]:
+    def stated_scores(self) -> tuple[Score, ...]:
         """Return the scores that the folder's `summary.csv` states, which `scores` computes.
 
         Raises UserError if the file is missing or broken.
@@ -126,12 +126,12 @@ class SuiteRun:
         return next((s for s in of_metric if s.value is not None), None)
 
 
-def plays(runs: Iterable[Run], lead: str) -> Plays[str]:
+def plays(runs: Iterable[Run], headline_metric: str) -> Plays[str]:
     """Return the success of runs of one family each by condition, to compare conditions.
 
-    `lead` is the headline metric, plain or balanced success.
+    `headline_metric` is plain or balanced success.
     """
-    return Plays([by_condition(run.grid, run.episodes, lead) for run in runs])
+    return Plays([by_condition(run.grid, run.episodes, headline_metric) for run in runs])
 
 
 def mean(scores: Sequence[Score]) -> Score:

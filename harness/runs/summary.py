@@ -149,8 +149,8 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
     names = {m.percentile: m.name for m in METRICS.values() if m.percentile}
     all_percentiles = np.array([percentiles(latencies) for latencies in latency_ms])
     for index, condition in enumerate(grid.conditions):
-        own = all_percentiles[index * len(grid.seeds) : (index + 1) * len(grid.seeds)]
-        for percent, values in zip(PERCENTILES, own.T, strict=True):
+        of_condition = all_percentiles[index * len(grid.seeds) : (index + 1) * len(grid.seeds)]
+        for percent, values in zip(PERCENTILES, of_condition.T, strict=True):
             yield Score.of(
                 condition, names[percent], in_range(LATENCY, seed_interval(values)), "seed means"
             )
@@ -212,12 +212,12 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
         if metric.answers and metric.role in by_role:
             role_answers, numbers = by_role[metric.role]
             values, episodes = metric.answers(role_answers), np.array(numbers)
-            if (known := ~np.isnan(values)).any():
+            if (is_known := ~np.isnan(values)).any():
                 if metric.interval == "rate":
                     estimate = rate_interval(values, episodes)
                 else:
                     estimate = in_range(
-                        metric.name, episode_interval(values[known], episodes[known])
+                        metric.name, episode_interval(values[is_known], episodes[is_known])
                     )
                 yield Score.of(ALL, metric.name, estimate, "answers")
 
@@ -233,11 +233,11 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
     def totals(values: Floats) -> list[int]:
         return [int(total) for total in sum_by_place(values, places, n)]
 
-    def known(values: Floats) -> list[Any]:
+    def numbers_or_none(values: Floats) -> list[Any]:
         return [None if v != v else v for v in values.tolist()]
 
     def means(name: str) -> list[Any]:
-        return known(mean_by_place(decisions[name], places, n))
+        return numbers_or_none(mean_by_place(decisions[name], places, n))
 
     columns = {
         "messages": totals(decisions["messages"]),
@@ -249,7 +249,7 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
     for name in ("miss", "false_alarm", "short_ttc", "short_pet"):
         columns[name] = [None if share is None else share > 0 for share in means(name)]
     for name in ("ttc_s", "pet_s"):
-        columns[f"least_{name}"] = known(least_by_place(decisions[name], places, n))
+        columns[f"least_{name}"] = numbers_or_none(least_by_place(decisions[name], places, n))
     if not np.isnan(decisions["acted"]).all():
         columns["never_acted"] = totals(1.0 - decisions["acted"])
     return [

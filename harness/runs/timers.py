@@ -45,7 +45,7 @@ class Timer(ABC):
         """
 
     @abstractmethod
-    def speed(self, stated: Any) -> Any:
+    def speed(self, stated_speed: Any) -> Any:
         """Return how fast an agent answers, as a run states it. Raises ValueError for no speed."""
 
     @abstractmethod

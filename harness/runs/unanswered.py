@@ -50,8 +50,8 @@ class Tally:
         one of theirs counts as a lost message.
         """
         lost = sum(n for role, n in self.unanswered.items() if is_helper(role))
-        asked = sum(n for role, n in self.asked.items() if is_helper(role))
-        too_many = lost and lost >= MOST_LOST * asked
+        helper_requests = sum(n for role, n in self.asked.items() if is_helper(role))
+        too_many = lost and lost >= MOST_LOST * helper_requests
         return frozenset(
             role for role, n in self.unanswered.items() if n and (too_many or not is_helper(role))
         )

@@ -40,7 +40,7 @@ def extent(run: Path) -> Extent:
     work = run / WORK
     names = _names(work)
     parts = [name for name in names if name.startswith("episodes-")]
-    done = sum(_episodes(work / name) for name in parts if _own(work / name))
+    done = sum(_episodes(work / name) for name in parts if _is_own_folder(work / name))
     kept = [
         name
         for name in names
@@ -52,11 +52,11 @@ def extent(run: Path) -> Extent:
 
 def _names(folder: Path) -> list[str]:
     with suppress(OSError):  # it may be gone by now
-        return sorted(os.listdir(folder)) if _own(folder) else []
+        return sorted(os.listdir(folder)) if _is_own_folder(folder) else []
     return []
 
 
-def _own(folder: Path) -> bool:
+def _is_own_folder(folder: Path) -> bool:
     return folder.is_dir() and not folder.is_symlink()
 
 

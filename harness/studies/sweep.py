@@ -11,7 +11,7 @@ from harness.coordination.parts import PLAIN
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.report.document import Table
-from harness.runs.leading import IN_WORDS, leading
+from harness.runs.leading import IN_WORDS, headline_metric
 from harness.studies.axes import (
     AXES,
     CORE,
@@ -299,7 +299,7 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
             title, axis, name = str(source), "condition", str(condition)
         else:
             title, axis, name = f"{source} · {condition} over {panel}", str(panel), _text(value)
-        metric = leading(set(metrics.index))
+        metric = headline_metric(set(metrics.index))
         heads[title] = axis, f"{IN_WORDS[metric]} %, 95 % CI"
         success = percent(metrics.loc[metric], *ESTIMATE)
         rows.setdefault(title, []).append((name, success, *means))

@@ -72,8 +72,10 @@ class Computer(Timer):
         model = msgspec.convert(manifest.settings.extensions.get(MODEL, ""), str)
         return Computer(msgspec.convert(stated, Device), model)
 
-    def speed(self, stated: Any) -> Speed:
-        return stated if isinstance(stated, Speed) else msgspec.convert(stated, Speed)
+    def speed(self, stated_speed: Any) -> Speed:
+        if isinstance(stated_speed, Speed):
+            return stated_speed
+        return msgspec.convert(stated_speed, Speed)
 
     def speeds(self, models: Sequence[str]) -> tuple[Speed, ...]:
         return tuple(profiles.speed(self.profile, self._row_of(model)) for model in models)

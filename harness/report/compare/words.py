@@ -23,7 +23,7 @@ from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.findings import FIRST, Kind, findings, of_runs
 from harness.report.words import SHOWN_FROM, as_good_as, p_value
-from harness.runs.leading import IN_WORDS, SUCCESS, lead_of, leading
+from harness.runs.leading import IN_WORDS, SUCCESS, headline_metric, lead_of
 from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
 from harness.runs.records import role_word
 from harness.runs.success import Success
@@ -124,7 +124,7 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
     outcomes = []
     for condition in comparison.conditions:
         differences = {d.metric: d for d in condition.differences}
-        metric = leading(set(differences))
+        metric = headline_metric(set(differences))
         d = differences.get(metric)
         if d is None:
             continue

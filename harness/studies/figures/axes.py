@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.report.drawing.colours import INK, PALE
-from harness.runs.leading import leading
+from harness.runs.leading import headline_metric
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,7 +49,7 @@ def cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
 
 def lead_in(rows: "pd.DataFrame") -> str:
     """Return the headline metric of a summary's rows: balanced success if all sources have it."""
-    return leading(*(set(of.metric) for _, of in rows.groupby("source")))
+    return headline_metric(*(set(of.metric) for _, of in rows.groupby("source")))
 
 
 def interval_of(rows: "pd.DataFrame") -> str:

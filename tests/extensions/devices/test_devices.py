@@ -345,7 +345,7 @@ def test_energy_that_is_not_known_is_refused_before_anything_is_asked(small: Dat
 def test_columns_and_metrics_of_energy_stand_behind_what_is_there() -> None:
     assert {*added_columns()} == {"inference_j", "helpers_j", "radio_mj", "waiting_j"}
     assert {*added_columns().values()} <= {*COLUMNS}
-    names = list(METRICS.own)
+    names = list(METRICS.of_harness)
     at = names.index("busy_ratio")
     assert names[at + 1 : at + 5] == ["energy_j", "helpers_j", "radio_mj", "waiting_j"]
 
