@@ -45,7 +45,7 @@ def summary(run: Run) -> list[dict[str, Any]]:
 
 def _cell(run: Run, condition: str, metric: str) -> dict[str, str] | None:
     score = run.score(condition, metric)
-    return None if score is None else words.shown(score)
+    return None if score is None else words.score_texts(score)
 
 
 def probabilities(runs: Runs) -> list[dict[str, Any]]:

@@ -313,7 +313,7 @@ class Details:
             seed, *values = row.values()
             entry = decisions.get((*values, end))
             if entry is None:
-                entry = {**_shown(self._rows[n], row), "end": end, "seeds": []}
+                entry = {**_row_for_page(self._rows[n], row), "end": end, "seeds": []}
                 decisions[(*values, end)] = entry
             entry["seeds"].append(seed)
         return list(decisions.values())
@@ -344,7 +344,7 @@ def _columns(d: Decisions) -> list[str]:
     return ["seed", *SHOWN, *OF_DRIVEN, *policy, *messages]
 
 
-def _shown(d: Decisions, row: Mapping[str, Any]) -> dict[str, Any]:
+def _row_for_page(d: Decisions, row: Mapping[str, Any]) -> dict[str, Any]:
     """Return a row of decisions for the page, with its policy and its messages as lists."""
     messages = []
     for place in range(1, d.helpers + 1):

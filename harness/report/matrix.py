@@ -12,7 +12,7 @@ from harness.core.figures import some_of
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.runs import Runs
-from harness.report.words import shown
+from harness.report.words import score_texts
 from harness.runs.folder import Run
 from harness.runs.leading import IN_WORDS, lead_of
 from harness.runs.metrics import BALANCED, LATENCY, SUCCESS, entry
@@ -275,7 +275,7 @@ def figures(results: Sequence[Line]) -> list[dict[str, str]]:
     for line in results:
         if line.mark == BEST and line.success:
             name = f"{IN_WORDS[line.lead]} with {line.condition}, {_rank(line, results)}"
-            rows.append({"what": name, **shown(line.success)})
+            rows.append({"what": name, **score_texts(line.success)})
     return rows
 
 
@@ -303,7 +303,7 @@ def headline(results: Sequence[Line]) -> str:
         lines = [line for line in results if line.condition == condition]
         best = next((line for line in lines if line.mark == BEST), None)
         if best is not None and best.success:
-            rate = shown(best.success)["value"]
+            rate = score_texts(best.success)["value"]
             close = _close(condition, results)
             if close:
                 names = some_of([best.name, *close])

@@ -26,8 +26,8 @@ def pace(run: Shown) -> Iterator[str]:
     with.
     """
     manifest = run.manifest
-    own = {role: took for role, took in manifest.answer_times.items() if took.first_token}
-    for role, took in (manifest.latency.sample | own).items():
+    measured_here = {role: took for role, took in manifest.answer_times.items() if took.first_token}
+    for role, took in (manifest.latency.sample | measured_here).items():
         first, word = took.first_token, printable(role_word(role))
         if first is None:
             continue

@@ -90,8 +90,8 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
     if not lacks or not out.is_file():
         return
     with opened(out, "rows") as page:
-        stated = re.search(rb'<meta name="lacks" content="([a-z ]*)">', page.read(HEAD))
-    lacked = stated[1].decode().split() if stated else []
+        head = re.search(rb'<meta name="lacks" content="([a-z ]*)">', page.read(HEAD))
+    lacked = head[1].decode().split() if head else []
     for what, why in lacks.items():
         if what not in lacked:
             raise UserError(

@@ -179,8 +179,8 @@ def _tokens(answer: Answer) -> float | None:
 
 
 def _sum(values: Iterable[float | None]) -> float | None:
-    stated = list(values)
-    return None if None in stated else float(sum(value for value in stated if value is not None))
+    terms = list(values)
+    return None if None in terms else float(sum(value for value in terms if value is not None))
 
 
 def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:

@@ -8,7 +8,7 @@ from harness.backends.registry import ENGINES
 from harness.core.arrays import Floats
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
-from harness.report.words import shown
+from harness.report.words import score_texts
 from harness.runs.folder import Run
 from harness.runs.metrics import SUCCESS, by_danger, halved, known_in
 from harness.runs.records import Score
@@ -79,7 +79,7 @@ def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) 
         return ""
     rates = []
     for name in sorted(references, key=lambda name: -(references[name].value or 0.0)):
-        cell = shown(references[name])
+        cell = score_texts(references[name])
         rates.append(f"{label(name, scenario)} {cell['value']} ({cell['interval']})")
     n = next(iter(references.values())).n
     text = (

@@ -54,9 +54,9 @@ def sentences(runs: Runs) -> list[Markup]:
     """
 
     def escaped(remarks: Remarks) -> list[Markup]:
-        said = list(remarks.sentences(runs))
-        texts(said)  # raises what stands for a failure if one is no text
-        return [escape(sentence) for sentence in said]
+        texts_of_extension = list(remarks.sentences(runs))
+        texts(texts_of_extension)  # raises what stands for a failure if one is no text
+        return [escape(sentence) for sentence in texts_of_extension]
 
     sentences: list[Markup] = []
     for name in REMARKS:

@@ -78,7 +78,7 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
         if _scenes(first) != _scenes(run):
             raise UserError(
                 f"{printable(first.path)} and {printable(run.path)} are not of the same scenes "
-                f"({_shown(first)} and {_shown(run)}); report them apart"
+                f"({_scene_words(first)} and {_scene_words(run)}); report them apart"
             )
     world = first.manifest.world
     if not isinstance(world, FrozenScenes):
@@ -86,12 +86,12 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
             raise UserError(
                 f"--dataset {printable(dataset)}: {printable(first.path)} was driven; leave it out"
             )
-        own = None
+        run_dataset = None
     elif isinstance(dataset, Dataset) and dataset.sha256 == world.sha256:
-        own = dataset
+        run_dataset = dataset
     else:
-        own = dataset_of(first, dataset if isinstance(dataset, Path) else None)
-    return Runs(tuple(runs), _names(runs), own)
+        run_dataset = dataset_of(first, dataset if isinstance(dataset, Path) else None)
+    return Runs(tuple(runs), _names(runs), run_dataset)
 
 
 def _scenes(run: Run) -> Any:
@@ -102,7 +102,7 @@ def _scenes(run: Run) -> Any:
     return run.actions, world.scenario, world.first_seed
 
 
-def _shown(run: Run) -> str:
+def _scene_words(run: Run) -> str:
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         return f"{printable(world.name, 40)} {printable(world.sha256, 12)}"

@@ -192,7 +192,7 @@ def _numbers(suite: SuiteRun) -> list[dict[str, str]]:
         scores[f"{IN_WORDS[metric]} with {condition}"] = suite.score(condition, metric)
     gain = suite.score(best, GAINS[metric]) if base == BASELINE else None
     scores[f"more with {best} than with {base}"] = gain
-    return [{"what": what, **words.shown(score)} for what, score in scores.items() if score]
+    return [{"what": what, **words.score_texts(score)} for what, score in scores.items() if score]
 
 
 def _families(lines: Sequence[Line], place: Place, metric: str) -> Table:
@@ -240,7 +240,7 @@ def _cell(cell: Cell) -> Markup:
     success = words.cell(cell.success)
     if cell.gain is None:
         return success
-    text, sign = words.shown(cell.gain), {"better": "✓ ", "worse": "✗ ", "": ""}[cell.verdict]
+    text, sign = words.score_texts(cell.gain), {"better": "✓ ", "worse": "✗ ", "": ""}[cell.verdict]
     value = f"{sign}{'+' if (cell.gain.value or 0.0) > 0 else ''}{text['value']}"
     interval = Markup("<small>{}</small>").format(text["interval"]) if text["interval"] else ""
     return Markup('{}<span class="gain {}">{}</span>{}').format(

@@ -34,7 +34,7 @@ def environment(*more: Path) -> Environment:
     templates.filters |= {
         "number": lambda value, decimals: Unit(decimals=decimals).number(value),
         "facts": words.facts,
-        "shown": words.shown,
+        "shown": words.score_texts,
         "cell": words.cell,
         "p_value": words.p_value,
         "mapping": _mapping,

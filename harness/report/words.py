@@ -27,7 +27,7 @@ from harness.runs.suite import SuiteRun, plays
 SHOWN_FROM = 40
 
 
-def shown(score: Score) -> dict[str, str]:
+def score_texts(score: Score) -> dict[str, str]:
     """Return a score as text for a table cell: `value`, `interval` and `n`, with the unit."""
     unit = entry(score.metric).unit
     n = f"n = {score.n} {score.interval}"
@@ -40,7 +40,7 @@ def cell(score: Score | None) -> Markup:
     """Return a score's value and interval as HTML for a table cell; a dash for None."""
     if score is None:
         return Markup("–")
-    text = shown(score)
+    text = score_texts(score)
     small = Markup("<small>{}</small>").format(text["interval"]) if text["interval"] else ""
     return Markup("<strong>{}</strong>{}").format(text["value"], small)
 
@@ -53,14 +53,14 @@ def headline(run: Run | SuiteRun) -> str:
         return f"{model} on {run.source}: the run has no success rate."
     metric = lead_of(run)
     families = f" (mean over {len(run.runs)} families)" if isinstance(run, SuiteRun) else ""
-    value = _shown(run, best, metric)
+    value = _value_text(run, best, metric)
     if not base:
         outcome = f"has {value} balanced success"
         if metric == SUCCESS:
             outcome = f"clears {value} of the episodes"
         text = f"Under {best}, {model} {outcome}{families}"
         if halves := entry(metric).halves:
-            dangerous, harmless = (_shown(run, best, half) for half in halves)
+            dangerous, harmless = (_value_text(run, best, half) for half in halves)
             text += f": {dangerous} with a danger, {harmless} without"
         if len(run.conditions) == 1:
             return f"{text}."
@@ -71,8 +71,8 @@ def headline(run: Run | SuiteRun) -> str:
     clear = judged(mean_difference(pairs), corrected[best])
     if metric == SUCCESS:
         text = f"Under {best}, {model} clears {value} of the episodes{families}; under {base}, "
-        return f"{text}{_shown(run, base, metric)}: {clear}."
-    shares = [_shown(run, best, half) for half in entry(metric).halves]
+        return f"{text}{_value_text(run, base, metric)}: {clear}."
+    shares = [_value_text(run, best, half) for half in entry(metric).halves]
     changes = [shown_change(half_difference(pairs, dangerous)) for dangerous in (True, False)]
     return (
         f"Under {best}, {model} succeeds in {shares[0]} of the layouts with a danger, {changes[0]} "
@@ -136,7 +136,9 @@ def figures(run: Run) -> list[dict[str, str]]:
     scores[f"unsafe episodes under {best}"] = run.score(best, "unsafe_rate")
     scores[f"latency of a decision under {best}"] = run.score(best, LATENCY)
     scores["ego's answers that could not be read"] = run.score(metrics.ALL, "failed_rate_ego")
-    return [{"what": what, **shown(score)} for what, score in scores.items() if score is not None]
+    return [
+        {"what": what, **score_texts(score)} for what, score in scores.items() if score is not None
+    ]
 
 
 def as_good_as(plain: Estimate, corrected: Estimate) -> str:
@@ -195,9 +197,9 @@ def _runs(run: Run | SuiteRun) -> list[Run]:
     return [*run.runs.values()] if isinstance(run, SuiteRun) else [run]
 
 
-def _shown(run: Run | SuiteRun, condition: str, metric: str) -> str:
+def _value_text(run: Run | SuiteRun, condition: str, metric: str) -> str:
     score = run.score(condition, metric)
-    return shown(score)["value"] if score else "–"
+    return score_texts(score)["value"] if score else "–"
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:

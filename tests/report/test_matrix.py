@@ -17,7 +17,7 @@ from harness.report import matrix, panels
 from harness.report.charts import statuses
 from harness.report.page import render
 from harness.report.runs import gather
-from harness.report.words import shown
+from harness.report.words import score_texts
 from harness.runs.folder import read
 from harness.runs.metrics import SUCCESS
 
@@ -120,7 +120,7 @@ def test_the_headline_names_the_best_or_says_that_there_is_none(both):
     best = [line for line in lines if line.mark == matrix.BEST]
     apart = "the most of 2 runs that cannot be told apart"
     assert [(f["what"], f["value"]) for f in matrix.figures(lines)] == [
-        (f"success with {line.condition}, {apart}", shown(line.scores[SUCCESS])["value"])
+        (f"success with {line.condition}, {apart}", score_texts(line.scores[SUCCESS])["value"])
         for line in best
     ]
     clear = [

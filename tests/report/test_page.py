@@ -37,7 +37,7 @@ from harness.report.notes import answer_times, latency_source, pace, readings
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.report.templating import visible
-from harness.report.words import figures, headline, shown
+from harness.report.words import figures, headline, score_texts
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, Latency, Score, Times
 from harness.runs.writer import csv_text
@@ -235,7 +235,7 @@ def test_the_page_says_how_honest_the_probabilities_are(run, page):
         here = rows.codes("condition", loaded.conditions) == loaded.conditions.index(condition)
         assert line.split()[0] == str((open_rows & here).sum())
         for metric in contents.HONEST:
-            cell = shown(loaded.score(condition, metric))
+            cell = score_texts(loaded.score(condition, metric))
             assert f"{cell['value']} {cell['interval']}" in line
         # no flip was asked for, and they are too few
         assert f" – {(one_optimal & here).sum()} – – " in line

@@ -217,13 +217,13 @@ def _prompts(pair: Pair) -> PromptChange | str | None:
     swarms = []
     for name, side in (("A", pair.a), ("B", pair.b)):
         prompts = []
-        for stated in side.prompts:
-            prompt = prompt_of(side.run, stated)
+        for prompt_record in side.prompts:
+            prompt = prompt_of(side.run, prompt_record)
             if prompt is None:
                 return (
                     f"what differs between the prompts is not known: {name}'s "
-                    f"{printable(stated['version'], 40)} "
-                    f"with sha256 {printable(stated['sha256'], 13)} is not here"
+                    f"{printable(prompt_record['version'], 40)} "
+                    f"with sha256 {printable(prompt_record['sha256'], 13)} is not here"
                 )
             prompts.append(prompt)
         swarms.append(of_swarm(*prompts))

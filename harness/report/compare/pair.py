@@ -151,42 +151,42 @@ def pair(a: Path, b: Path) -> Pair:
     first, second = read(a), read(b)
     for run in (first, second):
         refuse(run)
-    shown = f"{printable(a)} and {printable(b)}"
+    both = f"{printable(a)} and {printable(b)}"
     if first.world != second.world:
         raise UserError(
-            f"{shown}: one was made by `harness eval` and one by `harness drive`; give two of a "
+            f"{both}: one was made by `harness eval` and one by `harness drive`; give two of a "
             "kind, or see `harness study fidelity`"
         )
     side_a, side_b = _side(first), _side(second)
     if first.manifest.world.pinned != second.manifest.world.pinned:
         scenes = " and ".join(printable(where(run), 60) for run in (first, second))
-        raise UserError(f"{shown} are not of the same scenes ({scenes}); make both on the same")
+        raise UserError(f"{both} are not of the same scenes ({scenes}); make both on the same")
     seeds_a, seeds_b = sorted(first.manifest.seeds), sorted(second.manifest.seeds)
     if seeds_a != seeds_b:
         seeds = " and ".join(printable(each, 40) for each in (seeds_a, seeds_b))
-        raise UserError(f"{shown} have different seeds ({seeds}); make both with the same --seeds")
+        raise UserError(f"{both} have different seeds ({seeds}); make both with the same --seeds")
     conditions = tuple(name for name in first.conditions if name in second.conditions)
     if not conditions:
         names = " and ".join(printable(", ".join(run.conditions), 60) for run in (first, second))
         raise UserError(
-            f"{shown} have no condition in common ({names}); make both with the same --condition"
+            f"{both} have no condition in common ({names}); make both with the same --condition"
         )
     episodes = set(first.grid.episodes) & set(second.grid.episodes)
     if not episodes:
-        raise UserError(f"{shown} have no episode in common; make both on the same episodes")
+        raise UserError(f"{both} have no episode in common; make both on the same episodes")
     return Pair(side_a, side_b, conditions, tuple(seeds_a), tuple(sorted(episodes)))
 
 
 def _side(run: Run) -> Side:
     manifest = msgspec.json.decode(msgspec.json.encode(run.manifest.as_file()))
     values = {**manifest["settings"], **manifest}  # a model, say, as it was opened
-    stated = {name: values[name] for name in SETTINGS}
+    record = {name: values[name] for name in SETTINGS}
     if run.world == "closed-loop":
         parameters = manifest["world"]["scenario"]["parameters"]
-        stated["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
+        record["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
     # Through the class, which gives a setting that the run does not know the value it had then.
     points = [OperatingPoint.from_dict(condition).record() for condition in manifest["conditions"]]
-    stated["condition"] = {point["name"]: point for point in points}
-    settings = {name: str(value) for name, value in facts(nameless(stated)) if value is not None}
+    record["condition"] = {point["name"]: point for point in points}
+    settings = {name: str(value) for name, value in facts(nameless(record)) if value is not None}
     metrics = by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes)
     return Side(run, settings, metrics)

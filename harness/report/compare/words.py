@@ -340,8 +340,8 @@ def _versions(pair: Pair) -> list[tuple[str, str]]:
 
 def _where_all_are(pair: Pair) -> str:
     """Say what shows all changes of the prompts: a command where all of them are here."""
-    stated = [*pair.a.prompts, *pair.b.prompts]
-    here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in stated)
+    prompts = [*pair.a.prompts, *pair.b.prompts]
+    here = all(as_it_was(prompt["version"], prompt["sha256"]) for prompt in prompts)
     differing = [(a, b) for a, b in _versions(pair) if a != b]
     commands = dict.fromkeys(f"`harness prompt compare {a} {b}`" for a, b in differing)
     return " and ".join(commands) if here and commands else "the page of --html has them"
@@ -414,10 +414,10 @@ def _listed(some: Sequence[str], n: int, most: int) -> str:
 def settings(comparison: Comparison) -> list[str]:
     """Return a text for each setting that differs, with its value in A and B."""
 
-    def shown(value: str | None) -> str:
+    def in_words(value: str | None) -> str:
         return "none" if value is None else printable(value, 60)
 
-    return [f"{name}: {shown(a)} → {shown(b)}" for name, a, b in comparison.settings]
+    return [f"{name}: {in_words(a)} → {in_words(b)}" for name, a, b in comparison.settings]
 
 
 def judged(verdict: Verdict, sign: str = "+") -> str:
