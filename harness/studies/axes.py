@@ -126,7 +126,7 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
         raise UserError(f"--over {axis.name}: no grid is usual; give its values with --grid")
     parts = [part.strip() for part in text.split(",")]
     if axis.worded:
-        known = {
+        choices = {
             "consensus": names(),
             "schedule": SCHEDULES,
             **{setting: (NONE, *there()) for setting, there in _named().items()},
@@ -134,8 +134,8 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
         for text_of_value in parts:
             for part in text_of_value.split("+"):
                 name = part.partition(":")[0]
-                if known and name not in known:
-                    raise unknown("--grid", name, known)
+                if choices and name not in choices:
+                    raise unknown("--grid", name, choices)
         return tuple(dict.fromkeys(parts))
     values = [value for part in parts for value in _values(axis, part)]
     if len(values) > MOST_POINTS:

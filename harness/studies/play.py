@@ -270,9 +270,9 @@ def _estimates(
     source: Source, metrics: Mapping[str, Floats], latency_ms: Floats
 ) -> Iterator[tuple[str, Estimate, str]]:
     over = over_seeds if source.same_episodes else over_own_episodes
-    known = known_in(metrics)
+    names = known_in(metrics)
     for name in (*metrics, BALANCED):
-        if name not in known:
+        if name not in names:
             continue
         yield name, halved(name, lambda each: over(each, metrics[each]), shared=True), "seed means"
         if source.same_episodes:

@@ -186,12 +186,12 @@ class Repeats:
         """Yield a sentence for each group of repeats whose answers are identical texts."""
         alike: dict[frozenset[tuple[str, str]], list[str]] = {}
         for run in self.runs:
-            said = frozenset((answer.id, answer.raw) for answer in run.answers)
-            alike.setdefault(said, []).append(run.path.name)
-        for said, names in alike.items():
-            if said and len(names) > 1:
+            texts = frozenset((answer.id, answer.raw) for answer in run.answers)
+            alike.setdefault(texts, []).append(run.path.name)
+        for texts, names in alike.items():
+            if texts and len(names) > 1:
                 yield (
-                    f"{' and '.join(names)} have the same {amount(len(said), 'answer')}, word for "
+                    f"{' and '.join(names)} have the same {amount(len(texts), 'answer')}, word for "
                     "word: chance changed nothing there, or one is a copy of the other."
                 )
 
@@ -210,11 +210,11 @@ class Repeats:
         for n, of_scene in enumerate(intents.values()):
             if len(of_scene) > 1:
                 entropies[n] = _doubt(np.array(of_scene))
-        stated, sampled = entropies.T
+        stated_nats, sampled_nats = entropies.T
         episodes = np.array([int(scene.partition("-")[0]) for scene in intents])
-        for name, values in ((STATED, stated), (SAMPLED, sampled)):
+        for name, values in ((STATED, stated_nats), (SAMPLED, sampled_nats)):
             yield name, in_range(name, episode_interval(values, episodes))
-        yield DOUBT, episode_interval(stated - sampled, episodes)
+        yield DOUBT, episode_interval(stated_nats - sampled_nats, episodes)
 
 
 def flips(counts: Ints) -> Floats:
@@ -439,9 +439,9 @@ def headline(repeats: Repeats) -> list[str]:
 
 
 def _flip_sentence(repeats: Repeats) -> str:
-    known = [c for c in repeats.conditions if not math.isnan(repeats.estimate(c, FLIPS).value)]
+    with_flips = [c for c in repeats.conditions if not math.isnan(repeats.estimate(c, FLIPS).value)]
     m, k = repeats.runs[0].manifest, repeats.k
-    c = max(known or repeats.conditions, key=lambda c: repeats.estimate(c, FLIPS).value)
+    c = max(with_flips or repeats.conditions, key=lambda c: repeats.estimate(c, FLIPS).value)
     flips, once = repeats.estimate(c, FLIPS), repeats.estimate(c, SUCCESS)
     everywhere, anywhere = repeats.estimate(c, f"pass^{k}"), repeats.estimate(c, f"any@{k}")
     return (
@@ -464,7 +464,7 @@ def _variance_sentence(repeats: Repeats) -> Iterator[str]:
 
 
 def _entropy_sentence(repeats: Repeats) -> Iterator[str]:
-    stated, sampled = repeats.estimate(ALL, STATED), repeats.estimate(ALL, SAMPLED)
+    of_answer, of_repeats = repeats.estimate(ALL, STATED), repeats.estimate(ALL, SAMPLED)
     more = repeats.estimate(ALL, DOUBT)
     if math.isnan(more.value):
         return
@@ -474,7 +474,7 @@ def _entropy_sentence(repeats: Repeats) -> Iterator[str]:
     elif more.high < 0:
         verdict = "less than its repeats show"
     yield (
-        f"The ego's answers state {nats(stated)} nats of entropy, {verdict}: over repeats, the "
-        f"most probable action has {nats(sampled)} nats (difference {nats(more)}; n = {more.n} "
+        f"The ego's answers state {nats(of_answer)} nats of entropy, {verdict}: over repeats, the "
+        f"most probable action has {nats(of_repeats)} nats (difference {nats(more)}; n = {more.n} "
         "decision points)."
     )

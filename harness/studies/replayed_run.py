@@ -297,8 +297,8 @@ class ReplayedRun:
         The model is asked `question` for what is not stored. Raises UserError if it may not be
         asked and an answer is missing.
         """
-        asked, places = wanted_in(scenes, wanted)
-        if not self._asks and any(self._asker.lacks(asked, question, places)):
+        asked_scenes, places = wanted_in(scenes, wanted)
+        if not self._asks and any(self._asker.lacks(asked_scenes, question, places)):
             plain = question == PLAIN
             lacks = "that it did not ask" if plain else f"that {question.words}"
             remedy = ", or make the run again with --ask all" if plain else ""
@@ -373,9 +373,9 @@ class ReplayedRun:
         return self._opened[process]
 
     def _newly_opened(self) -> Backend:
-        spec, shown = self._asker.spec, printable(self.run.path)
+        spec, folder = self._asker.spec, printable(self.run.path)
         check_prompts(self.run, spec)
-        cards = [find_own(card, self._models, shown, _GIVE_IT) for card in spec.cards]
+        cards = [find_own(card, self._models, folder, _GIVE_IT) for card in spec.cards]
         opens = partial(open_backend, **spec.opening)
         models = open_each(cards, opens)
         identity = together(cards, models).identity()
@@ -383,7 +383,7 @@ class ReplayedRun:
         if not same_model(stored, now):
             changes = [key for key in {**now, **stored} if now.get(key) != stored.get(key)]
             raise UserError(
-                f"{shown}: the model is not what it was ({printable(', '.join(changes))}); run "
+                f"{folder}: the model is not what it was ({printable(', '.join(changes))}); run "
                 "again"
             )
         return together(cards, models, default_file())

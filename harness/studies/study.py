@@ -71,8 +71,8 @@ def ends(e: Estimate) -> dict[str, Any]:
 
 def corrected(p_values: Sequence[float | None]) -> list[float | None]:
     """Return p-values corrected together by Holm's method; None stays None."""
-    known = iter(holm([p for p in p_values if p is not None]))
-    return [None if p is None else next(known) for p in p_values]
+    corrected_values = iter(holm([p for p in p_values if p is not None]))
+    return [None if p is None else next(corrected_values) for p in p_values]
 
 
 def percent(row: Any, value: str, low: str, high: str) -> str:
@@ -172,13 +172,13 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
     """
     refuse_taken(out, kind)
     try:
-        stated = json.loads(text_of(out / f"{kind}.json"))
+        record = json.loads(text_of(out / f"{kind}.json"))
     except FileNotFoundError:
         return
     except (OSError, ValueError, RecursionError):
-        stated = None
+        record = None
     new = json.loads(json.dumps(manifest))
-    old = {**new, **stated} if stated and isinstance(stated, dict) else {}  # else it is no study
+    old = {**new, **record} if record and isinstance(record, dict) else {}  # else it is no study
     differing = []
     for key, value in new.items():
         if _lasting(key, old.get(key)) != _lasting(key, value):

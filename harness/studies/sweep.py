@@ -192,12 +192,12 @@ def run_sweep(
     Raises:
         UserError: the folder holds another sweep.
     """
-    stated = {
+    manifest = {
         "sources": [s.manifest() for s in sources],
         "seeds": list(seeds),
         "panels": described(panels),
     }
-    refuse_other(out, "sweep", stated)
+    refuse_other(out, "sweep", manifest)
     runs = [source for source in sources if isinstance(source, ReplayedRun)]
 
     def able(source: Source, point: OperatingPoint) -> bool:
@@ -214,16 +214,16 @@ def run_sweep(
         run.settle()
     whole = joined([part for parts in results.values() for part in parts])
     summary = whole.summary
-    shown = tables(summary)
+    main_tables = tables(summary)
     return Study(
         "sweep",
         f"{', '.join(source.name for source in sources)} over {', '.join(panels)}",
-        [f"{table.title}: {in_a_sentence(table)}." for table in shown],
+        [f"{table.title}: {in_a_sentence(table)}." for table in main_tables],
         [f"{counts(sources, seeds)}. {PAIRED}"],
-        shown,
+        main_tables,
         {"conditions": summary, "episodes": whole.episodes},
         # Anew, since sources state what was left out.
-        {**stated, "sources": [s.manifest() for s in sources], "versions": versions()},
+        {**manifest, "sources": [s.manifest() for s in sources], "versions": versions()},
         summary,
         lambda: _figures(summary, results),
         [caveat for run in runs for caveat in run.caveats],
@@ -289,8 +289,10 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
     """Return a study's main results from its summary, a table for each source and curve."""
     heads, rows = dict[str, tuple[str, str]](), dict[str, list[Sequence[str]]]()
     places = ["source", "panel", "condition", "value"]
-    known = summary.assign(value=summary.value.where(summary.panel != CORE, None))
-    for (source, panel, condition, value), group in known.groupby(places, sort=False, dropna=False):
+    scores = summary.assign(value=summary.value.where(summary.panel != CORE, None))
+    for (source, panel, condition, value), group in scores.groupby(
+        places, sort=False, dropna=False
+    ):
         # Over episodes, but where a seed has episodes of its own.
         metrics = group.sort_values("interval", ascending=False, kind="stable").set_index("metric")
         metrics = metrics[~metrics.index.duplicated(keep="last")]

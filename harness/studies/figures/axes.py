@@ -33,9 +33,9 @@ def paper_values(
     return marks[wanted]
 
 
-def cross(axes: Any, theirs: "pd.DataFrame", x: Any) -> None:
+def cross(axes: Any, paper_rows: "pd.DataFrame", x: Any) -> None:
     """Draw the paper's values at `x`: a cross for one value, an error bar for a range."""
-    low, high = (theirs[end].to_numpy(dtype=float) for end in ("low", "high"))
+    low, high = (paper_rows[end].to_numpy(dtype=float) for end in ("low", "high"))
     x, single = np.broadcast_to(x, low.shape), low == high
     if single.any():
         look: dict[str, Any] = {"color": INK, "markersize": 4.5, "zorder": 5, "clip_on": False}

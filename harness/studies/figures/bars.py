@@ -39,13 +39,13 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
     figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = drawn = figure.subplots(1, 3)
     names = list(dict.fromkeys(core.condition))
-    lead = lead_in(core)
+    headline_metric = lead_in(core)
     talking = [name for name in names if _value(core, name, "messages_per_episode")[0] > 0]
     in_legend = len(names) > 3 or max(map(len, names)) > SHORT
     colours = conditions(names)
     for axes, metric, scale, label, bars, margin in (
         (latency, "latency_proxy_ms", 1.0, "latency of a decision, ms", names, 0.14),
-        (success, lead, 100.0, f"{IN_WORDS[lead]}, %", names, 0.14),
+        (success, headline_metric, 100.0, f"{IN_WORDS[headline_metric]}, %", names, 0.14),
         (talk, "messages_per_episode", 1.0, "messages per episode (bars)", talking, 0.25),
     ):
         ticks = ["cloud"] if axes is latency else []
@@ -53,14 +53,14 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
             mean, down, up = _value(core, name, metric, scale)
             axes.bar(x, mean, width=0.65, color=colours[name], edgecolor=INK, linewidth=0.5)
             axes.errorbar(x, mean, yerr=[[down], [up]], color=INK, capsize=2.5, linewidth=1.0)
-            theirs = paper_values(
+            paper_rows = paper_values(
                 paper, CORE, SUCCESS if axes is success else metric, condition=name
             )
-            cross(axes, theirs, x)
+            cross(axes, paper_rows, x)
             axes.annotate(
                 f"{mean:.1f}",
-                (x, np.nanmax([mean, mean + up, *theirs.high])),
-                xytext=(0, 2 if theirs.empty else 4),
+                (x, np.nanmax([mean, mean + up, *paper_rows.high])),
+                xytext=(0, 2 if paper_rows.empty else 4),
                 textcoords="offset points",
                 ha="center",
                 fontsize=6,

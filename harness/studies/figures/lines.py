@@ -73,8 +73,8 @@ def _along(
     axes: Any, panel: "pd.DataFrame", paper: "pd.DataFrame | None", colours: Mapping[Curve, str]
 ) -> None:
     variable = str(panel.variable.iloc[0])
-    lead = lead_in(panel)
-    curves = [(axes, lead, IN_WORDS[lead])]
+    headline_metric = lead_in(panel)
+    curves = [(axes, headline_metric, IN_WORDS[headline_metric])]
     if variable in BESIDE:
         metric, label = BESIDE[variable]
         beside = axes.twinx()
@@ -110,13 +110,15 @@ def _along(
     if ticks:
         axes.set_xticks(range(len(ticks)), ticks, rotation=30, ha="right", fontsize=7)
     for where, metric, _ in curves:
-        theirs = paper_values(paper, str(panel.panel.iloc[0]), SUCCESS if where is axes else metric)
-        cross(where, theirs, theirs.value.to_numpy(dtype=float))
+        paper_rows = paper_values(
+            paper, str(panel.panel.iloc[0]), SUCCESS if where is axes else metric
+        )
+        cross(where, paper_rows, paper_rows.value.to_numpy(dtype=float))
     for where, metric, _ in curves[1:]:
         where.set_ylim(0, 125 if metric == "trigger_rate" else None)
         if metric == "trigger_rate":
             where.set_yticks(range(0, 101, 20))
     if variable == "tau" and paper is not None:
         axes.axvspan(*BEST_BAND, color=FAINT, zorder=0, label="best band of the paper")
-    axes.set(xlabel=axis_of(variable).label, ylabel=f"{IN_WORDS[lead]}, %")
+    axes.set(xlabel=axis_of(variable).label, ylabel=f"{IN_WORDS[headline_metric]}, %")
     plain(axes, "y")

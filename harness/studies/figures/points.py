@@ -51,16 +51,16 @@ def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
     for axes, panel in zip(drawn, panels, strict=True):
         for n, (name, estimates) in enumerate(panel.series.items()):
             shift = 0.7 * ((n + 0.5) / len(panel.series) - 0.5)
-            known = [
+            pairs = [
                 (y + shift, each)
                 for y, each in enumerate(estimates)
                 if each and not np.isnan(each.value)
             ]
-            ends = np.array([(each.value, each.low, each.high) for _, each in known]).reshape(-1, 3)
+            ends = np.array([(each.value, each.low, each.high) for _, each in pairs]).reshape(-1, 3)
             value, low, high = panel.scale * ends.T
             axes.errorbar(
                 value,
-                [y for y, _ in known],
+                [y for y, _ in pairs],
                 xerr=np.nan_to_num([value - low, high - value]),
                 fmt=MARKERS[n % len(MARKERS)],
                 color=colours[name],
