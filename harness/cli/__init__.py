@@ -32,11 +32,11 @@ app = typer.Typer(
 )
 
 
-def _version(asked: bool) -> bool:
-    if asked:
+def _version(is_asked: bool) -> bool:
+    if is_asked:
         typer.echo(f"harness {__version__}")
         raise typer.Exit
-    return asked
+    return is_asked
 
 
 @app.callback()

@@ -129,10 +129,10 @@ def command(
     from harness.runs.folder import read
 
     files = {"--junit": junit, **added}
-    asked = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
-    [option, *surplus] = [name for name, given in asked.items() if given] or [""]
+    formats_by_option = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
+    [option, *surplus] = [name for name, given in formats_by_option.items() if given] or [""]
     if surplus or not option:
-        raise UserError(f"{', '.join(asked)}: give exactly one of them")
+        raise UserError(f"{', '.join(formats_by_option)}: give exactly one of them")
     formats = _formats()
     further = _options(formats)
     typed = {
@@ -175,11 +175,11 @@ def command(
         elif file := added.get(option):
             format = formats[option]
             extras.need(option, *(module for module in extras.OPTIONAL if module in format.needs))
-            own = {f"--{name}": each for name, each in options_of(format).items()}
+            own_options = {f"--{name}": each for name, each in options_of(format).items()}
             rest = {
                 _word(flag): value
                 for flag, value in typed.items()
-                if own.get(flag) is further[flag]
+                if own_options.get(flag) is further[flag]
             }
             built_in = EXPORTS.is_ours(option.removeprefix("--"))
             with bar(format.doing), worded(f"format {option}", built_in):

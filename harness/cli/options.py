@@ -228,9 +228,9 @@ def takes(
             ),
             annotation=Path | None,
         )
-        own = list(inspect.signature(command).parameters.values())[1:]
-        own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
-        parameters = [file, *settings, *own]
+        others = list(inspect.signature(command).parameters.values())[1:]
+        others = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in others]
+        parameters = [file, *settings, *others]
         return as_command(typed, command, parameters)
 
     return decorate
@@ -311,10 +311,10 @@ def of_families(command: Any) -> Any:
         of_family = {name: value for name, value in given.items() if value is not None}
         return command(*settings, **values, of_family=of_family)
 
-    own = list(inspect.signature(command).parameters.values())
-    own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
-    place = [each.name for each in own].index("of_family")
-    return as_command(typed, command, [*own[:place], *added, *own[place + 1 :]])
+    parameters = list(inspect.signature(command).parameters.values())
+    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+    place = [each.name for each in parameters].index("of_family")
+    return as_command(typed, command, [*parameters[:place], *added, *parameters[place + 1 :]])
 
 
 def scenario_name(name: str | None, of_family: Mapping[str, str]) -> str:

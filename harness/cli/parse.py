@@ -119,9 +119,9 @@ def _read(file: str) -> str:
             data = bytes_of(file, "text")
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        shown = errors.printable(file)
+        name = errors.printable(file)
         raise errors.UserError(
-            f"cannot read completion file {shown!r}: {reason}; give a text file, or - for what is "
+            f"cannot read completion file {name!r}: {reason}; give a text file, or - for what is "
             "piped in"
         ) from None
     try:

@@ -122,8 +122,8 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
             how += f", and {amount(min(AGAIN, len(run.episodes)), 'episode')} driven again"
         except UserError as error:
             open_points.append(f"No episode was driven again: {error}.")
-    if stated := otherwise(path, run.manifest.settings):
-        wrong.append(stated)
+    if mistake := otherwise(path, run.manifest.settings):
+        wrong.append(mistake)
     if not silent:
         rows = f"{amount(len(run.scores), 'figure')} and {amount(len(run.decisions), 'decision')}"
         equal = "equal where it can be checked" if open_points else "equal"

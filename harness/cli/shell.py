@@ -190,7 +190,7 @@ class Group(TyperGroup):
         here = [*self.commands]
         width = max(map(len, here))
         for panel, names in {"Commands": here}.items() if self.path else panels().items():
-            if shown := [name for name in names if name in here]:  # a package can name others
+            if names_here := [name for name in names if name in here]:  # a package can name others
                 with formatter.section(panel):
                     formatter.write_dl(
                         [
@@ -198,7 +198,7 @@ class Group(TyperGroup):
                                 f"{name:<{width}}",
                                 self._short_help(name, formatter.width - width - 6),
                             )
-                            for name in shown
+                            for name in names_here
                         ]
                     )
 

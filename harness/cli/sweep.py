@@ -66,8 +66,10 @@ def command(
             "--proxy: no extension that is installed has the calibrated proxy; leave it out"
         )
     with bar("grid points", quiet=as_json or quiet, grows=True) as progress:
-        own = options.cards(model)
-        replayed = [ReplayedRun(run, latency, progress, not no_model, dataset, own) for run in runs]
+        cards = options.cards(model)
+        replayed = [
+            ReplayedRun(run, latency, progress, not no_model, dataset, cards) for run in runs
+        ]
         panels = panels_over(
             replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart
         )

@@ -183,10 +183,10 @@ def echo_fields(record: Any) -> None:
     meanings = attributes(type(record))
     for name, value in asdict(record).items():
         values = value if isinstance(value, tuple) else (value,)
-        shown = (
+        texts = (
             f"{v:g}" if type(v) in (int, float) else printable(str(v).lower(), 60) for v in values
         )
-        typer.echo(f"{name} = {', '.join(shown)}")
+        typer.echo(f"{name} = {', '.join(texts)}")
         typer.echo(
             fill(meanings.get(name, ""), 80, initial_indent="    ", subsequent_indent="    ")
         )
