@@ -107,10 +107,10 @@ def _hidden(scenario: Scenario, seed: int) -> Hidden:
     A braking vehicle counts as the danger in sight, since it may brake for the danger.
     """
     start = World.start(scenario, seed)
-    going: list[tuple[World, tuple[str, ...]]] = [(start, BLIND)]
+    branches: list[tuple[World, tuple[str, ...]]] = [(start, BLIND)]
     hidden = []
-    while going:
-        world, drivers = going.pop()
+    while branches:
+        world, drivers = branches.pop()
         if world.outcome.ended or world.step >= scenario.parameters.decisions:
             continue
         graph = scene_graph(scenario, world.state(), world.layout.spawns[0].id)
@@ -124,7 +124,7 @@ def _hidden(scenario: Scenario, seed: int) -> Hidden:
         for action, some in ways.items():
             on = world if len(ways) == 1 else world.branch()
             on.act(action)
-            going.append((on, some))
+            branches.append((on, some))
     return start.layout.danger or NONE, hidden
 
 
@@ -174,15 +174,15 @@ def judge(
     from sklearn.model_selection import StratifiedGroupKFold
 
     layout, step, danger = points.layout, points.step, points.danger
-    known, classes = ~np.isnan(points.numbers), np.unique(danger)
+    is_known, classes = ~np.isnan(points.numbers), np.unique(danger)
     folds = list(
-        StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(known, danger, layout)
+        StratifiedGroupKFold(FOLDS, shuffle=True, random_state=0).split(is_known, danger, layout)
     )
     # Learning fails on a number that is unknown wherever a model learns.
     varies = []
     for k, column in enumerate(points.numbers.T):
-        known_where_learnt = all(known[learnt, k].any() for learnt, _ in folds)
-        if known_where_learnt and len(np.unique(column[known[:, k]])) > 1:
+        known_where_learnt = all(is_known[learnt, k].any() for learnt, _ in folds)
+        if known_where_learnt and len(np.unique(column[is_known[:, k]])) > 1:
             varies.append(k)
     table, names = points.numbers[:, varies], [points.names[k] for k in varies]
     trees = partial(
@@ -193,14 +193,14 @@ def judge(
     def answers(table: Floats) -> Floats:
         """Return probabilities (m, classes), each by the model that has not seen its layout."""
         scores = np.zeros((len(table), len(classes)))
-        for model, (_, asked) in zip(models, folds, strict=True):
+        for model, (_, tested) in zip(models, folds, strict=True):
             columns = np.searchsorted(classes, model.classes_)
-            scores[np.ix_(asked, columns)] = model.predict_proba(table[asked])
+            scores[np.ix_(tested, columns)] = model.predict_proba(table[tested])
         return scores
 
     model_of = np.empty(len(layout), dtype=int)
-    for k, (_, asked) in enumerate(folds):
-        model_of[asked] = k
+    for k, (_, tested) in enumerate(folds):
+        model_of[tested] = k
     alike = step * FOLDS + model_of  # scores of two models do not compare
 
     def ranks(question: str, scores: Floats) -> "Ranks":

@@ -82,7 +82,7 @@ def run(
     if not dry_run:
         Here().check(of)
     sources = {name: of.source(name, limit) for name in of.datasets}
-    asked = {
+    agent_settings = {
         "model": model,
         "engine": engine,
         "prompt": prompt,
@@ -93,7 +93,10 @@ def run(
         "device": device,
         "dtype": dtype,
     }
-    specs = [resolve.spec(of.settings(name, **asked), source) for name, source in sources.items()]
+    specs = [
+        resolve.spec(of.settings(name, **agent_settings), source)
+        for name, source in sources.items()
+    ]
     for spec in specs:
         if spec.ego.prompt.version not in of.prompts:
             listed = ", ".join(of.prompts)
@@ -207,9 +210,9 @@ def _show(file: Path, done: "Rescored") -> None:
     by = f", made by {printable(done.contents.made_by)}" if done.contents.made_by else ""
     typer.echo(f"{printable(file)}: {printable(done.suite.variant)}{by}")
     typer.echo(f"{printable(done.edition.name)}, digest {done.edition.digest}, as it is here")
-    wrong = {name: found for name, found in done.differences.items() if found}
-    for name, found in wrong.items():
-        echo_text(f"{name}: {len(found)} differ: {', '.join(found)}")
+    wrong = {name: figures for name, figures in done.differences.items() if figures}
+    for name, figures in wrong.items():
+        echo_text(f"{name}: {len(figures)} differ: {', '.join(figures)}")
     layouts = sum(len(run.grid.episodes) for run in done.suite.runs.values())
     of = f"{done.compared} figures of {layouts} layouts in {len(done.suite.runs)} families"
     typer.echo(f"{'not ' * bool(wrong)}equal to the last digit: {of}")

@@ -96,10 +96,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         """
         return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 
-    def settings(self, dataset: str, **asked: Any) -> Settings:
+    def settings(self, dataset: str, **further: Any) -> Settings:
         """Return the settings of an evaluation on one of the edition's datasets.
 
-        `asked` are further settings, such as `model`, `prompt` and `answer`.
+        `further` are settings, such as `model`, `prompt` and `answer`.
         """
         return Settings(
             world=FrozenSettings(dataset=dataset),
@@ -107,7 +107,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             condition=self.condition,
             latency=self.latency,
             ties=self.ties,
-            **asked,
+            **further,
         )
 
     def source(self, dataset: str, limit: int | None = None) -> FrozenSource:
@@ -196,21 +196,21 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         card = card_here(convert(m.model, Card, f"{printable(run.path)}: its model"))
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
         ego, points = Agent(card, prompt, *how), resolve.points(self.condition)
-        own = deciding(m.settings)
-        settings = structs.replace(own, latency=self.latency, ties=self.ties)
+        decision_settings = deciding(m.settings)
+        settings = structs.replace(decision_settings, latency=self.latency, ties=self.ties)
         return Spec(ego, source, points, parse_seeds(self.seeds), settings=settings)
 
-    def _differs(self, what: str, here: str, stated: str) -> UserError:
+    def _differs(self, what: str, here: str, digest: str) -> UserError:
         return UserError(
-            f"{what} has digest {here}, and {printable(self.name)} is of {printable(stated)}; "
+            f"{what} has digest {here}, and {printable(self.name)} is of {printable(digest)}; "
             "restore it, or install the release that has it"
         )
 
 
 def _agent(m: Manifest) -> dict[str, Any]:
     """Return who answered, and how; prompts may differ by family."""
-    stated = {**m.agent(0), "temperature": m.settings.temperature}
-    return {key: value for key, value in stated.items() if key != "prompt"}
+    agent = {**m.agent(0), "temperature": m.settings.temperature}
+    return {key: value for key, value in agent.items() if key != "prompt"}
 
 
 def named(name: str) -> Edition:

@@ -92,8 +92,8 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
     lacks the answer to a question, or has one to another question; or if this installation computes
     the edition's golden figures otherwise.
     """
-    contents, stated = contents_of(file), folder / "stated"
-    with _about(file, stated):
+    contents, stated_folder = contents_of(file), folder / "stated"
+    with _about(file, stated_folder):
         edition = editions.named(contents.edition)
         limit = edition.layouts(sha256_file(file, "record"))
         if contents.digest != edition.digest and limit is None:
@@ -103,12 +103,12 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
             )
         if strange := [name for name in contents.runs if name not in edition.datasets]:
             raise unknown(f"dataset of {printable(edition.name)}", strange[0], edition.datasets)
-    unpack(file, contents, stated)
-    with _about(file, stated):
+    unpack(file, contents, stated_folder)
+    with _about(file, stated_folder):
         if limit is None:
             here.check(edition)
         runs, differences, compared = dict[str, Run](), dict[str, list[str]](), 0
-        stated_runs = [read(stated / name) for name in contents.runs]
+        stated_runs = [read(stated_folder / name) for name in contents.runs]
         for name, run in edition.entry(stated_runs, limit).items():
             source = here.source(edition, name) if limit is None else edition.source(name, limit)
             place = folder / "computed" / name
@@ -125,28 +125,28 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
 
 
 @contextmanager
-def _about(file: Path, stated: Path) -> Iterator[None]:
+def _about(file: Path, folder: Path) -> Iterator[None]:
     """Have errors name the file, and leave out the folder that it is unpacked to."""
     try:
         yield
     except (UserError, Unanswered, OverflowError) as error:
-        raise UserError(f"{printable(file)}: {str(error).replace(f'{stated}/', '')}") from None
+        raise UserError(f"{printable(file)}: {str(error).replace(f'{folder}/', '')}") from None
 
 
-def differing(stated: Run, computed: Run, edition: Edition) -> Iterator[str]:
+def differing(stated_run: Run, computed_run: Run, edition: Edition) -> Iterator[str]:
     """Yield the names of figures in which two runs of an edition differ, and of episodes' columns.
 
     Numbers are compared as they are written, to the last digit. A column of episodes that the
     stated run, which may be older, lacks is not compared.
     """
-    stated_scores = {score.key: score for score in edition.figures(stated)}
-    computed_scores = {score.key: score for score in edition.figures(computed)}
+    stated_scores = {score.key: score for score in edition.figures(stated_run)}
+    computed_scores = {score.key: score for score in edition.figures(computed_run)}
     for key in stated_scores | computed_scores:
         if stated_scores.get(key) != computed_scores.get(key):
             yield " ".join(key)
     for name in Episode.__struct_fields__:
-        stated_values = [getattr(episode, name) for episode in stated.episodes]
-        computed_values = [getattr(episode, name) for episode in computed.episodes]
+        stated_values = [getattr(episode, name) for episode in stated_run.episodes]
+        computed_values = [getattr(episode, name) for episode in computed_run.episodes]
         if any(value is not None for value in stated_values):
             wrong = sum(a != b for a, b in zip_longest(stated_values, computed_values))
             if wrong:

@@ -120,10 +120,10 @@ def calibration(name: str) -> Calibration:
 @read_once
 def _read(path: Any) -> Calibration:
     where = f"calibration file {printable(path)}"
-    found = convert(toml(path, where), Calibration, where)
-    check_seeds(where, found.first_seed, found.last_seed)
-    for correction in filter(None, (found.ego, found.helper)):
-        if len(correction.prior) not in (0, len(found.actions)):
+    calibration = convert(toml(path, where), Calibration, where)
+    check_seeds(where, calibration.first_seed, calibration.last_seed)
+    for correction in filter(None, (calibration.ego, calibration.helper)):
+        if len(correction.prior) not in (0, len(calibration.actions)):
             raise UserError(
                 f"{where}: prior has {len(correction.prior)} values; give one an action, or none"
             )
@@ -131,13 +131,15 @@ def _read(path: Any) -> Calibration:
             raise UserError(
                 f"{where}: prior sums to {sum(correction.prior):g}, not 1; fit it again"
             )
-        if bool(correction.prior) != ("L0" in found.level):
+        if bool(correction.prior) != ("L0" in calibration.level):
             raise UserError(
-                f"{where}: level {found.level} goes with a prior if it has L0; fit it again"
+                f"{where}: level {calibration.level} goes with a prior if it has L0; fit it again"
             )
-        if correction.temperature != 1 and "L1" not in found.level:
-            raise UserError(f"{where}: level {found.level} has no temperature but 1; fit it again")
-    return found
+        if correction.temperature != 1 and "L1" not in calibration.level:
+            raise UserError(
+                f"{where}: level {calibration.level} has no temperature but 1; fit it again"
+            )
+    return calibration
 
 
 def check_seeds(what: str, first: int, last: int) -> None:

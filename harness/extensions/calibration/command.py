@@ -42,16 +42,16 @@ def command(
         raise UserError(
             f"--out {printable(out)} is there already; give a new name, since runs name it"
         )
-    found, fitted = calibrate(
+    calibration, fitted = calibrate(
         run, cast(Level, level), dataset, shlex.join(["harness", *sys.argv[1:]])
     )
-    write(found, out)
+    write(calibration, out)
     if as_json:
-        echo_json({**asdict(found), "fitted": [asdict(each) for each in fitted]})
+        echo_json({**asdict(calibration), "fitted": [asdict(each) for each in fitted]})
         return
     for each in fitted:
         prior = " ".join(
-            f"{a} {p:.2f}" for a, p in zip(found.actions, each.correction.prior, strict=False)
+            f"{a} {p:.2f}" for a, p in zip(calibration.actions, each.correction.prior, strict=False)
         )
         typer.echo(
             f"{each.role}: temperature "
@@ -59,4 +59,6 @@ def command(
             f"NLL {each.before_nats:.3f} to {each.after_nats:.3f} nats (n = "
             f"{each.correction.answers})"
         )
-    typer.echo(f"wrote {printable(out)}: {found.level}, fitted on {printable(found.fitted_on)}")
+    typer.echo(
+        f"wrote {printable(out)}: {calibration.level}, fitted on {printable(calibration.fitted_on)}"
+    )

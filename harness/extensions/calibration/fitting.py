@@ -57,14 +57,15 @@ def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
         prior = tuple(np.maximum(p.mean(axis=0), LEAST_PRIOR).round(DIGITS).tolist())
     if "L1" not in level:
         return Correction(len(p), prior=prior)
-    known = optimal.any(axis=1)
-    if not known.any():
+    has_optimal = optimal.any(axis=1)
+    if not has_optimal.any():
         raise UserError(
             "no action is optimal in any of its decision points; give a run with more layouts"
         )
     tried = TEMPERATURES[np.argsort(np.abs(np.log(TEMPERATURES)), kind="stable")].round(4)
     nats = [
-        nats_of(Correction(len(p), t, prior).of(p[known]), optimal[known]) for t in tried.tolist()
+        nats_of(Correction(len(p), t, prior).of(p[has_optimal]), optimal[has_optimal])
+        for t in tried.tolist()
     ]
     return Correction(len(p), float(tried[int(np.argmin(np.round(nats, 9)))]), prior)
 
@@ -112,8 +113,8 @@ def calibrate(
     if not fitted or fitted[0].role != "ego":
         raise UserError(f"{name}: no answer of the ego could be read, so there is nothing to fit")
     corrections = {each.role: each.correction for each in fitted}
-    seeds = seeds_text(first, last - first + 1)
-    found = Calibration(
+    seeds = stated(first, last - first + 1)
+    calibration = Calibration(
         level,
         command,
         f"{manifest.variant.model} on {manifest.world.name}, {seeds}, "
@@ -126,7 +127,7 @@ def calibrate(
         corrections["ego"],
         corrections.get("helper"),
     )
-    return found, fitted
+    return calibration, fitted
 
 
 def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None:
@@ -139,9 +140,9 @@ def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None
     return Fitted(role, correction, nats_of(p, optimal), nats_of(correction.of(p), optimal))
 
 
-def write(found: Calibration, out: Path) -> None:
+def write(calibration: Calibration, out: Path) -> None:
     """Write a calibration's file: TOML, whose strings and lists are JSON's."""
-    fields = asdict(found)
+    fields = asdict(calibration)
     tables = {name: fields.pop(name) for name in ("question", "ego", "helper")}
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
     for name, table in tables.items():

@@ -72,14 +72,14 @@ class Checkup:
 
 def check(
     backend: Rendering,
-    asked: Sequence[Request],
-    shown: Sequence[Pictured] = (),
+    requests: Sequence[Request],
+    pictured: Sequence[Pictured] = (),
     progress: Callable[[int], None] = lambda done: None,
 ) -> Checkup:
     """Check a model with some questions, one in each answer mode.
 
-    For a model with vision, `shown` has questions of an image prompt, each with a camera picture, a
-    blank one and none. `progress` is called with 1 after each.
+    For a model with vision, `pictured` has questions of an image prompt, each with a camera
+    picture, a blank one and none. `progress` is called with 1 after each.
     """
 
     def answer(request: Request, warm: bool = False) -> Completion:
@@ -87,7 +87,7 @@ def check(
         progress(1)
         return completion
 
-    [prompt] = backend.rendered(asked[:1])
+    [prompt] = backend.rendered(requests[:1])
     chat: Chat | None = getattr(backend, "chat", None)
     ids = chat.encode(prompt) if chat else []
     turn_end = None
@@ -96,26 +96,26 @@ def check(
     return Checkup(
         prompt=prompt,
         tokens=list(zip(ids, chat.pieces(ids), strict=True)) if chat else None,
-        bos_tokens=_leading(ids, chat.bos) if chat else None,
+        bos_tokens=_count_of_first(ids, chat.bos) if chat else None,
         turn_end=turn_end,
         thinking=chat.thinking if chat else None,
-        answers={request.answer: answer(request) for request in asked},
+        answers={request.answer: answer(request) for request in requests},
         identity=backend.identity(),
-        looks=_looks(answer, shown) if shown else None,
+        looks=_looks(answer, pictured) if pictured else None,
     )
 
 
-def _leading(ids: Sequence[int], token: int | None) -> int:
+def _count_of_first(ids: Sequence[int], token: int | None) -> int:
     """Return how many of the first ids are a token."""
     return next((n for n, each in enumerate(ids) if each != token), len(ids))
 
 
-def _looks(answer: Callable[..., Completion], shown: Sequence[Pictured]) -> Looks:
-    answers = {own.answer: answer(own) for own, _, _ in shown}
-    blanks = {blank.answer: answer(blank, warm=True) for _, blank, _ in shown}
+def _looks(answer: Callable[..., Completion], pictured: Sequence[Pictured]) -> Looks:
+    answers = {with_picture.answer: answer(with_picture) for with_picture, _, _ in pictured}
+    blanks = {blank.answer: answer(blank, warm=True) for _, blank, _ in pictured}
     answered = [
         text
-        for _, _, text in shown
+        for _, _, text in pictured
         if not (answers[text.answer].error or blanks[text.answer].error)
     ]
     return Looks(answers, blanks, answer(answered[-1], warm=True) if answered else None)

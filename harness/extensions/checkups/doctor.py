@@ -177,9 +177,9 @@ def _smi_gpus() -> list[str]:
     program = which("nvidia-smi")
     if program is None:
         return []
-    asked = [program, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
+    command = [program, "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
     try:
-        done = subprocess.run(asked, capture_output=True, text=True, timeout=SMI_S, check=True)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=SMI_S, check=True)
     except (OSError, ValueError, subprocess.SubprocessError):
         return []
     return done.stdout.splitlines()

@@ -46,9 +46,9 @@ class Check:
     @property
     def usable(self) -> bool:
         """Return whether an answer in any answer mode can be parsed to an intent."""
-        asked = self.spec.ego.blank("ego", self.spec.actions)
+        request = self.spec.ego.blank("ego", self.spec.actions)
         answers = self.seen.answers.items()
-        return any(answer_of(asked.alike(answer=mode), reply).intent for mode, reply in answers)
+        return any(answer_of(request.alike(answer=mode), reply).intent for mode, reply in answers)
 
 
 def check(

@@ -144,12 +144,12 @@ def parity(
 
     def some(answer: "AnswerMode") -> "list[Request]":
         agent = Agent(reference, versions.load(prompt), answer, letters="raw")
-        asked = list(requests(Spec(agent, FrozenSource(data), (), (0,)), scenes))
-        return asked[:: max(1, len(asked) // prompts)][:prompts]
+        all_requests = list(requests(Spec(agent, FrozenSource(data), (), (0,)), scenes))
+        return all_requests[:: max(1, len(all_requests) // prompts)][:prompts]
 
-    asked, letters = [] if read_outs else some("json"), some("readout")
+    json_requests, letters = [] if read_outs else some("json"), some("readout")
     with bar(f"comparing {printable(reference.name, 30)}", PASSES, as_json) as progress:
-        compared = compare(reference, gguf, asked, letters, progress)
+        compared = compare(reference, gguf, json_requests, letters, progress)
     findings, left_out = compared.findings, compared.left_out
     holds = all(finding.holds for finding in findings)
     if as_json:
@@ -248,12 +248,12 @@ def _show_findings(result: "Findings | None") -> None:
         f"likeliest action does in {result.follows_letter} of {result.n} questions; mass on the "
         f"letters {result.label_mass:.2f}"
     )
-    shown = ", ".join(
+    moves = ", ".join(
         f"{pair.fact} {pair.moved} of {pair.n} ({pair.change})" for pair in result.pairs
     )
     typer.echo(
         f"pairs        of questions that differ in one fact, letters {result.letters}; the answer "
-        f"followed the fact in (mean change of its probability): {shown}"
+        f"followed the fact in (mean change of its probability): {moves}"
     )
     for sentence in result.sentences():
         typer.echo(f"             {sentence}")
@@ -278,8 +278,8 @@ def _token_lines(tokens: list[tuple[int, str]]) -> list[str]:
     """Return ids with their pieces, as many to a line as fit."""
     lines = [""]
     for number, piece in tokens:
-        shown = f"{number} {printable(repr(piece), 60)}"
-        if lines[-1] and len(lines[-1]) + len(shown) > _WIDTH:
+        token = f"{number} {printable(repr(piece), 60)}"
+        if lines[-1] and len(lines[-1]) + len(token) > _WIDTH:
             lines.append("")
-        lines[-1] += f"  {shown}" if lines[-1] else shown
+        lines[-1] += f"  {token}" if lines[-1] else token
     return [line for line in lines if line]

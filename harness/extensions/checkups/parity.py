@@ -72,15 +72,15 @@ class Outputs:
 def compare(
     reference: Card,
     gguf: Card,
-    asked: Sequence[Request],
+    json_requests: Sequence[Request],
     letters: Sequence[Request],
     progress: Callable[[int], None],
 ) -> Comparison:
     """Compare a model on llama.cpp with the same model on transformers, token by token.
 
     `reference` is its card on transformers: of a checkpoint, or of a GGUF file, which is unpacked;
-    `gguf` is its card on llama.cpp. `asked` are requests for JSON, perhaps none; `letters` ask for
-    a read-out. `progress` is called with 1 after each of `PASSES` passes over the prompts, or with
+    `gguf` is its card on llama.cpp. `json_requests` ask for JSON, perhaps none; `letters` ask for a
+    read-out. `progress` is called with 1 after each of `PASSES` passes over the prompts, or with
     the number left out. Raises UserError if weights are missing or do not load.
     """
     most_logit = SEEN if reference.vision else MOST_LOGIT
@@ -88,9 +88,9 @@ def compare(
     first = plain(batch_size=1)
     model = cast(TransformersEngine, first.engine).model
     rows = model.get_input_embeddings().num_embeddings  # padding included
-    expected = _outputs(first, asked, letters, rows)
+    expected = _outputs(first, json_requests, letters, rows)
     progress(1)
-    json_ids, letter_ids = [r.id for r in asked], [r.id for r in letters]
+    json_ids, letter_ids = [r.id for r in json_requests], [r.id for r in letters]
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory() as folder:
         file, left_out, exact = Path(folder) / "f32.gguf", None, None
@@ -110,14 +110,14 @@ def compare(
             ("transformers", plain, expected.texts)
         ]
         for label, engine in engines:
-            trial = _outputs(engine(batch_size=1), asked, letters, rows)
+            trial = _outputs(engine(batch_size=1), json_requests, letters, rows)
             if engine is exact:
                 alone.append(("llama.cpp F32", engine, trial.texts))
             ids = json_ids + letter_ids
             findings.append(
                 _equal(f"{label}: token ids equal", 1.0, ids, expected.tokens, trial.tokens)
             )
-            if asked:
+            if json_requests:
                 logit = np.abs(expected.logits - trial.logits).max(axis=1)
                 most = most_logit.get(label)
                 findings += [
@@ -134,44 +134,46 @@ def compare(
             what = f"{label}: largest difference of a read-out"
             findings.append(_near(what, MOST_READOUT, letter_ids, readout))
             progress(1)
-        for label, opened, texts in alone if asked else ():
+        for label, opened, texts in alone if json_requests else ():
             what = f"{label}: text equal in reversed batches of {BATCH}"
-            together = _texts(opened(batch_size=BATCH), asked[::-1])[::-1]
+            together = _texts(opened(batch_size=BATCH), json_requests[::-1])[::-1]
             findings.append(_equal(what, 1.0, json_ids, texts, together))
             progress(1)
-    if spared := PASSES - 1 - len(engines) - (len(alone) if asked else 0):
+    if spared := PASSES - 1 - len(engines) - (len(alone) if json_requests else 0):
         progress(spared)
     return Comparison(tuple(findings), left_out)
 
 
 def _outputs(
     backend: LanguageModel | LlamaBackend,
-    asked: Sequence[Request],
+    json_requests: Sequence[Request],
     letters: Sequence[Request],
     rows: int,
 ) -> Outputs:
     """Return what an engine makes of some questions: tokens, logits, texts and read-outs."""
     tokens = []
-    for request in (*asked, *letters):
+    for request in (*json_requests, *letters):
         prompt = backend.chat.render(request.messages, thinking=request.thinking)
         tokens.append(backend.chat.encode(prompt))
     logits = np.empty((0, rows))
-    if asked:
-        logits = np.concatenate([backend.next_log_probs([request], rows) for request in asked])
+    if json_requests:
+        logits = np.concatenate(
+            [backend.next_log_probs([request], rows) for request in json_requests]
+        )
     readouts = []
     for request, text in zip(letters, _texts(backend, letters), strict=True):
         intent = parse(text, role="ego", actions=request.actions).intent
         readouts.append(intent or [np.nan] * len(request.actions))
-    return Outputs(tokens, logits, _texts(backend, asked), np.array(readouts))
+    return Outputs(tokens, logits, _texts(backend, json_requests), np.array(readouts))
 
 
-def _texts(backend: Backend, asked: Sequence[Request]) -> list[str]:
+def _texts(backend: Backend, requests: Sequence[Request]) -> list[str]:
     """Answer each question. Raises Unanswered if one gets no answer:
     two errors are not equal texts.
     """
-    completions = backend.complete(asked)
+    completions = backend.complete(requests)
     if errors := [printable(c.error, 300) for c in completions if c.error is not None]:
-        raise Unanswered(f"{errors[0]}: no answer to {len(errors)} of {len(asked)} questions")
+        raise Unanswered(f"{errors[0]}: no answer to {len(errors)} of {len(requests)} questions")
     return [completion.text for completion in completions]
 
 

@@ -55,7 +55,7 @@ def check(
         raise UserError(f"prompt {version} {reason}; give another --dataset, or fix the prompt")
     scenes = data.scenes(data.courses())
     reader = pictures.picture_model(prompt, model, checked=True)
-    asked = trial.card_of(prompt, model, engine) if model and reader is None else None
+    card_to_ask = trial.card_of(prompt, model, engine) if model and reader is None else None
     if difference := reader and reader.difference:
         typer.echo(difference)
         raise typer.Exit(1)
@@ -66,9 +66,9 @@ def check(
     with bar("scenes", len(scenes), as_json) as progress:
         sizes = measure(prompt, data, scenes, count, picture, progress)
     tried = None
-    if asked:
-        with bar(f"asking {printable(asked.name, 30)}", quiet=as_json) as progress:
-            tried = trial.try_on(prompt, asked, device, dtype, progress)
+    if card_to_ask:
+        with bar(f"asking {printable(card_to_ask.name, 30)}", quiet=as_json) as progress:
+            tried = trial.try_on(prompt, card_to_ask, device, dtype, progress)
     stats = {call: summarize_counts(tokens) for call, tokens in sizes.tokens.items() if tokens}
     if as_json:
         outside = [each._asdict() for each in sizes.outside]

@@ -88,9 +88,9 @@ class Findings(Struct, frozen=True):
                 f"; with --letters {self.other_letters} in {_moved_of(others)}" if others else ""
             )
             reads = any(pair.read for pair in others)
-            found = f"with letters read {self.letters} it does not" if reads else "it does not"
+            clause = f"with letters read {self.letters} it does not" if reads else "it does not"
             yield (
-                f"{found} read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, "
+                f"{clause} read the scene: a conflict put in or taken out, or a gap of 0.2 or 5 s, "
                 f"moved its answer in {_moved_of(_of_scene(self.pairs))} pairs{otherwise} (model "
                 f"check, answer {self.answer}, prompt {self.prompt})."
             )
@@ -132,7 +132,7 @@ def examine(
     if isinstance(done, str):
         return done
     of_letters, rest = done[: -2 * len(pairs)], iter(done[-2 * len(pairs) :])
-    found = Findings(
+    findings = Findings(
         prompt=agent.prompt.version,
         prompt_sha256=agent.prompt.sha256,
         answer=reader.answer,
@@ -143,16 +143,16 @@ def examine(
         label_mass=round(fmean(c.label_mass or 0.0 for c in of_letters), 4),
         pairs=moved(pairs, rest),
     )
-    if found.reads_scene:
-        return found
-    turned = replace(reader, letters=cast("Letters", found.other_letters))
+    if findings.reads_scene:
+        return findings
+    turned = replace(reader, letters=cast("Letters", findings.other_letters))
     scenes = [*questions.scene_pairs(turned)]
     halves = [half for pair in scenes for half in (pair.present, pair.absent)]
     again = _answers(backend, halves, lambda count: None)
     return (
         again
         if isinstance(again, str)
-        else replace_struct(found, others=moved(scenes, iter(again)))
+        else replace_struct(findings, others=moved(scenes, iter(again)))
     )
 
 

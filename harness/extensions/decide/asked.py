@@ -103,7 +103,9 @@ def _check_depth(content: Any, left: int) -> None:
             _check_depth(inner, left - 1)
 
 
-def asked(name: str | None, question: Question, options: Sequence[tuple[Any, str | None]]) -> Asked:
+def with_options(
+    name: str | None, question: Question, options: Sequence[tuple[Any, str | None]]
+) -> Asked:
     """Return a question with its options, each of which has a value and a meaning or None.
 
     `name` is the question's, in messages. Raises Refusal if there are too few options, too many, or
@@ -119,18 +121,18 @@ def asked(name: str | None, question: Question, options: Sequence[tuple[Any, str
     return Asked(name, full, tuple(value for value, _ in options))
 
 
-def answered(asked: Asked, completion: Completion) -> Answered:
+def answered(question: Asked, completion: Completion) -> Answered:
     """Return the answer in a model's completion.
 
     Raises Refusal if it does not state a probability for each option.
     """
     if completion.finish_reason == "refusal":
-        return Answered(asked, None, completion.prompt_tokens)
+        return Answered(question, None, completion.prompt_tokens)
     try:
-        stated: Mapping[str, Any] = json.loads(completion.text)["action_distribution"]
-        shares = [stated[option] for option in asked.options]
+        distribution: Mapping[str, Any] = json.loads(completion.text)["action_distribution"]
+        shares = [distribution[option] for option in question.options]
     except (ValueError, LookupError, TypeError, RecursionError):
         shares = []
     if not shares or not all(type(p) in (int, float) and 0 <= p <= 1 for p in shares):
         raise Refusal("the model stated no probability of each option", 502, "no_answer")
-    return Answered(asked, tuple(map(float, shares)), completion.prompt_tokens)
+    return Answered(question, tuple(map(float, shares)), completion.prompt_tokens)

@@ -13,8 +13,8 @@ from harness.extensions.decide.asked import (
     Asked,
     Enquiry,
     Refusal,
-    asked,
     text_of,
+    with_options,
 )
 from harness.prompts.decision import Question
 
@@ -104,7 +104,7 @@ def read(body: Body) -> Enquiry:
         texts.append(text)
         images += urls
     state = "\n".join(texts)
-    questions = tuple(_asked(question, state) for question in body.questions)
+    questions = tuple(_question_of(question, state) for question in body.questions)
     return Enquiry(body.model, questions, tuple(images))
 
 
@@ -130,7 +130,7 @@ def _read(content: str | list[Part]) -> tuple[str, list[str]]:
     return "\n".join(texts), urls
 
 
-def _asked(question: Choice | Score | Predicate, state: str) -> Asked:
+def _question_of(question: Choice | Score | Predicate, state: str) -> Asked:
     """Return a question of a request with its options. Raises Refusal if it has a picture."""
     instructions, images = _read(question.instructions)
     if images:
@@ -138,17 +138,17 @@ def _asked(question: Choice | Score | Predicate, state: str) -> Asked:
     match question:
         case Choice(choices=choices):
             options = [(option.value, option.description) for option in choices]
-            return asked(question.name, Question(state, instructions, {}), options)
+            return with_options(question.name, Question(state, instructions, {}), options)
         case Score(levels=levels):
             options = []
             for number, level in enumerate(levels):
                 description = f": {level.description}" if level.description else ""
                 options.append((str(number), f"{level.label}{description}"))
-            whole = asked(question.name, Question(state, instructions, {}, "score"), options)
+            whole = with_options(question.name, Question(state, instructions, {}, "score"), options)
             return Asked(whole.name, whole.question, tuple(level.label for level in levels))
         case Predicate():
             outcomes = [(option, None) for option in ("true", "false")]
-            return asked(question.name, Question(state, instructions, {}, "noul"), outcomes)
+            return with_options(question.name, Question(state, instructions, {}, "noul"), outcomes)
 
 
 def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
@@ -180,12 +180,12 @@ def _answer(answer: Answered) -> dict[str, Any]:
         levels = [
             {"value": n, "label": label, "probability": p} for n, (label, p) in enumerate(pairs)
         ]
-        told = {
+        score = {
             "score": answer.mean_level,
             "confidence": answer.confidence,
             "probabilities": levels,
         }
-        return {"type": "score", **name, **told}
+        return {"type": "score", **name, **score}
     listed = [{"value": value, "probability": p} for value, p in pairs]
     chosen = {"choice": values[answer.likeliest], "confidence": answer.confidence}
     return {"type": "choice", **name, **chosen, "probabilities": listed}

@@ -83,29 +83,29 @@ class ServedModel:
         image = picture(enquiry.images[0]) if enquiry.images else None
         return [self._request(each, image) for each in enquiry.questions]
 
-    def _request(self, asked: Asked, image: Image | None) -> Request:
+    def _request(self, query: Asked, image: Image | None) -> Request:
         """Return a question as a request, with a picture if there is one.
 
         Raises Refusal if it has too many options, or is too long.
         """
-        if self._reads_letters and len(asked.options) > len(LETTERS):
+        if self._reads_letters and len(query.options) > len(LETTERS):
             raise Refusal(
-                f"question {printable(asked.name, 40)!r} has {len(asked.options)} options; "
+                f"question {printable(query.name, 40)!r} has {len(query.options)} options; "
                 f"{printable(self.name)} answers by a letter each, and takes {len(LETTERS)} at "
                 "most",
                 code="options",
             )
-        if asked.length > MOST_CHARACTERS:  # before each order of the letters has a copy
+        if query.length > MOST_CHARACTERS:  # before each order of the letters has a copy
             raise Refusal(
-                f"a question and its state have {asked.length} characters; give {MOST_CHARACTERS} "
+                f"a question and its state have {query.length} characters; give {MOST_CHARACTERS} "
                 "at most",
                 code="context_length_exceeded",
             )
         turn = {"role": "user", "image": "camera"} if image else {"role": "user"}
         chats = self._agent.in_orders(
-            asked.options, lambda order: decision.letter_chat(asked.question, (turn,), order)
+            query.options, lambda order: decision.letter_chat(query.question, (turn,), order)
         )
-        blank = self._agent.blank("ego", asked.options)
+        blank = self._agent.blank("ego", query.options)
         return blank.alike(
-            id=f"{next(self._numbers)}/asked", question=asked.question, image=image, **chats
+            id=f"{next(self._numbers)}/asked", question=query.question, image=image, **chats
         )

@@ -7,7 +7,14 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-from harness.extensions.decide.asked import MOST_QUESTIONS, Answered, Asked, Enquiry, asked, text_of
+from harness.extensions.decide.asked import (
+    MOST_QUESTIONS,
+    Answered,
+    Asked,
+    Enquiry,
+    text_of,
+    with_options,
+)
 from harness.prompts.decision import Question
 
 Content = str | dict[str, Any] | list[Any]
@@ -49,24 +56,24 @@ class Body(Struct):
 def read(body: Body) -> Enquiry:
     """Return the questions of a request. Raises Refusal if it holds what is not supported."""
     state = text_of(body.state)
-    questions = tuple(_asked(name, each, state) for name, each in body.questions.items())
+    questions = tuple(_question_of(name, each, state) for name, each in body.questions.items())
     return Enquiry(body.model, questions, (*body.files, *body.images))
 
 
-def _asked(name: str, question: Choice | Score | Noul, state: str) -> Asked:
+def _question_of(name: str, question: Choice | Score | Noul, state: str) -> Asked:
     instructions = "" if question.instructions is None else text_of(question.instructions)
     match question:
         case Choice(criteria=criteria):
             options = [(option, _meaning(content)) for option, content in criteria.items()]
-            return asked(name, Question(state, instructions, {}), options)
+            return with_options(name, Question(state, instructions, {}), options)
         case Score(criteria=levels):
             options = [(str(level), text_of(content)) for level, content in enumerate(levels)]
-            return asked(name, Question(state, instructions, {}, "score"), options)
+            return with_options(name, Question(state, instructions, {}, "score"), options)
         case Noul(criteria=outcomes):
             options = [
                 (option, _meaning((outcomes or {}).get(option))) for option in ("true", "false")
             ]
-            return asked(name, Question(state, instructions, {}, "noul"), options)
+            return with_options(name, Question(state, instructions, {}, "noul"), options)
 
 
 def _meaning(content: Content | None) -> str | None:

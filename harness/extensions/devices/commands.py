@@ -127,9 +127,9 @@ def _fit_cells(fit: "Fit", of_run: bool) -> Sequence[str]:
         printable(fit.row.model),
         fit.answer,
         f"{fit.prompt_tokens:g} + {fit.output_tokens:g}",
-        _known(fit.seconds, f"{1000 * fit.seconds:.{decimals}f}"),
-        _known(fit.in_time.value, in_time),
-        _known(fit.joules.value, joules),
+        _or_unknown(fit.seconds, f"{1000 * fit.seconds:.{decimals}f}"),
+        _or_unknown(fit.in_time.value, in_time),
+        _or_unknown(fit.joules.value, joules),
         f"{fit.row.memory_gb.value:.2g}" if fit.row.memory_gb else "unknown",
     )
 
@@ -169,10 +169,10 @@ def check(
     lines = []
     for result in results:
         what, factor = scales[result.what]
-        measured = interval_of(result.measured, Unit(factor=factor))
-        stated = _known(result.stated, f"{result.stated * factor:.1f}")
+        measured = shown(result.measured, Unit(factor=factor))
+        profile_says = _or_unknown(result.stated, f"{result.stated * factor:.1f}")
         role, n = role_word(result.role), str(result.measured.n)
-        lines.append((role, what, measured, stated, n))
+        lines.append((role, what, measured, profile_says, n))
     table(["role", "what", "measured", f"{printable(device.name)} says", "n"], lines)
     echo_text(
         "medians of answers asked alone, with 95 % intervals over episodes; "
@@ -268,5 +268,5 @@ def _source(device: "Device", constant: "Constant") -> str:
     return constant.source
 
 
-def _known(value: float, text: str) -> str:
+def _or_unknown(value: float, text: str) -> str:
     return "unknown" if value != value else text

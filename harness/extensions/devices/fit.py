@@ -149,9 +149,9 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
 
 def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Comparison]:
     speed, role = profiles.speed(device, row), alone[0].role
-    stated = [profiles.seconds(speed, *tokens(answer)) for answer in alone]
+    seconds = [profiles.seconds(speed, *tokens(answer)) for answer in alone]
     measured = _median([(answer.seconds, answer) for answer in alone])
-    yield Comparison("seconds", role, measured, float(np.median(stated)))
+    yield Comparison("seconds", role, measured, float(np.median(seconds)))
     read, written = list[tuple[float, Answer]](), list[tuple[float, Answer]]()
     for answer in alone:
         if answer.first_token_s and answer.prompt_tokens:

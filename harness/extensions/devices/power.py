@@ -61,16 +61,16 @@ def measure(
         Unanswered: a request got no answer.
     """
     _ask(backend, requests[0])
-    begun = time.perf_counter()
+    start_s = time.perf_counter()
     with metered(meters) as idle:
         sleep(window_s)
-    idled_s = time.perf_counter() - begun
+    idled_s = time.perf_counter() - start_s
     seconds, answers = np.zeros(WINDOWS), np.zeros(WINDOWS, dtype=int)
     joules = {meter.name: np.zeros(WINDOWS) for meter in meters}
     for n in range(WINDOWS):
-        begun = time.perf_counter()
+        start_s = time.perf_counter()
         with metered(meters) as spent:
-            while (took := time.perf_counter() - begun) < window_s or not answers[n]:
+            while (took := time.perf_counter() - start_s) < window_s or not answers[n]:
                 _ask(backend, requests[answers.sum() % len(requests)])
                 answers[n] += 1
             seconds[n] = took
@@ -98,9 +98,9 @@ def measure_agent(
     """Load an agent's model on a device and `measure` it with scenes of the default dataset."""
     data = load.load(load.find(DATASET), 10)
     spec = Spec(agent, FrozenSource(data), (), (0,), settings=Settings(batch_size=1, device=device))
-    asked = list(requests(spec, data.scenes(data.forest.ids[:10])))
+    sample = list(requests(spec, data.scenes(data.forest.ids[:10])))
     backend = open_backend(agent.card, device=device, dtype=None, batch_size=1)
-    return measure(backend, asked, meters, window_s, progress)
+    return measure(backend, sample, meters, window_s, progress)
 
 
 def _ask(backend: Backend, request: Request) -> None:

@@ -68,8 +68,8 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if not 0 < len(self.model) <= MOST_LETTERS:
-            shown = printable(self.model, 40)
-            raise ValueError(f"model is {shown!r}; give 1 to {MOST_LETTERS} characters")
+            words = printable(self.model, 40)
+            raise ValueError(f"model is {words!r}; give 1 to {MOST_LETTERS} characters")
         try:
             sayable("model", self.model)
         except UserError as error:
@@ -197,8 +197,8 @@ def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | 
 def speed(device: Device, row: DeviceRow) -> Speed:
     """Return a row's tokens a second and joules a token as plain numbers."""
     answer_s = row.answer_ms.value / 1000 if row.answer_ms else None
-    known = {name: c.value if c else None for name, c in constants(device, row)}
-    return Speed(row.model, **known, answer_s=answer_s)
+    rates = {name: c.value if c else None for name, c in constants(device, row)}
+    return Speed(row.model, **rates, answer_s=answer_s)
 
 
 def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:

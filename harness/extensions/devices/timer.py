@@ -67,10 +67,10 @@ class Computer(Timer):
         return None
 
     def recorded(self, manifest: Manifest) -> "Computer | None":
-        if (stated := manifest.beside.get(PROFILE)) is None:
+        if (profile := manifest.beside.get(PROFILE)) is None:
             return None
         model = msgspec.convert(manifest.settings.extensions.get(MODEL, ""), str)
-        return Computer(msgspec.convert(stated, Device), model)
+        return Computer(msgspec.convert(profile, Device), model)
 
     def speed(self, stated_speed: Any) -> Speed:
         if isinstance(stated_speed, Speed):
@@ -277,8 +277,8 @@ def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
     run no model. `vehicles`, `(n, 1+H)`, has the joules of each vehicle's answer, the ego first.
     """
     count = min(infers.shape[1], vehicles.shape[1] - 1)
-    own = vehicles[:, 1 : 1 + count]
-    return np.asarray(np.sum(np.where(infers[:, :count], own, 0.0), axis=1))
+    joules = vehicles[:, 1 : 1 + count]
+    return np.asarray(np.sum(np.where(infers[:, :count], joules, 0.0), axis=1))
 
 
 def tokens(answer: Answer) -> tuple[float, float]:

@@ -64,8 +64,8 @@ def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> lo
     """
     manifest, variant = run.manifest, run.manifest.variant
     whole = manifest.as_file()
-    stated = nameless(whole)
-    asked = ("prompt", "helpers", "answer", "thinking", "seeds", "conditions")
+    record = nameless(whole)
+    arguments = ("prompt", "helpers", "answer", "thinking", "seeds", "conditions")
     samples = list(_samples(run, dataset, scenes))
     name = digest(whole)[:22]
     return log.EvalLog(
@@ -81,9 +81,9 @@ def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> lo
             dataset=log.EvalDataset(name=run.source, samples=len(samples)),
             model=f"{manifest.model['engine']}/{variant.model}",
             config=log.EvalConfig(),
-            task_args={key: stated[key] for key in asked},
+            task_args={key: record[key] for key in arguments},
             packages={"swarmdrive-harness": manifest.versions.get("harness", "unknown")},
-            metadata={key: stated[key] for key in ("command", "world", "latency", "identity")},
+            metadata={key: record[key] for key in ("command", "world", "latency", "identity")},
             viewer=ViewerConfig(trust_content=False),  # what a model writes may be anything
         ),
         results=log.EvalResults(
@@ -121,29 +121,29 @@ def _samples(
         ]
         facts = {"scene": name, "episode": int(episode[rows.start]), "step": int(step[rows.start])}
         for answer in answers.values():
-            asked: Sequence[Mapping[str, str]] = ()
+            prompt: Sequence[Mapping[str, str]] = ()
             if sent and dataset and name in scenes:
                 source = source_of(name, answer.heard)
-                said = {each.key: each for each in run.answers_by_scene.get(source, ())}
-                heard = messages_of(said, answer.heard, run.actions)
-                shown = as_asked(dataset.scenario, scenes[name], answer, scenes.get(source))
-                asked = sent(shown, answer.viewer, heard)
+                answers_by_key = {each.key: each for each in run.answers_by_scene.get(source, ())}
+                heard = messages_of(answers_by_key, answer.heard, run.actions)
+                scene = as_asked(dataset.scenario, scenes[name], answer, scenes.get(source))
+                prompt = sent(scene, answer.viewer, heard)
             yield _sample(
-                run, answer, asked, target, kept if answer.role in ("ego", "merge") else {}, facts
+                run, answer, prompt, target, kept if answer.role in ("ego", "merge") else {}, facts
             )
 
 
 def _sample(
     run: Run,
     answer: Answer,
-    asked: Sequence[Mapping[str, str]],
+    prompt: Sequence[Mapping[str, str]],
     target: list[str],
     kept: Mapping[str, Score],
     facts: Mapping[str, Any],
 ) -> log.EvalSample:
-    here = bool(asked) and digest(asked) == answer.prompt_sha256
+    here = bool(prompt) and digest(prompt) == answer.prompt_sha256
     chat = (
-        [SPOKEN[message["role"]](content=message["content"]) for message in asked] if here else []
+        [SPOKEN[message["role"]](content=message["content"]) for message in prompt] if here else []
     )
     reply = model.ChatMessageAssistant(content=answer.raw, source="generate")
     usage = None
@@ -189,12 +189,12 @@ def _kept(run: Run, condition: Any, regret: Any) -> dict[str, Score]:
     """
     scores = {}
     for n, name in enumerate(run.conditions):
-        known = regret[(condition == n) & ~np.isnan(regret)]
-        if len(known):
+        regrets = regret[(condition == n) & ~np.isnan(regret)]
+        if len(regrets):
             explanation = (
-                f"{int(known.sum())} of {len(known)} seeds decide so that success is given away"
+                f"{int(regrets.sum())} of {len(regrets)} seeds decide so that success is given away"
             )
-            scores[f"regret {name}"] = Score(value=float(known.mean()), explanation=explanation)
+            scores[f"regret {name}"] = Score(value=float(regrets.mean()), explanation=explanation)
     return scores
 
 

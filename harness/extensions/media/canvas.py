@@ -161,14 +161,14 @@ class Canvas:
         for viewer, ids in seen.items():
             colour = ROLES["ego" if viewer in still.turns else "helper"]
             self._over(sight(still.state, viewer, ids, colors=colour, linewidths=0.6, alpha=0.5))
-        known = {*still.turns, *chain.from_iterable(seen[agent] for agent in still.turns)}
+        seen_ids = {*still.turns, *chain.from_iterable(seen[agent] for agent in still.turns)}
         for vehicle in still.state.vehicles:
             look = "ego" if vehicle.id in still.turns else vehicle.part
             self._over(
                 body(
                     vehicle,
                     "danger" if vehicle.id == still.danger else look,
-                    vehicle.id not in known,
+                    vehicle.id not in seen_ids,
                 )
             )
         self._over(*_messages(self.played, still), *self._names(still, view, pt_per_m))
@@ -189,14 +189,14 @@ class Canvas:
         """Every vehicle's id and speed beside it, over nobody:
         where it was in the last still if it can.
         """
-        shown = [v for v in still.state.vehicles if view.holds(north_up(np.array([v.x_m, v.y_m])))]
+        inside = [v for v in still.state.vehicles if view.holds(north_up(np.array([v.x_m, v.y_m])))]
         decisions = {agent: turn.decision for agent, turn in still.turns.items()}
         attackers = {
             m.sender for decision in decisions.values() for m in decision.messages if m.attacker
         }
         taken = [_around(v) for v in still.state.vehicles]
         outlines, leaders = list[Outline](), list[Floats]()
-        for v in shown:
+        for v in inside:
             action = (
                 f" {decisions[v.id].action}" if v.id in decisions and len(decisions) > 1 else ""
             )
@@ -334,5 +334,5 @@ def _shares(turns: Sequence[Turn], actions: Sequence[str]) -> Iterator[Artist]:
             yield Rectangle(
                 (start, n - 0.4), p, 0.8, facecolor=colour, alpha=pale, edgecolor=INK, linewidth=0.3
             )
-        said = turn.outcome.split(" at ")[0] or turn.decision.action
-        yield Text(1.05, n, said, size=7, va="center", clip_on=False)
+        words = turn.outcome.split(" at ")[0] or turn.decision.action
+        yield Text(1.05, n, words, size=7, va="center", clip_on=False)

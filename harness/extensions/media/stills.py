@@ -83,16 +83,16 @@ def stills(
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)
     acting = actions_by_frame(played)
-    begun = [(due_frame(world, decision), decision) for decision in played.decisions]
-    due, ids = sorted({frame for frame, _ in begun}), [v.spawn.id for v in world.vehicles]
+    starts = [(due_frame(world, decision), decision) for decision in played.decisions]
+    due, ids = sorted({frame for frame, _ in starts}), [v.spawn.id for v in world.vehicles]
     # until an agent's own first decision is due, it counts as open
-    latest = {decision.agent or ids[0]: decision for _, decision in reversed(begun)}
+    latest = {decision.agent or ids[0]: decision for _, decision in reversed(starts)}
     seen = world.state()
     while True:
         if due and due[0] <= world.frame:
             now, seen = due.pop(0), world.state()
             latest |= {
-                decision.agent or ids[0]: decision for frame, decision in begun if frame == now
+                decision.agent or ids[0]: decision for frame, decision in starts if frame == now
             }
         turns = {ids[place]: _turn(world, place, latest[ids[place]], p) for place in world.journeys}
         progress(1)
@@ -112,7 +112,7 @@ def _turn(world: World, place: int, decision: Decision, p: Parameters) -> Turn:
     since_s = max(world.frame - due_frame(world, decision), 0) / p.simulation_hz
     ended = world.journeys[place].outcome
     is_open = world.frame < acting_frame(decision, p) and not ended.ended
-    return Turn(decision, since_s, is_open, _said(ended))
+    return Turn(decision, since_s, is_open, _words(ended))
 
 
 def _ending(world: World) -> str:
@@ -120,14 +120,14 @@ def _ending(world: World) -> str:
     if not world.ended:
         return ""
     if len(world.journeys) == 1:
-        return _said(world.outcome)
+        return _words(world.outcome)
     agent = gravest(world.journeys)
     if agent is None:
         return f"all cleared at {world.time_s:.1f} s"
-    return f"{world.vehicles[agent].spawn.id}: {_said(world.journeys[agent].outcome)}"
+    return f"{world.vehicles[agent].spawn.id}: {_words(world.journeys[agent].outcome)}"
 
 
-def _said(outcome: Outcome) -> str:
+def _words(outcome: Outcome) -> str:
     if not outcome.ended:
         return ""
     partner = f" with {outcome.partner}" if outcome.partner else ""

@@ -48,13 +48,13 @@ def write_video(played: ReplayedEpisode, out: Path, progress: Callable[[int], No
 
 def check(out: Path) -> None:
     """Raise UserError if no video can be written to this file, such as for its ending."""
-    shown = f"--out {printable(out)}"
+    option = f"--out {printable(out)}"
     if out.suffix not in (".gif", ".mp4"):
-        raise UserError(f"{shown}: end it in .gif or .mp4")
+        raise UserError(f"{option}: end it in .gif or .mp4")
     if out.suffix == ".mp4":
-        extras.need(f"{shown}: .mp4", "imageio_ffmpeg")
+        extras.need(f"{option}: .mp4", "imageio_ffmpeg")
     if out.is_dir():
-        raise UserError(f"{shown} is a folder; name a file in it")
+        raise UserError(f"{option} is a folder; name a file in it")
 
 
 def _gif(pictures: Iterable[Pixels], out: Path) -> None:
@@ -128,9 +128,9 @@ def _views(
     for still, seen in zip(listed, graphs, strict=True):
         now = still.since_s < period_s  # later, who was asked last and who was met is of the past
         decisions = [turn.decision for turn in still.turns.values()] if now else []
-        asked = [message.sender for decision in decisions for message in decision.messages]
+        senders = [message.sender for decision in decisions for message in decision.messages]
         graph = seen[still.state.ego.id] if now else None
-        held.append(spots(still.state, zone_m, graph, (still.danger, *still.turns, *asked)))
+        held.append(spots(still.state, zone_m, graph, (still.danger, *still.turns, *senders)))
     return views(
         held, [int(still.state.time_s / period_s + 1e-6) for still in listed], shape_of(scenario)
     )

@@ -164,8 +164,8 @@ class CalibratedWorld:
 
     def __call__(self, decision_points: Sequence[int]) -> Intents:
         """Return the intents of all vehicles at this step, in every episode."""
-        own = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
-        return replace(self._now.intents, own=own)
+        ego_intents = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
+        return replace(self._now.intents, own=ego_intents)
 
     def others(self, *_: Any, **__: Any) -> Any:
         """Raise NotImplementedError: all intents are drawn, so no model can be asked."""
@@ -271,10 +271,10 @@ class Calibrated:
         link = np.empty((n, helpers, 2))
         jitter, unsure = np.empty((n, helpers)), np.empty((n, helpers))
         for h in range(helpers):
-            own = noise.generator("calibrated", seed, first, h)
-            crossings = np.stack([stratified(own, kind), stratified(own, kind)], axis=1)
+            generator = noise.generator("calibrated", seed, first, h)
+            crossings = np.stack([stratified(generator, kind), stratified(generator, kind)], axis=1)
             link[:, h] = np.repeat(crossings, STEPS, axis=0)
-            jitter[:, h], unsure[:, h] = own.random((2, n))
+            jitter[:, h], unsure[:, h] = generator.random((2, n))
         witness = np.repeat(approach[:, None] == np.arange(helpers), STEPS, axis=0)
         nats = np.where(witness, p.witness_nats, spread(p.others_nats, p.others_sd_nats, unsure))
         guessed, knew = (np.repeat(top, STEPS) for top in (guess, know))

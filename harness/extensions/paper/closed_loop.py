@@ -71,12 +71,12 @@ def run_closed_loop(
     grids = panels()
     summary = _summary(done, grids)
     core, *sweeps = (summary[summary.panel == name] for name in grids)
-    shown = tables(summary)
+    main_tables = tables(summary)
     m, world = done.manifest, cast(ClosedLoop, done.manifest.world)
     return Study(
         "closed-loop",
         f"The paper's panels, driven: {m.variant} · {world.title}",
-        [f"{table.title}: {in_a_sentence(table)}." for table in shown],
+        [f"{table.title}: {in_a_sentence(table)}." for table in main_tables],
         [
             f"Every grid point was driven in closed loop on the layouts of {world.title}; n = "
             f"{crossed(world.episodes, len(m.seeds))} (channel seeds "
@@ -84,7 +84,7 @@ def run_closed_loop(
             "95 % intervals are over episodes. "
             "conditions.csv has all figures with their n, and run/ the driven episodes."
         ],
-        shown,
+        main_tables,
         {"conditions": summary},
         {"run": RUN, "panels": described(grids), "versions": m.versions},
         summary,

@@ -111,14 +111,14 @@ class Choices:
 
         return self.played(best)
 
-    def index(self, asked: Bools) -> Ints:
+    def index(self, mask: Bools) -> Ints:
         """Return the index in `sets` of each set of helpers, given as a mask `(..., H)`."""
         helpers = self.sets.shape[1]
         bits = 1 << np.arange(helpers)
         codes = self.sets @ bits
         order = np.argsort(codes)
-        padding = [(0, 0)] * (asked.ndim - 1) + [(0, helpers - asked.shape[-1])]
-        wanted = np.pad(asked, padding) @ bits
+        padding = [(0, 0)] * (mask.ndim - 1) + [(0, helpers - mask.shape[-1])]
+        wanted = np.pad(mask, padding) @ bits
         places: Ints = order[np.searchsorted(codes[order], wanted)]
         return places
 
@@ -127,14 +127,14 @@ class Choices:
 
         `worths` has what asking is worth at each level, if it is known, as `worths` returns it.
         """
-        known = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
+        lookup = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
         def choose(level: Level, ends: Floats, spent: Floats) -> Ints:
             intents = level.intents
-            worth = worth_of(point, intents, level.draws) if known is None else known[id(level)]
+            worth = worth_of(point, intents, level.draws) if lookup is None else lookup[id(level)]
             may_ask = intents.valid & (intents.range_m <= point.ask.radius_m)
-            asked = chosen(worth, point.ask.above, may_ask, intents.range_m, point.ask.max_helpers)
-            return self.index(asked).reshape(ends.shape[:2])
+            mask = chosen(worth, point.ask.above, may_ask, intents.range_m, point.ask.max_helpers)
+            return self.index(mask).reshape(ends.shape[:2])
 
         return choose
 
@@ -160,10 +160,10 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     Then the oracle is not exact: with a fusion call, a rule with memory, another content, or parts
     that change messages. `helpers` and `actions` are their numbers.
     """
-    shown, consensus = printable(point.name), point.fusion.consensus
+    name, consensus = printable(point.name), point.fusion.consensus
     if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
         raise UserError(
-            f"--condition {shown}: consensus {consensus} is no function of who is heard now, so "
+            f"--condition {name}: consensus {consensus} is no function of who is heard now, so "
             "that the oracle would be none; give linear, or another without memory"
         )
     changed = {
@@ -175,7 +175,7 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     }
     for setting in changed:
         if changed[setting]:
-            raise UserError(f"--condition {shown}: the oracle knows no {setting}; leave it out")
+            raise UserError(f"--condition {name}: the oracle knows no {setting}; leave it out")
 
 
 def choices(

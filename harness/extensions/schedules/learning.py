@@ -66,11 +66,11 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
     alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
     for level, ends, _, _ in tree.backwards(choose):
-        known = known_of(point, level.intents, level.draws)
+        facts = known_of(point, level.intents, level.draws)
         places = slice(0, len(level.at))  # what is known is the same under every seed
         gain = (ends[..., alone] - ends[..., :1]).mean(axis=0)
-        there = known.may_ask[places]
-        rows.append(inputs(known)[places][there])
+        there = facts.may_ask[places]
+        rows.append(inputs(facts)[places][there])
         targets.append(gain[:, : there.shape[1]][there])
     return np.concatenate(rows), np.concatenate(targets)
 
@@ -166,9 +166,9 @@ def tuned(
     return THRESHOLDS[int(np.flatnonzero(np.isclose(success, success.max()))[-1])]
 
 
-def text(stated: Stated) -> str:
+def text(schedule: Stated) -> str:
     """Return the text of a schedule's file: TOML, whose strings and lists are JSON's."""
-    fields = asdict(stated)
+    fields = asdict(schedule)
     network = fields.pop("network")
     lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
     lines += ["", "[network]"]

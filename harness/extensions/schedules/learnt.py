@@ -120,25 +120,25 @@ class Stated:
         return Learnt(Network(**arrays), self.threshold)
 
 
-def inputs(known: ScheduleInputs) -> Floats:
+def inputs(facts: ScheduleInputs) -> Floats:
     """Return the network's inputs for each helper, `(..., H, F)`, in the order of `INPUTS`.
 
     They are arbitrary for a helper that may not be asked.
     """
-    outlook, may_ask = known.outlook, known.may_ask
+    outlook, may_ask = facts.outlook, facts.may_ask
     assert outlook is not None
-    ranked = np.sort(known.own, axis=-1)
+    ranked = np.sort(facts.own, axis=-1)
     regions = max(outlook.unseen.shape[-1], 1)
-    range_m = np.where(may_ask, known.range_m, np.inf)
+    range_m = np.where(may_ask, facts.range_m, np.inf)
     nearer = (range_m[..., None, :] < range_m[..., :, None]).sum(axis=-1)
     ego_inputs = (
-        known.entropy_nats,
+        facts.entropy_nats,
         1.0 - ranked[..., -1] + ranked[..., -2:-1].sum(axis=-1),
-        known.own[..., 0],
-        known.own[..., -1],
+        facts.own[..., 0],
+        facts.own[..., -1],
         outlook.unseen.max(axis=-1, initial=0.0),
         outlook.unseen.sum(axis=-1) / regions,
-        known.distance_m[..., 0] / FAR_M,
+        facts.distance_m[..., 0] / FAR_M,
         np.minimum(outlook.to_zone_s, FAR_S) / FAR_S,
         may_ask.sum(axis=-1) - 1.0,
     )
@@ -154,8 +154,8 @@ def inputs(known: ScheduleInputs) -> Floats:
         unseen,
         outlook.added.max(axis=-1, initial=0.0),
         outlook.added.sum(axis=-1) / regions,
-        known.range_m / FAR_M,
-        known.distance_m[..., 1:] / FAR_M,
+        facts.range_m / FAR_M,
+        facts.distance_m[..., 1:] / FAR_M,
         ego_m,
         to_zone,
         nearer,

@@ -124,12 +124,12 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
     The thresholds are deciles of what asking is worth, the schedule's own, and 0.
     """
     most = range(1, point.ask.max_helpers + 1)
-    own = point.changed(schedule=schedule, threshold=None)
+    usual = point.changed(schedule=schedule, threshold=None)
     if schedule != PAPER and SCHEDULES[schedule].threshold is None:
         return [Candidate(schedule, None, m) for m in most]
-    best = [np.fmax.reduce(worth, axis=-1) for worth in choices.worths(own)]
+    best = [np.fmax.reduce(worth, axis=-1) for worth in choices.worths(usual)]
     tenths = np.nanquantile(np.concatenate(best), SHARES).tolist()
-    tried = {0.0, own.ask.above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
+    tried = {0.0, usual.ask.above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
     return [Candidate(schedule, threshold, m) for threshold in sorted(tried) for m in most]
 
 

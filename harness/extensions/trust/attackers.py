@@ -46,22 +46,22 @@ class Attackers:
             )
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
         first, past = self._remembered(truth, episodes)
-        present, said = np.isfinite(truth.range_m), truth
+        present, sent = np.isfinite(truth.range_m), truth
         attacking = np.zeros(truth.valid.shape, dtype=bool)
         for attack in self._attacks:
             drawn = _of_helpers(attackers(attack.share, present, uniforms[..., 0]), draws.trips)
             turn = Turn(truth, drawn, first, past, _of_helpers(uniforms[..., 1], draws.trips))
-            said = _acted(attack, said, turn)
+            sent = _acted(attack, sent, turn)
             attacking |= drawn
         for intents, place in zip(truth.helpers, episodes, strict=True):
             intended = self._intended.setdefault(place, [])
             intended.append(intents)
             # keep the first step and those that an attack looks at
             del intended[1 : -self._steps or None]
-        if said.voice_of is None:
-            return SentIntents(said, draws, attacking)
-        voices = np.take_along_axis(attacking, said.voice_of, axis=-1)
-        return SentIntents(said, draws.of_helpers(said.voice_of), voices)
+        if sent.voice_of is None:
+            return SentIntents(sent, draws, attacking)
+        voices = np.take_along_axis(attacking, sent.voice_of, axis=-1)
+        return SentIntents(sent, draws.of_helpers(sent.voice_of), voices)
 
     def _remembered(
         self, truth: Intents, episodes: Sequence[tuple[int, int]]
@@ -80,7 +80,7 @@ class Attackers:
         return first, past
 
 
-def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
+def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:
     """Let an attack act. A package's cannot write to what it gets,
     and says only what a message can hold.
 
@@ -89,38 +89,38 @@ def _acted(attack: Attack, said: Intents, turn: Turn) -> Intents:
     """
     kind = type(attack)
     if is_ours(attack):
-        return attack.act(said, turn)
+        return attack.act(sent, turn)
     with worded(f"attack {kind.__name__} of {printable(kind.__module__)}"):
-        after = attack.act(read_only(said), read_only(turn))
+        after = attack.act(read_only(sent), read_only(turn))
         if after.voice_of is None:
-            after = replace(after, site=said.site, outlook=said.outlook, plans=said.plans)
-            _refuse_of_others(said, after, turn.attackers)
+            after = replace(after, site=sent.site, outlook=sent.outlook, plans=sent.plans)
+            _refuse_of_others(sent, after, turn.attackers)
         else:
             check_shape("voices", after.voice_of, after.helpers.shape[:2])
-            if np.any((after.voice_of < 0) | (after.voice_of >= said.helpers.shape[1])):
+            if np.any((after.voice_of < 0) | (after.voice_of >= sent.helpers.shape[1])):
                 raise ValueError("a voice of nobody who is there")
-            if said.voice_of is None:
-                after = _with_honest_voices(said, after, turn.attackers)
+            if sent.voice_of is None:
+                after = _with_honest_voices(sent, after, turn.attackers)
         check_distributions("intents", after.helpers, after.valid)
-        if not np.array_equal(after.own, said.own, equal_nan=True):
+        if not np.array_equal(after.own, sent.own, equal_nan=True):
             raise ValueError("it changes the ego's own intent")
     return after
 
 
-def _with_honest_voices(said: Intents, after: Intents, attackers: Bools) -> Intents:
+def _with_honest_voices(sent: Intents, after: Intents, attackers: Bools) -> Intents:
     """Return the voices that an attack added to, where those of honest helpers are as they were.
 
     Raises ValueError if it changes, leaves out or doubles one.
     """
     voice_of = after.voice_of
     assert voice_of is not None
-    before = replace(said.of_helpers(voice_of), voice_of=voice_of)
+    before = replace(sent.of_helpers(voice_of), voice_of=voice_of)
     after = replace(after, site=before.site, outlook=before.outlook, plans=before.plans)
     present = np.isfinite(after.range_m)
     honest = present & ~np.take_along_axis(attackers, voice_of, axis=1)
     _refuse_of_others(before, after, ~honest)
     for owners, is_honest, attack, range_m in zip(
-        voice_of, honest, attackers, said.range_m, strict=True
+        voice_of, honest, attackers, sent.range_m, strict=True
     ):
         expected = np.flatnonzero(~attack & np.isfinite(range_m))
         if not np.array_equal(np.sort(owners[is_honest]), expected):
@@ -128,12 +128,12 @@ def _with_honest_voices(said: Intents, after: Intents, attackers: Bools) -> Inte
     return after
 
 
-def _refuse_of_others(said: Intents, after: Intents, attackers: Bools) -> None:
+def _refuse_of_others(sent: Intents, after: Intents, attackers: Bools) -> None:
     """Raise ValueError if an attack changes what is the ego's,
     or a helper's that is no attacker.
     """
     nobody = np.zeros(attackers.shape, dtype=bool)
-    before, now = ({"silent": nobody, **each.arrays(), **_claimed(each)} for each in (said, after))
+    before, now = ({"silent": nobody, **each.arrays(), **_claimed(each)} for each in (sent, after))
     if changed := sorted(before.keys() ^ now.keys()):
         raise ValueError(f"it adds or leaves out {', '.join(changed)}")
     for name, values in now.items():
@@ -180,10 +180,10 @@ def _of_helpers(values: Any, trips: Trips) -> Any:
     agent, helper = trips.layout_seed[:, None] // OF_ANOTHER_AGENT, np.arange(values.shape[1])
     if not agent.any():
         return values
-    theirs = np.take_along_axis(
+    of_helpers = np.take_along_axis(
         values, np.where((helper < agent) & (helper > 0), helper - 1, helper), axis=1
     )
-    return np.where((agent > 0) & (helper == 0), 0, theirs).astype(values.dtype)
+    return np.where((agent > 0) & (helper == 0), 0, of_helpers).astype(values.dtype)
 
 
 # The draws of one helper follow those of another, so more helpers in a batch change no earlier

@@ -291,8 +291,8 @@ class Silent(Attack):
     by_scene: ClassVar[bool] = True
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
-        own, helpers = np.nan_to_num(turn.truth.own), np.nan_to_num(turn.truth.helpers)
-        differs = np.argmax(helpers, axis=-1) != np.argmax(own, axis=-1)[:, None]
+        ego, helpers = np.nan_to_num(turn.truth.own), np.nan_to_num(turn.truth.helpers)
+        differs = np.argmax(helpers, axis=-1) != np.argmax(ego, axis=-1)[:, None]
         return replace(sent, silent=turn.attackers & differs)
 
 
@@ -457,12 +457,12 @@ def in_question(text: str, words: bool, objects: bool) -> str:
     named = sorted(
         (part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds
     )
-    shown = []
+    parts = []
     for name, *settings in named:
         if (words and ATTACKS[name].in_text) or (objects and ATTACKS[name].in_objects):
             others = [setting for setting in settings if not setting.startswith("share=")]
-            shown.append(":".join([name, *others]))
-    return "&".join(shown)
+            parts.append(":".join([name, *others]))
+    return "&".join(parts)
 
 
 def _attack(text: str) -> Attack:

@@ -77,5 +77,5 @@ def _intent(attack: Attack, intent: Sequence[float]) -> list[float]:
         np.zeros((1, 2)),
     )
     turn = Turn(one_helper, attacks, p, np.empty((1, 0, 1, actions)), np.zeros((1, 1)))
-    said: list[float] = attack.act(one_helper, turn).helpers[0, 0].tolist()
-    return said
+    distribution: list[float] = attack.act(one_helper, turn).helpers[0, 0].tolist()
+    return distribution

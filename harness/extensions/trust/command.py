@@ -95,8 +95,8 @@ def command(
             out = out or Path("reports") / name
             cache = default_file()
             run = read_or_evaluate(spec, out / "run", progress, cache, open_backend).path
-        own = options.cards([model] if model else None)
-        replayed = ReplayedRun(run, progress=progress, asks=not no_model, models=own)
+        cards = options.cards([model] if model else None)
+        replayed = ReplayedRun(run, progress=progress, asks=not no_model, models=cards)
         draws = parse_seeds(seeds) if seeds else replayed.seeds
         where = out or run / "trust"
         with work.going_on(where):

@@ -122,17 +122,17 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
     return point.changed(name=name, consensus=consensus, attack=text, **more)
 
 
-def names_of(option: str, text: str, known: Sequence[str]) -> tuple[str, ...]:
+def names_of(option: str, text: str, allowed: Sequence[str]) -> tuple[str, ...]:
     """Return the names in a list such as `liar,brake`; none for `all`.
 
-    Raises UserError for a name that is not among the `known`.
+    Raises UserError for a name that is not among the `allowed`.
     """
     if text == "all":
         return ()
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
     for part in (part for name in names for part in name.split("+")):
-        if part.partition(":")[0] not in known:
-            raise unknown(option, part.partition(":")[0], ("all", *known))
+        if part.partition(":")[0] not in allowed:
+            raise unknown(option, part.partition(":")[0], ("all", *allowed))
         if "share=" in part:
             raise UserError(f"{option} {printable(part)}: give shares with --share")
     return names
@@ -573,11 +573,11 @@ def _detections(bench: Bench) -> Iterator[Table]:
         rows = []
         for cell in bench.cells.values():
             if cell.rule == rule and cell.flagged is not None:
-                found = [interval_of(estimate) for estimate in cell.detection().values()]
+                shares = [shown(estimate) for estimate in cell.detection().values()]
                 time = f"{cell.time_to_detection:.0f}" if cell.caught else "–"
                 caught = f"{len(cell.caught)} of {len(cell.first)}"
                 attack = cell.attack or "nobody attacks"
-                rows.append((attack, f"{cell.share:.2f}", *found, time, caught))
+                rows.append((attack, f"{cell.share:.2f}", *shares, time, caught))
         if rows:
             yield Table(
                 f"How well {rule} finds attackers",
@@ -615,5 +615,5 @@ def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:
         p = bench.holm.get(key) if name == bench.success_rule.metric else None
         yield {**place, "metric": name, **ends(e), "p_holm_against_linear": p}
     if cell.flagged is not None:
-        found = {"value": cell.time_to_detection, "n": len(cell.caught)}
-        yield {**place, "metric": "messages_to_detection", **found}
+        detection = {"value": cell.time_to_detection, "n": len(cell.caught)}
+        yield {**place, "metric": "messages_to_detection", **detection}

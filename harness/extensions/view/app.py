@@ -163,7 +163,7 @@ class View:
             written = None
         links = [pages.to_notes(run.name, scene)]
         if written and scene is None:
-            return await run_in_threadpool(_shown, written, links)
+            return await run_in_threadpool(_page, written, links)
         return await self._drawn(
             request, partial(pages.report, self._whole([run]), written, scene), links
         )
@@ -284,7 +284,7 @@ class View:
     def _study(self, run: Listed) -> Response:
         page = own_file(self.folder, run.name, "index.html")
         if page:
-            return _shown(page)
+            return _page(page)
         return HTMLResponse(pages.study(run, pictures(self.folder, run.name)))
 
     async def _drawn(
@@ -307,7 +307,7 @@ class View:
             return _with_way_back(await asyncio.wrap_future(drawn), links)
 
 
-def _shown(page: Path, links: Sequence[tuple[str, str]] = ()) -> Response:
+def _page(page: Path, links: Sequence[tuple[str, str]] = ()) -> Response:
     return _with_way_back(pages.whole_text(page), links)
 
 

@@ -141,11 +141,12 @@ def _parts(done: Run | SuiteRun) -> Mapping[str, Run]:
 
 def _row(run: Listed, done: Run | SuiteRun) -> tuple[str, ...]:
     best, _ = words.compared(done)
-    lead = lead_of(done)
+    headline = lead_of(done)
     n = sum(len(part.grid.episodes) for part in _parts(done).values())
     figures = (
-        words.cell(done.score(best, metric)) for metric in (lead, GAINS[lead], "unsafe_rate")
+        words.cell(done.score(best, metric))
+        for metric in (headline, GAINS[headline], "unsafe_rate")
     )
     agents = run.model or "–", run.prompt or "–", done.source, run.kind
     where = linked(run.name, quote(f"{run.name}/{PAGE}"))
-    return where, *figures, str(n), f"{best}, {IN_WORDS[lead]}", *agents, f"{run.date:%Y-%m-%d}"
+    return where, *figures, str(n), f"{best}, {IN_WORDS[headline]}", *agents, f"{run.date:%Y-%m-%d}"

@@ -80,13 +80,13 @@ def history(
     if not lines:
         raise UserError(f"no finished runs in {printable(folder)}; `harness eval` makes one")
     runs = [line.run for of in lines.values() for line in of]
-    for what, name, known in (
+    for what, name, names in (
         ("metric", metric, {score.metric for run in runs for score in run.scores}),
         ("condition", condition, {name for run in runs for name in run.conditions}),
         ("dataset", dataset, {_scenes(run) for run in runs}),
     ):
-        if name is not None and name not in known:
-            raise unknown(f"{what} of these runs", name, known)
+        if name is not None and name not in names:
+            raise unknown(f"{what} of these runs", name, names)
     groups = [
         _group(of, metric, condition)
         for of in lines.values()

@@ -110,22 +110,22 @@ def listed(folder: Path, words: str, order: str) -> str:
     every = runs(folder)
     how_far = extents(folder, every)
     order = order if order.removeprefix("-") in COLUMNS else NEWEST
-    shown = sort([run for run in every if _has(run, words)], order)
-    asked = {"q": words} if words else {}
-    links = {column: urlencode({"sort": _next(column, order), **asked}) for column in COLUMNS}
-    going = any(run.name in how_far and how_far[run.name].going for run in shown)
+    listed_runs = sort([run for run in every if _has(run, words)], order)
+    query = {"q": words} if words else {}
+    links = {column: urlencode({"sort": _next(column, order), **query}) for column in COLUMNS}
+    is_going = any(run.name in how_far and how_far[run.name].going for run in listed_runs)
     return _page(
         "list.html.j2",
         folder=str(folder),
         every=len(every),
-        runs=shown,
+        runs=listed_runs,
         words=words,
         order=order,
         links=links,
         kinds=RUNS,
         unread=UNREAD,
         now=now(every, how_far),
-        going=going,
+        going=is_going,
         script=Markup(script()),
     )
 
@@ -166,9 +166,9 @@ def progress(run: Listed, extent: Extent) -> str:
 def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
     """Return listed runs sorted by a column; those without a value are last."""
     column = attrgetter(order.removeprefix("-"))
-    known = [run for run in runs if column(run) is not None]
+    with_value = [run for run in runs if column(run) is not None]
     unknown = [run for run in runs if column(run) is None]
-    return [*sorted(known, key=column, reverse=order.startswith("-")), *unknown]
+    return [*sorted(with_value, key=column, reverse=order.startswith("-")), *unknown]
 
 
 def study(run: Listed, pictures: Sequence[str]) -> str:

@@ -89,7 +89,7 @@ def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
 
     Raises UserError if the prompt's files are wrong.
     """
-    first, own = chosen(base), systems(base)
+    first, system_texts = chosen(base), systems(base)
     files = dict(first.prompt.files)
     for role, text in texts.items():
         files[f"{role}.j2"] = SYSTEM.sub(
@@ -97,7 +97,7 @@ def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
             files[f"{role}.j2"],
             count=1,
         )
-    new = {role: text for role, text in texts.items() if text != own[role]}
+    new = {role: text for role, text in texts.items() if text != system_texts[role]}
     if not new:
         return first
     what = (

@@ -101,7 +101,7 @@ def command(
     base = _base(settings, scenarios, budget)
     settings = structs.replace(settings, prompt=base.version)
     sizes = {} if reflect else choices(base)
-    own = given(tune, [manifest for manifest, _ in manifests]) if tune else []
+    given_layouts = given(tune, [manifest for manifest, _ in manifests]) if tune else []
     in_range("--layouts", layouts, 2, FIRST["train"])
     only_for("tune", "--first-seed", str(first_seed), first_seed, layouts)
     silent, who = as_json or quiet, options.workers_of(workers)
@@ -111,7 +111,7 @@ def command(
             TemporaryDirectory() as place,
             bar("freezing a few tune layouts", quiet=silent) as progress,
         ):
-            few = own or built(
+            few = given_layouts or built(
                 scenarios, Path(place), min(SAMPLE, layouts), first_seed, who, progress
             )
             specs = [resolve.spec(settings, source) for source in few]
@@ -119,7 +119,9 @@ def command(
                 min(manifest.episodes, settings.world.limit or manifest.episodes)  # type: ignore[union-attr]
                 for manifest, _ in manifests
             ]
-            asks = counted(specs, sizes, budget, 0 if own else layouts, episodes, tokenizer)
+            asks = counted(
+                specs, sizes, budget, 0 if given_layouts else layouts, episodes, tokenizer
+            )
         if as_json:
             echo_json(asks)
         elif not quiet:
@@ -133,19 +135,19 @@ def command(
             "budget": budget,
             "engine": engine_name,
             "prompt_sha256": base.sha256,
-            "tune": [source.dataset.sha256 for source in own] or [layouts, first_seed],
+            "tune": [source.dataset.sha256 for source in given_layouts] or [layouts, first_seed],
             "report": [sha256 for _, sha256 in manifests],
             "evaluation": settings_as_file(to_builtins(settings)),
         }
     )
-    if begun := work.start_of(where, work.WorkStart):
-        work.same(where, begins.settings, begun.settings)
+    if start := work.start_of(where, work.WorkStart):
+        work.same(where, begins.settings, start.settings)
     cache, label = None if no_cache else default_file(), f"asking {printable(settings.model, 30)}"
     with (
-        work.working(where, begun or begins) as place,
+        work.working(where, start or begins) as place,
         bar(label, quiet=silent, grows=True) as progress,
     ):
-        sources = own or built(scenarios, place, layouts, first_seed, who, progress)
+        sources = given_layouts or built(scenarios, place, layouts, first_seed, who, progress)
         specs = [resolve.spec(settings, source) for source in sources]
         plan = Search(
             base,

@@ -77,17 +77,17 @@ class Reflecting:
 
     def __init__(
         self,
-        asked: Callable[[str], str],
+        rewriter: Callable[[str], str],
         kept: Path,
         settings: Mapping[str, Any],
         roles: Sequence[str],
     ):
-        """Set up the search; `asked` sends a text to the rewriting model and returns its reply.
+        """Set up the search; `rewriter` sends a text to the rewriting model and returns its reply.
 
         `kept` is the file of the replies so far to a search of these `settings`; `roles` are those
         whose messages are rewritten.
         """
-        self._asked, self._roles = asked, roles
+        self._asked, self._roles = rewriter, roles
         self._cells = Cells(kept, sha256_bytes(canonical_json(settings).encode()))
         self.replies = 0
 
@@ -95,10 +95,10 @@ class Reflecting:
         gepa: Any = import_module("gepa")
         adapter = _Adapter(tuning)
         layouts = list(range(len(tuning.layouts)))
-        own = systems(tuning.base)
+        system_texts = systems(tuning.base)
         with strangers("gepa"):
             gepa.optimize(
-                {role: own[role] for role in self._roles if role in own},
+                {role: system_texts[role] for role in self._roles if role in system_texts},
                 trainset=layouts,
                 valset=layouts,
                 adapter=adapter,
@@ -130,7 +130,7 @@ def asked_of(backend: Backend) -> Callable[[str], str]:
     The function raises Unanswered if the model gives none.
     """
 
-    def asked(prompt: str) -> str:
+    def reply(prompt: str) -> str:
         request = Request(
             "reflect",
             "ego",
@@ -143,7 +143,7 @@ def asked_of(backend: Backend) -> Callable[[str], str]:
             raise Unanswered(f"--reflect: {printable(completion.error, 300)}")
         return completion.text
 
-    return asked
+    return reply
 
 
 class _Silent:

@@ -34,12 +34,12 @@ def of_decision(decision: Decision) -> str:
     lost is the best action's worth less its own.
     """
     actions = decision.dataset.actions
-    stated = ", ".join(
+    policy = ", ".join(
         f"{a} {_share(p)}" for a, p in zip(actions, decision.policy.tolist(), strict=True)
     )
     return " ".join(
         [
-            f"It stated {stated}, and did {actions[decision.action]}.",
+            f"It stated {policy}, and did {actions[decision.action]}.",
             _worths(decision),
             *_unseen(decision),
         ]
@@ -86,10 +86,10 @@ def _unseen(decision: Decision) -> list[str]:
 
 
 def _meets(conflict: Conflict) -> str:
-    ours, theirs = conflict.ego.time_s, conflict.other.time_s
-    if ours is None or theirs is None:
+    ego_s, other_s = conflict.ego.time_s, conflict.other.time_s
+    if ego_s is None or other_s is None:
         return f"from {conflict.sector}"
-    gap_s = theirs - ours
+    gap_s = other_s - ego_s
     return (
         f"from {conflict.sector}, {abs(gap_s):.1f} s {'later' if gap_s > 0 else 'earlier'} than "
         "the ego"

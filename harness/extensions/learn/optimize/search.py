@@ -351,7 +351,7 @@ def _mean(tuning: Tuning, record: Record) -> float:
 def _row(tuning: Tuning, record: Record) -> dict[str, Any]:
     """Return what is known of a candidate, a row of the table of wordings."""
     layouts = np.array(sorted(record.played), dtype=int)
-    known = len(layouts) > 0
+    is_played = len(layouts) > 0
     worth = [record.played[n].worth for n in layouts.tolist()]
     return {
         "wording": record.candidate.what,
@@ -359,8 +359,8 @@ def _row(tuning: Tuning, record: Record) -> dict[str, Any]:
         "layouts": len(layouts),
         "questions": len(record.asked),
         "characters": record.length,
-        "success": round(_mean(tuning, record), 6) if known else None,
-        "worth": round(float(tuning.weights(layouts) @ worth), 6) if known else None,
+        "success": round(_mean(tuning, record), 6) if is_played else None,
+        "worth": round(float(tuning.weights(layouts) @ worth), 6) if is_played else None,
     }
 
 

@@ -227,8 +227,8 @@ class Tuning:
                     heard = compress(helpers, part.result.on_time[row].tolist())
                     answers = [asker.answers.get(f"{scene.id}/{helper}") for helper in heard]
                     messages = tuple(answer for answer in answers if answer)
-                    own = asker.answers.get(f"{scene.id}/{ego}")
-                    action, text = int(part.result.action[row]), own.raw if own else ""
+                    reply = asker.answers.get(f"{scene.id}/{ego}")
+                    action, text = int(part.result.action[row]), reply.raw if reply else ""
                     decision = Decision(dataset, scene, policy, action, messages, text)
                     courses[scene.record.episode].append(decision)
         played = {}

@@ -86,8 +86,8 @@ def intent(
     if answer == "readout":
         letter = readout.spelt(text)[:1]
         letters = readout.letters(actions)
-        known = letter and letter in letters and not readout.spelt(text)[1:2].isalnum()
-        return tuple(float(each == letter) for each in letters) if known else None
+        is_letter = letter and letter in letters and not readout.spelt(text)[1:2].isalnum()
+        return tuple(float(each == letter) for each in letters) if is_letter else None
     return parse(
         text,
         role=role,
@@ -111,7 +111,7 @@ def driven(p: Sequence[float], values: Sequence[float]) -> float:
     return float(np.mean(np.array(values)[likeliest]))
 
 
-def stated(p: Sequence[float], values: Sequence[float]) -> float:
+def expected_success(p: Sequence[float], values: Sequence[float]) -> float:
     """Return the mean of `values` (A,), each action's probability of success, under `p` (A,).
 
     Unlike `driven`, it tells apart distributions with the same likeliest action.
@@ -173,7 +173,7 @@ def expected_advantage(
     between answers with the same likeliest action, so that few samples teach more; but an answer
     that is unsure and right earns less than one that is sure. Arguments: as of `advantage`.
     """
-    return _rewards(stated, completions, values, constant, columns)
+    return _rewards(expected_success, completions, values, constant, columns)
 
 
 def _rewards(

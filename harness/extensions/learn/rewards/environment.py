@@ -199,10 +199,10 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         if self._text:
             return tuple(self.ask.chat(graph)), info
         read = [number for _, number in numbers(graph, self.source.scenario.road())]
-        known = np.array([number is not None for number in read], np.int8)
+        is_known = np.array([number is not None for number in read], np.int8)
         return {
             "numbers": np.array([number or 0.0 for number in read], np.float32),
-            "known": known,
+            "known": is_known,
         }, info
 
     def _trees(self, what: str) -> Trees:

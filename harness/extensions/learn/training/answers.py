@@ -64,8 +64,8 @@ def sights(view: SceneGraph) -> str:
 
 
 def _gap_s(conflict: Conflict) -> float | None:
-    ours, theirs = conflict.ego.time_s, conflict.other.time_s
-    return None if ours is None or theirs is None else theirs - ours
+    ego_s, other_s = conflict.ego.time_s, conflict.other.time_s
+    return None if ego_s is None or other_s is None else other_s - ego_s
 
 
 def message(
@@ -77,15 +77,15 @@ def message(
     `confidence`. `actions` has the names of the A actions, the most careful first; `named` is as in
     `evidence`.
     """
-    stated = rounded(intent.tolist(), PARTS)
+    parts = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
-    braking = stated[0]  # the most careful action comes first
+    braking = parts[0]  # the most careful action comes first
     return {
         "evidence": evidence(view, named),
         "risk": "high" if braking > HIGH else "medium" if braking > MEDIUM else "low",
-        "intent": tuple(stated),
+        "intent": tuple(parts),
         "recommended_maneuver": actions[best],
-        "confidence": stated[best],
+        "confidence": parts[best],
     }
 
 

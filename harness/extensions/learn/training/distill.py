@@ -99,9 +99,9 @@ def distill(
         )
     learnt = curriculum.settings()  # once: the base's file may change while this learns from it
     settings = {**learnt, **plan.settings()}
-    if begun := work.start_of(out, work.WorkStart):
-        work.same(out, settings, begun.settings)
-    with work.working(out, begun or work.WorkStart(settings=settings)) as place:
+    if start := work.start_of(out, work.WorkStart):
+        work.same(out, settings, start.settings)
+    with work.working(out, start or work.WorkStart(settings=settings)) as place:
         layouts, seed, folder = curriculum.layouts, curriculum.seed, place / "lessons"
         lessons = [
             draw(scenario, prompts, layouts, seed, folder / scenario.name, workers, drawing)

@@ -131,12 +131,12 @@ def take_over(model: Any, base: Path) -> None:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    file, own = base / WEIGHTS, model.state_dict()
+    file, state = base / WEIGHTS, model.state_dict()
     within = "model.language_model." if hasattr(model.config, "vision_config") else "model."
     try:
         weights = load_file(file)
         for name, values in weights.items():
-            place = own[name.replace("model.", within, 1)]
+            place = state[name.replace("model.", within, 1)]
             if place.shape[1:] != values.shape[1:] or len(place) < len(values):
                 raise ValueError(f"{name} is {tuple(values.shape)}, and {tuple(place.shape)} here")
             place[: len(values)] = values

@@ -86,8 +86,8 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     no action succeeds is left out. `folder` has the dataset; None finds the one that the run
     states. Raises UserError if the dataset or the prompt is not here as it was.
     """
-    for asked, completion, _ in _answered(run, folder):
-        yield {"prompt": asked.pop("prompt"), "completion": _said(completion), **asked}
+    for row, completion, _ in _answered(run, folder):
+        yield {"prompt": row.pop("prompt"), "completion": _reply(completion), **row}
 
 
 def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator[dict[str, Any]]:
@@ -98,25 +98,25 @@ def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator
     success is possible; one that cannot be parsed is worth 0, and of a read-out the likeliest
     letter counts. A question without an answer is left out.
     """
-    for asked, completion, stored in _answered(run, folder):
-        values, p, raw = asked["values"], stored.intent, stored.raw
-        letters = readout.letters(asked["actions"])
+    for row, completion, stored in _answered(run, folder):
+        values, p, raw = row["values"], stored.intent, stored.raw
+        letters = readout.letters(row["actions"])
         if p is not None and completion in letters:
             best = int(np.argmax(p))
             raw, p = letters[best], tuple(np.eye(len(p))[best].tolist())
         worth = 0.0 if p is None else float(np.dot(p, values))
-        least = float(np.dot(asked["probabilities"], values)) - margin
+        least = float(np.dot(row["probabilities"], values)) - margin
         if stored.error is None and raw.strip() and worth <= least + ROUNDING:
             yield {
-                "prompt": asked.pop("prompt"),
-                "chosen": _said(completion),
-                "rejected": _said(raw),
-                **asked,
+                "prompt": row.pop("prompt"),
+                "chosen": _reply(completion),
+                "rejected": _reply(raw),
+                **row,
                 "value_rejected": worth,
             }
 
 
-def _said(text: str) -> list[dict[str, str]]:
+def _reply(text: str) -> list[dict[str, str]]:
     return [{"role": "assistant", "content": text}]
 
 
@@ -182,7 +182,7 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
                 completion = readout.letters(q.actions)[int(q.label.argmax())]
             seed = int(scene.record.episode_seed)
             safe = forest.safe[forest.place[scene.id]]
-            asked = {
+            row = {
                 "prompt": sent,
                 "scene": scene.id,
                 "viewer": stored.key,
@@ -192,4 +192,4 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
                 "probabilities": q.label.tolist(),
                 "values": safe.astype(float).tolist(),
             }
-            yield asked, completion, stored
+            yield row, completion, stored

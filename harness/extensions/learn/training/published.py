@@ -79,8 +79,8 @@ class Published:
         kind = "\n".join(message["content"] for message in messages[:-1])
         if kind not in self._heads:
             other = ({**message, "content": "?"} for message in messages[-1:])
-            asked = self.encode(self.chat.render((*messages[:-1], *other), thinking=False))
-            self._heads[kind] = ids[: common_length([ids, asked])]
+            other_ids = self.encode(self.chat.render((*messages[:-1], *other), thinking=False))
+            self._heads[kind] = ids[: common_length([ids, other_ids])]
         shared = common_length([ids, self._heads[kind]])
         return np.array(ids, dtype=np.int32), shared, f"{shared} {kind}"
 

@@ -53,8 +53,8 @@ class Question:
     @property
     def read_out(self) -> tuple[Mapping[str, str], ...]:
         """Return the prompt's chat messages, asking for one letter (read-out)."""
-        shown, words = self.excerpt or self.graph, self.scenario.prompt_words
-        messages = self.prompt.render(shown, self.actions, self.heard, words, letter=True)
+        graph, words = self.excerpt or self.graph, self.scenario.prompt_words
+        messages = self.prompt.render(graph, self.actions, self.heard, words, letter=True)
         return in_mode("readout", self.prompt, messages, self.graph, self.actions, words)
 
 
@@ -73,9 +73,9 @@ def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
     """
     for q in questions:
         if q.graph.conflicts or q.image:
-            shown = structs.replace(q.graph, nodes=(), sectors=())
-            messages = q.prompt.render(shown, q.actions, words=q.scenario.prompt_words)
-            yield replace(q, messages=messages, excerpt=shown, heard=())
+            conflicts = structs.replace(q.graph, nodes=(), sectors=())
+            messages = q.prompt.render(conflicts, q.actions, words=q.scenario.prompt_words)
+            yield replace(q, messages=messages, excerpt=conflicts, heard=())
 
 
 def with_messages(
@@ -93,8 +93,8 @@ def with_messages(
             heard = []
             for h, u in zip(helpers, draws, strict=True):
                 if u < ARRIVES:
-                    asked = question(lessons, scene, h, prompt)
-                    sent = message(scene.graphs[h], intents[asked.key], asked.actions, asked.named)
+                    q = question(lessons, scene, h, prompt)
+                    sent = message(scene.graphs[h], intents[q.key], q.actions, q.named)
                     heard.append({"sender": h, **sent})
             if heard:
                 yield question(lessons, scene, ego, prompt, heard)

@@ -122,7 +122,7 @@ class Student:
         return samples
 
     @cached_property
-    def asked(self) -> list[Sample]:
+    def one_letter_samples(self) -> list[Sample]:
         """Return a sample with a one-letter answer for each question without helpers' messages."""
         return self.reading(self.questions)
 
@@ -141,7 +141,7 @@ class Student:
             for scene, prompt in product(scenes, lessons.prompts):
                 helpers |= {key(lessons, scene, helper, prompt) for helper in scene.viewers[1:]}
         names, samples = [], []
-        for question, sample in zip(self.questions, self.asked, strict=True):
+        for question, sample in zip(self.questions, self.one_letter_samples, strict=True):
             if question.key in helpers:
                 names.append(question.key)
                 samples.append(sample)
@@ -170,14 +170,14 @@ class Student:
         if stage == "excerpts":
             return self.reading(list(excerpts(self.questions)), seen=True)
         if stage == "alone":
-            return self.asked
+            return self.one_letter_samples
         heard = self.heard if self.plan.samples["messages"] else []
         with_heard = self.reading(heard)
         if stage == "messages":
-            return with_heard + self.some(self.asked, len(heard))
+            return with_heard + self.some(self.one_letter_samples, len(heard))
         # As many texts of the ego, alone and with messages, as of all helpers: each decision needs
         # the ego's.
-        pairs = list(zip(self.questions, self.asked, strict=True))
+        pairs = list(zip(self.questions, self.one_letter_samples, strict=True))
         of_helpers = [pair for pair in pairs if pair[0].graph.role == "helper"]
         of_egos = [pair for pair in pairs if pair[0].graph.role == "ego"]
         of_heard = list(zip(heard, with_heard, strict=True))
@@ -187,7 +187,7 @@ class Student:
             drawn += self.some(kind, most)
         intents = self.read([sample for _, sample in drawn])
         texts = self.writing([question for question, _ in drawn], intents)
-        return texts + self.some(self.asked + with_heard, int(REHEARSED * len(texts)))
+        return texts + self.some(self.one_letter_samples + with_heard, int(REHEARSED * len(texts)))
 
     def some(self, items: Sequence[T], most: int) -> list[T]:
         """Return at most `most` random items, in their order; the plan's seed draws them."""
@@ -204,7 +204,7 @@ class Student:
             state = torch.load(done, weights_only=True, map_location=self.model.device)
             restore(self.model, state["model"])
             return [tuple(point) for point in state["curve"]]
-        going = self.work / f"{name}.going.pt"
+        checkpoint = self.work / f"{name}.going.pt"
         count, show = self.plan.samples[name], partial(progress, name)
         if not count:
             return []
@@ -216,11 +216,11 @@ class Student:
             count,
             self.plan,
             show,
-            going,
+            checkpoint,
             self._watched if self.published or self.plan.objective != "imitation" else tuple,
         )
         save({"model": learnt(self.model), "curve": curve}, done)
-        going.unlink(missing_ok=True)
+        checkpoint.unlink(missing_ok=True)
         return curve
 
     @cached_property
@@ -300,9 +300,9 @@ class Student:
         system, rest = chat(messages)
         if system not in self._shared:
             self._shared[system] = self._encode(system)
-        head, asked = self._shared[system], self._encode(rest)
-        ids = np.concatenate([head, asked, self._encode(reply + END)])
-        answer_at = len(head) + len(asked)
+        head, rest_ids = self._shared[system], self._encode(rest)
+        ids = np.concatenate([head, rest_ids, self._encode(reply + END)])
+        answer_at = len(head) + len(rest_ids)
         return Sample(ids, len(head), system, answer_at, target, question.weight, question.image)
 
     def _encode(self, text: str) -> Any:

@@ -101,13 +101,13 @@ def run_stage(
     count: int,
     plan: Plan,
     progress: Callable[..., None],
-    going: Path,
+    checkpoint: Path,
     watch: Callable[[], Sequence[float]] = tuple,
 ) -> Curve:
     """Train on `count` sequences drawn from `samples`, and return the loss curve.
 
     `letters` and `digits` are the ids of the tokens that state an action and an image token's
-    class. `going` is the checkpoint file of this stage, from which a killed call resumes. Every 50
+    class. `checkpoint` is the file of this stage, from which a killed call resumes. Every 50
     steps the curve gets the sequences seen, the mean loss since then, and what `watch` returns;
     `progress` is called with them.
     """
@@ -116,9 +116,9 @@ def run_stage(
     batches = _batches(samples, count, plan)
     start, curve = 0, []
     losses: list[Any] = []
-    if going.is_file():
+    if checkpoint.is_file():
         # where AdamW counts its steps
-        state = torch.load(going, weights_only=True, map_location="cpu")
+        state = torch.load(checkpoint, weights_only=True, map_location="cpu")
         restore(model, state["model"])
         for opt, kept in zip(opts, state["opts"], strict=True):
             opt.load_state_dict(kept)
@@ -157,7 +157,7 @@ def run_stage(
                     "curve": curve,
                     "losses": losses,
                 },
-                going,
+                checkpoint,
             )
             kept_s = time.monotonic()
     return curve
@@ -329,12 +329,12 @@ def _cells_loss(logits: Any, pictures: Sequence[Sight]) -> Any:
     """Return the cross-entropy of what each picture's tokens show;
     vehicles and nobody weigh alike.
     """
-    shown = np.concatenate([cells(picture) for picture in pictures])
-    target = torch.from_numpy(shown).to(logits.device)
+    classes = np.concatenate([cells(picture) for picture in pictures])
+    target = torch.from_numpy(classes).to(logits.device)
     weight = torch.full(
-        (logits.shape[1],), 1.0 / max(1, int((shown > 0).sum())), device=logits.device
+        (logits.shape[1],), 1.0 / max(1, int((classes > 0).sum())), device=logits.device
     )
-    weight[0] = 1.0 / max(1, int((shown == 0).sum()))
+    weight[0] = 1.0 / max(1, int((classes == 0).sum()))
     return F.cross_entropy(logits, target, weight=weight, reduction="sum") / 2
 
 
@@ -357,10 +357,12 @@ def read_out(
         weight = of_letters[: len(target)]
         for start in range(0, len(same), batch):
             some = same[start : start + batch]
-            asked = [replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some]
-            last = torch.tensor([len(s.ids) - s.shared - 1 for s in asked], device=device)
+            prompts = [
+                replace(samples[i], ids=samples[i].ids[: samples[i].answer_at]) for i in some
+            ]
+            last = torch.tensor([len(s.ids) - s.shared - 1 for s in prompts], device=device)
             with torch.no_grad():
-                hidden = hidden_states(model, asked)
+                hidden = hidden_states(model, prompts)
                 logits = hidden[torch.arange(len(some), device=device), last] @ weight.T
             p.update(zip(some, torch.softmax(logits.double(), -1).cpu().numpy(), strict=True))
     return [p[i] for i in range(len(samples))]

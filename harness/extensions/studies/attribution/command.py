@@ -41,8 +41,8 @@ def command(
     in_range("--sample", sample, 1, MOST)
     in_range("--sample-seed", sample_seed, 0, LAST_SEED)
     with bar("asking without", quiet=as_json or quiet, grows=True) as progress:
-        own = options.cards(model)
-        stored = ReplayedRun(run, progress=progress, dataset=dataset, models=own)
+        cards = options.cards(model)
+        stored = ReplayedRun(run, progress=progress, dataset=dataset, models=cards)
         chosen = condition or (USUAL if USUAL in stored.points else stored.run.conditions[-1])
         attribution = attribute(stored, chosen, sample, sample_seed)
     file, study = write(attribution, run), attribution_study(attribution, stored)

@@ -132,10 +132,10 @@ def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
 
     This is done for every viewer of these scenes whose prompt lists the object.
     """
-    asked = [each for scene in scenes for each in _questions(stored, scene)]
+    questions = [each for scene in scenes for each in _questions(stored, scene)]
     whole = requests(stored.spec, scenes)
-    answers = stored.answered([*whole, *(request for *_, request in asked)])
-    for scene, viewer, item, request in asked:
+    answers = stored.answered([*whole, *(request for *_, request in questions)])
+    for scene, viewer, item, request in questions:
         p = answers[f"{scene.id}/{viewer}"].intent
         if p and answers[request.id].error is None:
             yield _left_out(
@@ -296,14 +296,14 @@ def _what(row: Row) -> str:
 
 def headline(table: Sequence[Row]) -> str:
     """Return a sentence on which kind of object or message moved answers most, if that is clear."""
-    known = [row for row in table if row.shift.n]
-    if not known:
+    rows = [row for row in table if row.shift.n]
+    if not rows:
         return (
             "Nothing was left out: no prompt of the sample lists an object, and no message was in "
             "time."
         )
-    most = max(known, key=lambda row: row.shift.value)
-    close = [row for row in known if row is not most and not row.shift.high < most.shift.low]
+    most = max(rows, key=lambda row: row.shift.value)
+    close = [row for row in rows if row is not most and not row.shift.high < most.shift.low]
     if close:
         return (
             f"What moves answers most is not clear: {figure(most.shift, SHIFT)} of the probability "

@@ -56,16 +56,16 @@ def command(
     settings = changed(
         settings, {"prompt": settings.prompt or frozen.scenario.prompt, "ask": "all"}
     )
-    theirs = _of_helpers(settings)
-    modes = {*_names("--answer", settings.answer), *_names("--helper-answer", theirs.answer)}
+    of_helpers = _of_helpers(settings)
+    modes = {*_names("--answer", settings.answer), *_names("--helper-answer", of_helpers.answer)}
     by_ego = _combinations(settings, "--", modes)
     egos = [resolve.agents(each, frozen.scenario)[0] for each in by_ego]
     with resolve.helper_options(
-        {"--answer": settings.helpers.answer, "--thinking": theirs.thinking}
+        {"--answer": settings.helpers.answer, "--thinking": of_helpers.thinking}
     ):
         helpers = [
             resolve.agents(each, frozen.scenario)[0]
-            for each in _combinations(theirs, "--helper-", modes)
+            for each in _combinations(of_helpers, "--helper-", modes)
         ]
     if not 1 < (cells := len(egos) * len(helpers)) <= MOST_CELLS:
         raise UserError(f"{cells} combinations: give 2 to {MOST_CELLS}, such as --model a,b")
@@ -87,14 +87,14 @@ def command(
 
 def _of_helpers(settings: Settings) -> Settings:
     """Return settings whose model, prompt and modes are those of the helpers."""
-    own = settings.helpers
+    helpers = settings.helpers
     given = {
-        "model": own.model,
-        "prompt": own.prompt,
-        "answer": own.answer,
-        "thinking": own.thinking,
+        "model": helpers.model,
+        "prompt": helpers.prompt,
+        "answer": helpers.answer,
+        "thinking": helpers.thinking,
     }
-    engine = {"engine": None} if own.model else {}
+    engine = {"engine": None} if helpers.model else {}
     return changed(
         settings, {name: value for name, value in given.items() if value is not None} | engine
     )

@@ -43,14 +43,14 @@ class Questions:
 
     def __post_init__(self) -> None:
         ego = self.spec.ego
-        shown = f"--model {printable(ego.card.name)}"
+        option = f"--model {printable(ego.card.name)}"
         if not ego.can.closed_loop:
             raise UserError(
-                f"{shown}: a replay has no answers to twins; give the model that it replays"
+                f"{option}: a replay has no answers to twins; give the model that it replays"
             )
         if ego.card.privileged:
             raise UserError(
-                f"{shown} reads the truth, which no twin changes; give local-view or a model"
+                f"{option} reads the truth, which no twin changes; give local-view or a model"
             )
         if not any(lack(self.spec, TWINS[name]) is None for name in self.twins):
             raise UserError(f"--twin: none applies here: {self.lacks(self.twins)}")
@@ -159,10 +159,10 @@ def ask(
     [identity] = spread(
         _identity, [questions.spec], workers, lambda done: None, lambda spec: name, False
     )
-    begun = questions.begin(identity)
+    start = questions.begin(identity)
     if left := work.start_of(out, work.WorkStart):
-        work.same(out, begun.settings, left.settings)
-    with work.working(out, begun, RESULT) as place:
+        work.same(out, start.settings, left.settings)
+    with work.working(out, start, RESULT) as place:
         points = [
             (number, questions.dataset.scenes(ids), read_kept(_answers_file(place, number)))
             for number, ids in questions.points().items()
@@ -170,8 +170,8 @@ def ask(
         by_episode: dict[int, list[Pair]] = {}
         tally = Tally()
 
-        def keep(at: int, asked: tuple[list[Pair], list[Answer]]) -> None:
-            by_episode[at], answers = asked
+        def keep(at: int, answers_of_episode: tuple[list[Pair], list[Answer]]) -> None:
+            by_episode[at], answers = answers_of_episode
             tally.add(answers)
             answered = [answer for answer in answers if answer.error is None]
             write_whole(_answers_file(place, points[at][0]), lines(answered))
@@ -179,8 +179,8 @@ def ask(
 
         # These are files of one machine.
         files = (cache, place) if isinstance(workers, int) else (None, None)
-        asked = partial(_asked, questions, *files)
-        each(asked, points, workers, keep, lambda point: f"episode {point[0]}", repeatable=False)
+        job = partial(_ask_episode, questions, *files)
+        each(job, points, workers, keep, lambda point: f"episode {point[0]}", repeatable=False)
         if tally.missing:
             raise Unanswered(str(tally))
         pairs = [pair for at in range(len(points)) for pair in by_episode[at]]
@@ -199,7 +199,7 @@ def _answers_file(place: Path, episode: int) -> Path:
     return place / f"answers-{episode:06d}.jsonl"
 
 
-def _asked(
+def _ask_episode(
     questions: Questions,
     cache: Path | None,
     place: Path | None,
@@ -222,20 +222,20 @@ def _asked(
     if any(twin.senders for twin in twins):
         first = [request for of_scene in of_scenes.values() for request in of_scene]
     asker.ask(first)
-    asked = list[Asked]()
+    questions_and_copies = list[Asked]()
     for scene in scenes:
         for twin in twins:
             if twin.senders:
-                asked += _fusion(spec, twin, scene, asker.answers)
+                questions_and_copies += _fusion(spec, twin, scene, asker.answers)
             else:
-                asked += _twins(spec, twin, scene, of_scenes[scene.id])
+                questions_and_copies += _twins(spec, twin, scene, of_scenes[scene.id])
     answered = {request.id for request in first}
     then: dict[str, Request] = {}
-    for *_, question, copy in asked:
+    for *_, question, copy in questions_and_copies:
         then |= {each.id: each for each in (question, copy) if each.id not in answered}
     asker.ask(list(then.values()))
     pairs = []
-    for twin_of_question in asked:
+    for twin_of_question in questions_and_copies:
         *_, question, copy = twin_of_question
         errors = (asker.answers[question.id].error, asker.answers[copy.id].error)
         if errors == (None, None):
@@ -288,8 +288,8 @@ def _differ(a: Request, b: Request) -> bool:
     return (a.messages, a.actions) != (b.messages, b.actions) or a.image_sha256 != b.image_sha256
 
 
-def _pair(spec: Spec, asked: Asked, episode: int, answers: Mapping[str, Answer]) -> Pair:
-    twin, role, *both = asked
+def _pair(spec: Spec, twin_of_question: Asked, episode: int, answers: Mapping[str, Answer]) -> Pair:
+    twin, role, *both = twin_of_question
     a, b = (answers[request.id] for request in both)
     p, q = a.intent, None
     if b.intent:

@@ -110,14 +110,14 @@ def headline(table: Sequence[Row]) -> str:
     if not least.broken:
         return f"All {len(table)} pairs of twin and role hold in every question."
     rate = least.invariance_rate
-    shown = f"{100 * rate.value:.1f} % [{100 * rate.low:.1f}, {100 * rate.high:.1f}], n = {rate.n}"
+    share = f"{100 * rate.value:.1f} % [{100 * rate.low:.1f}, {100 * rate.high:.1f}], n = {rate.n}"
     text = f"{whole} of {len(table)} pairs of twin and role hold in every question."
     close = [row for row in table if row is not least and not row.invariance_rate.low > rate.high]
     if not close:
-        return f"{text} Least often holds {least.twin.name}, {least.role}: {shown}."
+        return f"{text} Least often holds {least.twin.name}, {least.role}: {share}."
     names = [f"{row.twin.name}, {row.role}" for row in (least, *close)]
     return (
-        f"{text} No pair clearly holds least often: it is {shown}, and the intervals of these "
+        f"{text} No pair clearly holds least often: it is {share}, and the intervals of these "
         f"overlap: {some_of([f'({name})' for name in names])}."
     )
 
@@ -128,10 +128,10 @@ def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
     Raises:
         UserError: the named twin has no row, or the number that is tested is unknown.
     """
-    shown = f"--fail-if {printable(gate.text)!r}"
+    option = f"--fail-if {printable(gate.text)!r}"
     judged = [row for row in table if gate.condition in (None, row.twin.name)]
     if not judged:
-        raise unknown(f"twin of {shown}", gate.condition or "", {row.twin.name for row in table})
+        raise unknown(f"twin of {option}", gate.condition or "", {row.twin.name for row in table})
     failed = []
     for row in judged:
         value, where = (
@@ -140,7 +140,7 @@ def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
         )
         if np.isnan(value):
             # A gate that passes because nothing is known would guard nothing.
-            raise UserError(f"{shown}: {where} has no such number; ask about more episodes")
+            raise UserError(f"{option}: {where} has no such number; ask about more episodes")
         if OPERATORS[gate.op](round(value, 9), gate.number):
             failed.append((where, value))
     return Verdict(gate.text, tuple(failed))

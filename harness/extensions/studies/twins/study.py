@@ -251,5 +251,5 @@ def difference(a: str, b: str) -> Iterator[tuple[str, Markup]]:
 
 
 def _word(words: Sequence[str], kind: str) -> Markup:
-    shown = escape(visible(" ".join(words)))
-    return shown if kind == "equal" else Markup("<mark>{}</mark>").format(shown)
+    text = escape(visible(" ".join(words)))
+    return text if kind == "equal" else Markup("<mark>{}</mark>").format(text)
