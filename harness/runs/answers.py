@@ -19,7 +19,7 @@ MARKS = f"{ASKED}{REWRITTEN}/+"  # in keys, beside who answered
 class Answered:
     """Hold a run's number of answers by role, parse failures by role and status, and ego's intents.
 
-    `ego` has the parsed distributions over A actions, (n, A).
+    `ego` has the n distributions over A actions, (n, A), that could be read from the ego's answers.
     """
 
     count: Counter[str]  # how many answers there are, by role

@@ -122,7 +122,10 @@ def _scores(run: Run) -> Iterator[Score]:
 
 
 def current(run: Run) -> bool:
-    """Return whether a run's manifest states that its figures have this harness's version."""
+    """Return whether a run's figures were computed by this harness's version of the rules.
+
+    The run's manifest states the version; one that states none is of version 1.
+    """
     return run.manifest.versions.get("figures", "1") == str(FIGURES)
 
 
@@ -239,7 +242,11 @@ def _of_episodes(run: Run) -> Iterator[str]:
 def differing(
     stated_rows: Sequence[Episode], computed_rows: Sequence[Episode]
 ) -> Iterator[tuple[str, int]]:
-    """Yield the columns in which two tables of the same episodes differ, and in how many rows."""
+    """Yield each column in which two tables of episodes differ, and in how many rows it does.
+
+    Both tables have the same episodes in the same order. Numbers may differ by rounding, as `close`
+    allows.
+    """
     for name in Episode.__struct_fields__:
         pairs = zip(stated_rows, computed_rows, strict=True)
         wrong = sum(not close(getattr(a, name), getattr(b, name)) for a, b in pairs)

@@ -133,12 +133,18 @@ def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
 
 
 def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
-    """Return values (n, A) as columns by name: one for each action, such as `fused_IDLE`."""
+    """Return values (n, A) of n decisions and A actions as columns (n,) by name.
+
+    There is a column for each action, such as `fused_IDLE`.
+    """
     return {f"{name}_{action}": values[:, place] for place, action in enumerate(actions)}
 
 
 def by_message(name: str, values: Any) -> dict[str, Any]:
-    """Return values (n, H) as columns by name: one for each message, such as `delivered_1`."""
+    """Return values (n, H) of n decisions and H messages as columns (n,) by name.
+
+    There is a column for each message, such as `delivered_1`.
+    """
     return {f"{name}_{place + 1}": values[:, place] for place in range(values.shape[1])}
 
 
@@ -152,8 +158,11 @@ class Labels:
 
 @dataclass(frozen=True)
 class Decisions:
-    """Hold decisions as the columns (n,) of an Arrow table: one row for each decision point,
+    """Hold n decisions as the columns (n,) of an Arrow table: one row for each decision point,
     condition and seed.
+
+    `actions` are the names of the meta-actions, `helpers` the greatest number of messages in a
+    decision.
     """
 
     table: pa.Table  # the columns of `schema`
@@ -164,7 +173,11 @@ class Decisions:
 
     @classmethod
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
-        """Build decisions from arrays and `Labels` (n,) by column; missing columns are unknown."""
+        """Build decisions from arrays and `Labels` (n,) by column; missing columns are unknown.
+
+        `actions` are the names of the meta-actions, `helpers` the greatest number of messages in a
+        decision.
+        """
         n = len(columns["seed"])
         fields = schema(actions, helpers)
         arrays = {
@@ -200,7 +213,9 @@ class Decisions:
         return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
-        """Return the columns of a value that each action has, such as `fused` or `safe`, (n, A)."""
+        """Return the columns of a value that each of A actions has, such as `fused` or `safe`, (n,
+        A).
+        """
         key = f"{name} of actions"
         if key not in self._arrays:
             columns = [self[f"{name}_{action}"] for action in self.actions]
@@ -208,7 +223,7 @@ class Decisions:
         return self._arrays[key]
 
     def of_messages(self, name: str) -> Floats:
-        """Return the columns of a value that each message has, such as `on_time`, (n, H).
+        """Return the columns of a value that each of H messages has, such as `on_time`, (n, H).
 
         NaN where no helper was asked.
         """
@@ -327,7 +342,7 @@ class Decisions:
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str], most: int | None = None) -> "Decisions":
-        """Read decisions from a Parquet file.
+        """Read decisions from a Parquet file; `actions` names its meta-actions, in order.
 
         Raises OSError or ValueError if it is none, lacks a column, or has more than `most` rows or
         more bytes than its rows can need: a file of a few bytes may hold a thousand million rows.

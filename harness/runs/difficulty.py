@@ -63,8 +63,9 @@ class Pool:
     ) -> Estimate | None:
         """Return the difference in success a - b, both (S, E), adjusted; None if impossible.
 
-        It is paired by episode and adjusted for layout difficulty. The axes are S channel seeds and
-        E episodes.
+        It is paired by episode and adjusted for layout difficulty. `success` says how episodes are
+        averaged, `level` is the confidence of the interval. The axes are S channel seeds and E
+        episodes.
         """
 
         def plain(part: Bools) -> Estimate:
@@ -75,7 +76,7 @@ class Pool:
     def estimate(self, success: Success, values: Floats) -> Estimate | None:
         """Return the mean success of values (S, E), adjusted for difficulty; None if impossible.
 
-        The axes are S channel seeds and E episodes.
+        `success` says how episodes are averaged. The axes are S channel seeds and E episodes.
         """
 
         def plain(part: Bools) -> Estimate:

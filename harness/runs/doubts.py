@@ -20,10 +20,11 @@ Channel = tuple[Mapping[str, Any], Mapping[str, Sequence[float]]]  # its paramet
 def doubted(
     conditions: Conditions, channels: Mapping[str, Channel], off_lag: Mapping[str, float | None]
 ) -> set[str]:
-    """Return the conditions with a warning: controls, another decision lag, unvalidated radios.
+    """Return the names of the conditions with a warning: controls, another lag, unvalidated radios.
 
-    `channels` holds parameters and validated limits by profile, `off_lag` by condition the share of
-    decisions that take longer or shorter than the dataset's decision lag.
+    A control replaces what helpers say. The lag is the time from a decision to its action.
+    `channels` holds parameters and validated limits by channel profile, `off_lag` by condition the
+    share of decisions that take longer or shorter than the dataset's lag.
     """
     names = {name for control in control_settings().values() for name in under(conditions, control)}
     return names | {*lagging(off_lag)} | {name for name, _ in beyond(conditions, channels)}
@@ -39,8 +40,9 @@ def under(conditions: Conditions, control: str) -> list[str]:
 
 
 def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
-    """Return the conditions half or more of whose decisions miss the dataset's decision lag.
+    """Return the conditions half or more of whose decisions miss the dataset's lag.
 
+    The lag is the time from a decision to its action, for which the dataset knows what follows.
     `off_lag` is by condition the share of decisions that would act in another frame.
     """
     return [name for name, share in off_lag.items() if (share or 0.0) >= MOST_OFF_LAG]

@@ -18,7 +18,8 @@ from harness.runs.folder import Run
 class Option:
     """Describe a further command-line option of an export format.
 
-    Formats that share an option hold the same object.
+    `refusal` is called with the typed value and the option that names the file; it returns why the
+    value is refused there, or None. Formats that share an option hold the same object.
     """
 
     kind: type  # what is typed: `bool` for a switch, or `float`
@@ -29,7 +30,11 @@ class Option:
 
 @runtime_checkable
 class Export(Protocol):
-    """Describe an export format that an extension adds: a run as a file of another program."""
+    """Describe an export format that an extension adds: a run as a file of another program.
+
+    `help` is the help of its command-line option, `doing` what is said while it writes, and `needs`
+    the optional modules without which it cannot write.
+    """
 
     help: str  # of the option
     doing: str  # what is said while it writes

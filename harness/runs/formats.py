@@ -43,7 +43,10 @@ TYPED = ("model", "helpers.model", "world.dataset", "world.scenario")
 
 
 class Added(NamedTuple):
-    """Describe a setting or column that was added to a format, and its value in older runs."""
+    """Describe a setting or column that was added to a format.
+
+    `since` is the day that added it, `absent` its value in an older run, and `why` says why.
+    """
 
     since: str  # the day that added it
     absent: Any  # its value in a run without it
@@ -226,9 +229,10 @@ def upgraded(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def gathered(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table of settings with those of extensions in a table of theirs,
-    where a file has some beside those of the core; without the latter's nulls.
+    """Return a table of settings as this version holds it: those of extensions in a table
+    `extensions`.
 
+    In files some of them stand beside the settings of the core; of these, null ones are left out.
     Raises UserError for one of an extension that is not installed.
     """
     beside = extensions.beside()
@@ -255,8 +259,10 @@ def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_file(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of run.json: settings of extensions stand behind those of the core, where
-    their extension says so, and what they opened stands beside the table of settings.
+    """Return the content of run.json, of the manifest's plain values by name.
+
+    Settings of extensions stand behind those of the core, where their extension says so; what they
+    opened stands beside the table of settings, and not in a table `beside`.
     """
     table: dict[str, Any] = {}
     for name, value in manifest.items():
@@ -267,7 +273,10 @@ def as_file(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def settings_as_file(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table of settings as `as_file` has it."""
+    """Return a table of settings in the form of run.json, as `as_file` writes it.
+
+    There, settings of extensions stand behind those of the core, where their extension says so.
+    """
     of_extensions, beside = settings[EXTENSIONS], extensions.beside()
     table: dict[str, Any] = {}
     for name, value in settings.items():

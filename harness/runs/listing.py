@@ -31,7 +31,12 @@ _BROKEN = (*BROKEN, AttributeError, csv.Error)  # in what no type was given to
 
 @dataclass(frozen=True)
 class Listed:
-    """Describe one run or study in a list."""
+    """Describe one run or study in a list.
+
+    `state` says whether it is finished, and `why` what to do if it is not. `success`, from 0 to 1,
+    is that of `condition`, the best one, with the 95 % interval from `low` to `high`. None where it
+    is unknown, or a study has no such thing.
+    """
 
     name: str  # its folder, relative to the folder that is listed
     # `eval`, `drive`, `suite`, a word of `STUDIES`, or `run` if it is broken and does not say

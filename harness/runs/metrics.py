@@ -77,8 +77,9 @@ class Metric:
     """Define one metric, with values of 0 or more, by its name, meaning, unit and function.
 
     The function is one of `decisions`, `episodes`, `answers` and `pooled`, by what it takes; a
-    metric without any is computed where `summary.csv` is made. `halves` names the two metrics that
-    it is the mean of, with and without a danger.
+    metric without any is computed where `summary.csv` is made. `better` says which change is
+    better, and `most` is the greatest value. `halves` names the two metrics that it is the mean of,
+    with and without a danger.
     """
 
     name: str  # its name in tables, with the unit at the end
@@ -1082,7 +1083,10 @@ def least_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:
-    """Return the mean of a metric's values (S, E) with an interval over channel seeds."""
+    """Return the mean of a metric's values (S, E) with a 95 % interval over channel seeds.
+
+    The axes are S channel seeds and E episodes.
+    """
     if entry(name).interval == "rate":
         return in_range(name, seed_rate_interval(values))
     return in_range(name, seed_interval(known_mean(values, axis=1)))
@@ -1116,9 +1120,9 @@ def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float =
 def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False) -> Estimate:
     """Return a metric's estimate: for balanced success the mean of those of its two halves.
 
-    `estimate` gives that of a metric by name. Halves have no episode in common, so that their
-    intervals are independent. `shared` says that they share units, such as seeds: n is then that of
-    each half, else the sum.
+    A half is the episodes with a danger, or those without. `estimate` returns the estimate of the
+    metric with a name. Halves have no episode in common, so that their intervals are independent.
+    `shared` says that they share units, such as seeds: n is then that of each half, else the sum.
     """
     halves = entry(name).halves
     if not halves:
@@ -1132,9 +1136,9 @@ def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False)
 
 
 def by_danger(success: Floats, dangerous: Bools) -> dict[str, Floats]:
-    """Return success (..., E) with a danger and without, by metric; NaN in other episodes.
+    """Return success (..., E) with a danger and without, by metric name; NaN in other episodes.
 
-    `dangerous` is a mask (E,).
+    `dangerous` is a mask (E,) of the E episodes with a danger.
     """
     parts = (np.where(part, success, np.nan) for part in (dangerous, ~dangerous))
     return dict(zip(entry(BALANCED).halves, parts, strict=True))
@@ -1155,7 +1159,11 @@ def known_in(values: Mapping[str, Floats]) -> list[str]:
 
 
 def p_value(name: str, pairs: Sequence[tuple[Floats, Floats]]) -> float | None:
-    """Return the p-value of no difference, by the interval of `difference`; None without one."""
+    """Return the p-value of no difference in a metric; None if the difference has no interval.
+
+    `pairs` has the values of both sides, (E, S) each, as `difference` takes them: E episodes by S
+    channel seeds.
+    """
     return multiplicity.p_value(lambda level: difference(name, pairs, level))
 
 

@@ -53,7 +53,11 @@ def asked_key(viewer: str, question: str) -> str:
 
 
 class FirstTurn(Struct, frozen=True, kw_only=True):
-    """Hold the failed answer before a repair turn, with its parse status, tokens and seconds."""
+    """Hold the failed answer before a repair turn, with its parse status, tokens and seconds.
+
+    The numbers of tokens are None if the engine has no tokenizer, and `seconds` if it was not timed
+    alone.
+    """
 
     raw: str
     status: str
@@ -67,7 +71,10 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
 class Answer(Struct, frozen=True, kw_only=True):
     """Hold one answer of a model, a line of `answers.jsonl`.
 
-    Tokens and times include those of a repair turn, a second question after a failed answer.
+    `viewer` is the vehicle that answered in the decision point `scene`, `raw` its text, and
+    `intent` the probability of each action, None if the text could not be parsed. Tokens and
+    seconds include those of a repair turn, a second question after a failed answer; they are None
+    where unknown.
     """
 
     scene: str  # id of the decision point
@@ -162,7 +169,7 @@ class Answer(Struct, frozen=True, kw_only=True):
 
 
 class AnswerFacts(Struct, frozen=True):
-    """Hold the fields of `Answer` that a run's figures are computed from.
+    """Hold the fields of `Answer` that a run's figures are computed from, with the same meaning.
 
     Without the texts, all answers of a run fit into memory.
     """
@@ -192,7 +199,12 @@ class AnswerFacts(Struct, frozen=True):
 
 
 class Times(Struct, frozen=True, omit_defaults=True):
-    """Hold how long answers took that were asked one at a time: number and percentiles, s."""
+    """Hold how long n answers took that were asked one at a time: percentiles, s.
+
+    The 95 % intervals of the median and of the 95th percentile are over episodes, None if these
+    cannot bound them. `first_token` and `token` are None if the engine does not report times of
+    tokens.
+    """
 
     n: int  # number of answers
     median_s: float  # the median
@@ -208,7 +220,9 @@ class Times(Struct, frozen=True, omit_defaults=True):
 class Latency(Struct, frozen=True, omit_defaults=True):
     """Hold the seconds of inference by role, fixed before a run, or token rates to compute them.
 
-    They decide which messages arrive within the decision window.
+    They decide which messages arrive within the decision window. `source` says where they come
+    from. Where a timer times each answer by itself, the seconds are None and `speeds` has each
+    agent's speed, the ego's first.
     """
 
     # one of `SOURCES`, or what times each answer by itself, of `timers.TIMERS`
@@ -264,7 +278,11 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 
 
 class Message(Struct, frozen=True, rename={"sender": "from"}):
-    """Hold a helper's reply to the ego: whether and when it arrived, and its weight in fusion."""
+    """Hold a helper's reply to the ego: whether and when it arrived, and its weight in fusion.
+
+    `arrival_ms` counts from the start of the decision, None if the reply was lost. `weight` is None
+    if a fusion call made the decision, `trust` (0 to 1) if the consensus rule rates none.
+    """
 
     sender: str  # the helper
     delivered: bool  # whether it arrived
@@ -312,7 +330,12 @@ class Decision(Struct, frozen=True, kw_only=True):
 
 
 class Episode(Struct, frozen=True, kw_only=True):
-    """Hold the outcome of one layout under one condition and seed, a line of `episodes.csv`."""
+    """Hold the outcome of one layout under one condition and seed, a line of `episodes.csv`.
+
+    `outcome` says how it ended, `failure` how it failed, and `time_s` when that was decided. A
+    field is None where its kind of run does not know it; such as what only frozen or closed-loop
+    runs have.
+    """
 
     condition: str  # name of the operating point
     seed: int  # seed of the channel's draws
@@ -384,7 +407,12 @@ class Variant(Struct, frozen=True):
 
 
 class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
-    """Hold the estimate of a metric in a condition, a line of `summary.csv`."""
+    """Hold the estimate of a metric in a condition, a line of `summary.csv`.
+
+    `low` and `high` are the ends of the 95 % interval, None if the data cannot bound it; `value` is
+    None if nothing could be averaged. `n` counts the units that `interval` names, such as episodes,
+    and `n_excluded` those without a value.
+    """
 
     condition: str  # name of the operating point, or `all` for what is the same in all
     metric: str  # name of the metric, its unit at the end
@@ -419,7 +447,8 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 class Looks(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Hold when a run with sequential stopping was inspected, and its stopping rule.
 
-    The rule is a width of intervals, or another run from which success is to differ.
+    The rule is a width of intervals, or another run from which success is to differ. `layouts` is
+    how many layouts there were to evaluate, and `at` after how many of them the run was inspected.
     """
 
     layouts: int  # how many there were
@@ -496,7 +525,10 @@ class ClosedLoop(
 
 
 class ChannelRecord(Struct, frozen=True, kw_only=True):
-    """Record a channel profile as it was when the run was made, with all its parameters."""
+    """Record a channel profile as it was when the run was made, with all its parameters.
+
+    `limits` has the least and greatest value for which the model was validated, by parameter.
+    """
 
     model: str
     description: str
@@ -519,7 +551,11 @@ _SUMMED = ("amount", "asked", "uncounted", "read_tokens", "written_tokens")  # f
 
 
 class Cost(Struct, frozen=True):
-    """Hold what a run's requests to one model cost, by the price on its model card."""
+    """Hold what a run's requests to one model cost, by the price on its model card.
+
+    `amount` is in `currency`; of the `asked` requests, the `uncounted` ones are not in it, since
+    nobody said how many tokens they had.
+    """
 
     currency: str
     amount: float

@@ -39,7 +39,8 @@ AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay
 
 
 def mass(p: Floats, optimal: Bools) -> Floats:
-    """Return the probability that policies p (..., A) give to optimal actions, (...).
+    """Return the probability that policies p (..., A) over A actions give to optimal actions,
+    (...).
 
     `optimal` is a mask (..., A); NaN where no action is optimal.
     """
@@ -51,8 +52,9 @@ def mass(p: Floats, optimal: Bools) -> Floats:
 def brier(p: Floats, optimal: Bools) -> Floats:
     """Return the Brier score (Brier 1950) of taking any optimal action, (...), from p (..., A).
 
-    With the probability m of the optimal actions it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst.
-    It does not matter how m is spread over several optimal actions.
+    `optimal` is a mask (..., A) over the A actions. With the probability m of the optimal actions
+    it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst. It does not matter how m is spread over
+    several optimal actions.
     """
     return np.asarray(2.0 * (1.0 - mass(p, optimal)) ** 2)
 
@@ -60,7 +62,8 @@ def brier(p: Floats, optimal: Bools) -> Floats:
 def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
     """Return -ln of the optimal actions' probability (Good 1952), (...), from p (..., A).
 
-    A probability below `LEAST_P` counts as that, so that it is 5.3 nats at most.
+    `optimal` is a mask (..., A) over the A actions. A probability below `LEAST_P` counts as that,
+    so that it is 5.3 nats at most.
     """
     return np.asarray(-np.log(np.maximum(mass(p, optimal), LEAST_P)))
 
@@ -68,7 +71,8 @@ def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
 def right(p: Floats, optimal: Bools) -> Floats:
     """Return 1 where the likeliest action of p (..., A) is optimal, else 0, (...).
 
-    For equally likely actions it is the share that is optimal; NaN where no action is.
+    `optimal` is a mask (..., A) over the A actions. For equally likely actions it is the share that
+    is optimal; NaN where no action is.
     """
     likeliest = p == p.max(axis=-1, keepdims=True)
     share = np.sum(likeliest & optimal, axis=-1) / np.maximum(likeliest.sum(axis=-1), 1)
@@ -116,7 +120,7 @@ Figure = Callable[[Floats, Floats, Floats], Floats]
 
 
 def decisions(count: Floats, hits: Floats, sure: Floats) -> Floats:
-    """Return the number of decisions in each resample, (R,).
+    """Return the number of decisions in each of R bootstrap resamples, (R,).
 
     The arguments are those of `calibration_error`.
     """
@@ -144,9 +148,9 @@ def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
 def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
     """Return the greatest share of decisions, most confident first, with an error of `RISK`, (R,).
 
-    It is selective classification (El-Yaniv and Wiener 2010) with a threshold that is chosen on the
-    same decisions; equally confident ones are taken together. The arguments are those of
-    `calibration_error`.
+    There is one for each of R bootstrap resamples. It is selective classification (El-Yaniv and
+    Wiener 2010) with a threshold that is chosen on the same decisions; equally confident ones are
+    taken together. The arguments are those of `calibration_error`.
     """
     acted, correct = count.cumsum(axis=1), hits.cumsum(axis=1)
     within = acted - correct <= RISK * acted + 1e-9
@@ -181,10 +185,11 @@ def estimates(
 def difference(
     a: Judged, b: Judged, figure: Figure, episodes: int
 ) -> tuple[float, float, Estimate]:
-    """Return a figure of A, that of B, and B - A with its interval, paired by episode.
+    """Return a figure, such as `coverage`, of run A, that of run B, and B - A with its interval.
 
-    Episodes in which either has no decision are left out. All are NaN if one is left with too few
-    decisions, as in `estimate`.
+    They are paired by episode: episodes in which either has no decision are left out. All are NaN
+    if one is left with too few decisions, as in `estimate`. `episodes` is the number of all
+    episodes.
     """
     both = np.intersect1d(a.episode, b.episode)
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))

@@ -86,7 +86,7 @@ class Success:
     def difference(self, a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
         """Return the difference in success a - b, both (S, E), paired by episode, with interval.
 
-        The axes are S channel seeds and E episodes.
+        `level` is the confidence of the interval. The axes are S channel seeds and E episodes.
         """
         return mean_difference([(self, a, b)], level)
 
@@ -172,8 +172,8 @@ def by_condition(
 ) -> tuple[Success, dict[str, Floats]]:
     """Return the success rule of a run's episodes, and their success (S, E) by condition.
 
-    `episodes` are in the order of the grid; `headline_metric` is plain or balanced success. The
-    axes are S channel seeds and E episodes.
+    The rule says how episodes are averaged. `episodes` are in the order of the grid;
+    `headline_metric` is plain or balanced success. The axes are S channel seeds and E episodes.
     """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
     return Success.of(episodes[: len(grid.episodes)], headline_metric), values
@@ -233,8 +233,8 @@ class Plays(Generic[Setting]):
 def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
     """Return the mean over families of success a - b, both (S, E), paired by episode.
 
-    The interval treats all families' episodes together. The axes are S channel seeds and E
-    episodes.
+    `pairs` has for each family of scenes its success rule, a and b; the axes are S channel seeds
+    and E episodes. The interval, of confidence `level`, treats all families' episodes together.
     """
     parts = []
     for success, a, b in pairs:
@@ -244,13 +244,19 @@ def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
 
 
 def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
-    """Return the mean over families of success a - b in episodes with a danger, or without."""
+    """Return the mean over families of success a - b in episodes with a danger, or without.
+
+    `pairs` is as `mean_difference` takes it; `dangerous` chooses the episodes with a danger.
+    """
     parts = [known_mean(a - b, 0)[success.dangerous == dangerous] for success, a, b in pairs]
     return paired_difference(parts)
 
 
 def p_of_mean(pairs: Pairs) -> float | None:
-    """Return the p-value of no mean difference over families; None without an interval."""
+    """Return the p-value of no mean difference over families; None without an interval.
+
+    `pairs` is as `mean_difference` takes it.
+    """
     return multiplicity.p_value(lambda level: mean_difference(pairs, level))
 
 

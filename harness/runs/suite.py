@@ -127,7 +127,7 @@ class SuiteRun:
 
 
 def plays(runs: Iterable[Run], headline_metric: str) -> Plays[str]:
-    """Return the success of runs of one family each by condition, to compare conditions.
+    """Return success by condition of runs, each on another family of scenes, to be compared.
 
     `headline_metric` is plain or balanced success.
     """

@@ -53,7 +53,9 @@ class Figures:
     """Hold all that a run's scores are computed from, for some of its episodes.
 
     `values` has each metric's values by episode, (C, S, E), for C conditions, S channel seeds and E
-    episodes.
+    episodes; `latency_ms` the decisions' latencies for each condition and seed; `judged` the
+    decisions with exactly one optimal action for each condition; and `answers` each answer with its
+    episode.
     """
 
     grid: Grid  # the episodes
@@ -126,7 +128,8 @@ def of_conditions(
 ) -> Iterator[Score]:
     """Yield the scores of the metrics `names` in each condition, from their values (C, S, E).
 
-    Each has a score with an interval over seeds, and one with an interval over episodes.
+    Each has a score with an interval over seeds, and one with an interval over episodes. The axes
+    are C conditions, S channel seeds and E episodes.
     """
     for index, condition in enumerate(conditions):
 

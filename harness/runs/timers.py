@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 class Timer(ABC):
     """Times each answer of a run, and says what its decisions cost; frozen.
 
-    The one that is registered has nothing open: it opens others, and knows speeds.
+    The object that is registered has opened no files: it makes those that have (`opened`,
+    `recorded`), and reads speeds.
     """
 
     option: ClassVar[str]  # what is typed to choose it
@@ -35,11 +36,11 @@ class Timer(ABC):
 
     @abstractmethod
     def opened(self, settings: Mapping[str, Any]) -> "Timer | None":
-        """Return the one that a run's settings of extensions choose; None if they choose none."""
+        """Return the timer that a run's settings of extensions, by name, choose; None for none."""
 
     @abstractmethod
     def recorded(self, manifest: "Manifest") -> "Timer | None":
-        """Return the one that a run states; None if it has another's answers, and their times.
+        """Return the timer that a run's manifest states; None if it took over another run's times.
 
         Raises ValueError if it states none that can be read.
         """
@@ -68,11 +69,11 @@ class Timer(ABC):
 
     @abstractmethod
     def check(self, run: Any) -> None:
-        """Raise UserError for what of a run, a `Spec`, it does not go with."""
+        """Raise UserError if a run, a `Spec`, has other settings that do not go with this timer."""
 
     @abstractmethod
     def obstacle(self, point: "OperatingPoint") -> str | None:
-        """Return why a condition cannot be played with it, and what to do; None if it can."""
+        """Return why a condition cannot be played with this timer; None if it can."""
 
     @abstractmethod
     def latency(self, agents: Sequence[Any]) -> "Latency":
@@ -80,23 +81,28 @@ class Timer(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """Return those of `chosen_by` that choose it, by name."""
+        """Return the settings of `chosen_by` that choose this timer, values by name."""
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return what a run states of it beside its settings: by setting, what that opened, as
-        plain values, or its value.
+        """Return what a run states of this timer beside its settings, as plain values.
+
+        It has by setting the content of what the setting opened, or else its value.
         """
 
     @abstractmethod
     def files(self) -> Mapping[str, Path]:
-        """Return the files that it is made of by their path in a project."""
+        """Return the files that this timer is made of, by their path in a project."""
 
     @abstractmethod
     def columns(
         self, latency: "Latency", decided: Sequence[Any], answers: Mapping[str, "Answer"]
     ) -> dict[str, Floats]:
-        """Return what it `adds` to decisions (`Decided`) in their order, (n,) each."""
+        """Return the columns that this timer `adds` to n decisions, in their order, (n,) each.
+
+        `decided` has the decisions in parts, `answers` the answers by request id, and `latency` is
+        the run's.
+        """
 
     @abstractmethod
     def joules(
@@ -106,12 +112,17 @@ class Timer(ABC):
         scenes: Sequence[Any],
         answers: Mapping[str, "Answer"],
     ) -> Floats:
-        """Return the joules of each vehicle's answer, (n, 1+H), the ego first; NaN if unknown."""
+        """Return the joules of each vehicle's answer in n scenes, (n, 1+H), NaN if unknown.
+
+        The ego comes first, then the H helpers. `answers` has the run's by request id.
+        """
 
     @abstractmethod
     def energy_j(self, point: "OperatingPoint", heard: "Exchange", joules: Floats) -> Floats:
-        """Return the joules of decisions, (n,), without those of a fusion call, by these answers'
-        (n, 1+H).
+        """Return the joules of n decisions, (n,), without those of a fusion call.
+
+        `joules` are those of the answers, (n, 1+H), the ego's and H helpers'; `heard` is what was
+        sent.
         """
 
 
@@ -150,7 +161,7 @@ def without(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def added_columns() -> dict[str, str]:
-    """Return the columns that timers add to decisions, each with the one behind which it stands."""
+    """Return the columns that timers add to decisions, each with the one that it follows."""
     columns: dict[str, str] = {}
     for each in _timers():
         columns |= each.adds

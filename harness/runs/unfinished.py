@@ -21,7 +21,8 @@ class Extent:
     """Hold how far an unfinished run is, as `extent` reads it.
 
     `going` is whether a process works on it, `done` the finished episodes of `due`, which is None
-    for a shard.
+    for a shard. `early` says that the run may stop before; `answers` counts those of unfinished
+    episodes.
     """
 
     going: bool  # whether a process works on it now
