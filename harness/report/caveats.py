@@ -173,7 +173,10 @@ def controls(run: Run) -> Iterator[str]:
 
 
 def lagging(run: Run) -> Iterator[str]:
-    """Yield the conditions whose decisions mostly take longer than the dataset's decision lag."""
+    """Yield the conditions whose decisions mostly take longer than the dataset's lag.
+
+    The lag is the time from a decision to its action, for which the dataset knows what follows.
+    """
     if off := doubts.lagging(_off_lag(run)):
         yield (
             f"Under {', '.join(off)}, most decisions take longer than these frozen scenes assume: "
@@ -194,8 +197,9 @@ def unmeasured(run: Run) -> Iterator[str]:
 def doubted(*runs: Run) -> set[str]:
     """Return the names of the runs' conditions that have a warning.
 
-    These are controls, conditions with another lag than the dataset's, and radios outside the range
-    for which their channel model was validated.
+    These are controls (helpers' messages are replaced), conditions with another lag from decision
+    to action than the dataset's, and radios outside the range for which their channel model was
+    validated.
     """
     names = set[str]()
     for run in runs:

@@ -210,10 +210,11 @@ def timeline() -> Spec:
 def stacked(
     rows: Rows, by: str, field: str, colours: Mapping[str, str], what: str, amount: str = "share"
 ) -> Spec:
-    """Return a chart of stacked bars: one for each run and value of the field `by`.
+    """Return a chart of stacked bars: one for each run and value of the rows' field `by`.
 
-    A bar's segments are the values of `field`, in the order and colours of `colours`; their lengths
-    are the rows' field `amount`, by default shares on a scale in percent. `what` is the axis title.
+    A bar's segments are the values of the field `field`, in the order and colours of `colours`;
+    their lengths are the rows' field `amount`, by default shares on a scale in percent. `what` is
+    the axis title.
     """
     several_runs, order = len({row["run"] for row in rows}) > 1, list(colours)
     bars = []
@@ -418,7 +419,10 @@ def tooltip(rows: Rows) -> list[Spec]:
 
 
 def interval(**encoding: Spec) -> Spec:
-    """Return a layer that draws a line for each row, from x to x2 or from y to y2."""
+    """Return a layer that draws a line for each row, from x to x2 or from y to y2.
+
+    `encoding` has the Vega-Lite encoding of each of these channels.
+    """
     return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
 
 

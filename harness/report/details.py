@@ -140,7 +140,8 @@ class Details:
     """Collect what the page shows of single scenes: the world, answers, decisions and outcomes.
 
     `replayed` has closed-loop scenes that could be simulated again, `framed` the ids of scenes
-    shown with camera pictures, `left_out` each run's ablations.
+    shown with camera pictures. `prompts` renders a run's prompts again, `full` adds those that a
+    rule did not read. `left_out` has for each run how answers change without one object or message.
     """
 
     runs: Runs  # the runs

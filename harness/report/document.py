@@ -17,7 +17,11 @@ WIDTH, HEIGHT = 240, 22  # of a line of a forest plot
 
 @dataclass(frozen=True)
 class Table:
-    """Hold a table of text to show on a page and in a terminal."""
+    """Hold a table of text to show on a page and in a terminal.
+
+    `heads` are the columns' titles, `rows` the cells; `terminal` are the indices of the columns
+    that a terminal shows, and `most` is how many rows it shows, None for all.
+    """
 
     title: str  # what stands above it
     heads: Sequence[str]  # of the columns; the first column names the rows

@@ -37,7 +37,7 @@ LAST = (Kind.PACE, Kind.ORIGIN)  # what stands below them
 
 @dataclass(frozen=True)
 class Finding:
-    """Hold one sentence about a run, or about some of several, with its kind."""
+    """Hold one sentence about a run, or about some of several runs, with its kind."""
 
     kind: Kind
     sentence: str
@@ -46,7 +46,7 @@ class Finding:
 def each(source: Source[Run]) -> Source[Runs]:
     """Turn a function that yields sentences about one run into one for several runs by name.
 
-    A sentence that is not true of all runs begins with the names of those it is true of.
+    Of a sentence that is not true of all runs, the names of those it is true of come first.
     """
     return partial(_merged, source)
 

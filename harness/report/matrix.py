@@ -51,8 +51,9 @@ Mark = tuple[str, Behind | None]  # of a run under a condition: the mark, and ho
 class Line:
     """Hold the results of one run under one condition: a row of the report's main table.
 
-    `mark` says whether it is the best run, not told from it, or worse; `lead` is the headline
-    metric and `tokens` the median numbers of prompt and answer tokens.
+    `scores` has its scores by metric, None where unknown. `mark` says whether it is the best run,
+    not told from it, or worse, and `behind` how far it is behind, None for the best; `lead` is the
+    headline metric and `tokens` the median numbers of prompt and answer tokens.
     """
 
     name: str  # of the run
@@ -77,7 +78,7 @@ class Line:
 class Grid:
     """Hold success under one condition as a table, prompts across and models down.
 
-    A row is a model and, for each prompt, the results of the runs with both.
+    A row is a model and, for each prompt of `prompts`, the results of the runs with both.
     """
 
     condition: str  # operating point

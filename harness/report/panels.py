@@ -34,7 +34,10 @@ BUDGET = (200, 400)  # tokens of a prompt: the paper's
 
 @dataclass(frozen=True)
 class Panel:
-    """Hold one chart of the report page: a Vega-Lite specification with its title and caption."""
+    """Hold one chart of the report page: a Vega-Lite specification with its title and caption.
+
+    `id` is its name in the page, and `part` the part of the page in which it stands.
+    """
 
     id: str  # its name in the page, and of the files it is saved as
     part: Part  # of the page
@@ -45,7 +48,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class AddedPanel:
-    """One chart that an extension which ships adds, as `adds={"panels": ...}`; see `Panel`."""
+    """One chart that an extension which ships adds to the report page, by `adds={"panels": ...}`.
+
+    `rows` returns a run's data for it, and `spec` the Vega-Lite specification of all runs' rows;
+    the other fields are those of `Panel`.
+    """
 
     part: Part
     title: str

@@ -44,7 +44,8 @@ class Cost:
 class Planned:
     """Hold the sample size for one condition: the layouts needed to find a difference.
 
-    `finds` is the smallest difference that the asked number of layouts finds, NaN if none.
+    `finds` is the smallest difference that the asked number of layouts finds, NaN if none; `cost`
+    is what the needed layouts take, None without pilot runs.
     """
 
     condition: str  # its name; empty for a stated rate

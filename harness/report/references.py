@@ -73,7 +73,8 @@ def meaning(name: str, exact: bool = True) -> str:
 def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) -> str:
     """Return a caption's sentences on the references: each one's success, best first, and meaning.
 
-    Empty without references. `exact` is as in `meaning`.
+    Empty without references. `exact`: whether success was computed from decision trees, and not
+    estimated from a run.
     """
     if not references:
         return ""

@@ -38,7 +38,7 @@ class Remarks(Protocol):
     def left_out(self, run: Run) -> LeftOut:
         """Return how answers and decisions change without one object or message, by decision point.
 
-        The keys of an entry are those of `LeftOut`.
+        Each decision point has a list of entries, with the keys that `LeftOut` names.
         """
         ...
 
@@ -70,7 +70,8 @@ def sentences(runs: Runs) -> list[Markup]:
 def left_out(run: Run) -> LeftOut:
     """Return what all extensions know of answers without one object or message, by decision point.
 
-    An extension that fails adds nothing. Raises UserError if a file of the run is broken.
+    Each has a list of entries, one for an object or message. An extension that fails adds nothing.
+    Raises UserError if a file of the run is broken.
     """
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:

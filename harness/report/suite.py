@@ -50,7 +50,8 @@ class Cell:
 class Line:
     """Hold one row of the suite's table: the results of one family, or the mean over families.
 
-    `drivers` has the success of reference drivers by name, `cells` the result by condition.
+    A family is the scenes of one scenario; `run` is its run, None for the mean. `drivers` has the
+    success of reference drivers by name, `cells` the result by condition.
     """
 
     name: str  # the family's

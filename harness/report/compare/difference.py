@@ -54,7 +54,12 @@ class DecisionFlip:
 
 @dataclass(frozen=True)
 class Difference:
-    """Hold how one metric differs in one condition, in the metric's unit (shares 0 to 1)."""
+    """Hold how one metric differs in one condition, in the metric's unit (shares 0 to 1).
+
+    `a` and `b` are its means in runs A and B, `change` is B - A with its 95 % interval. The
+    p-values are of no difference: as computed, and corrected for multiple testing; None where there
+    is none.
+    """
 
     metric: str  # its name
     # mean of A over the episodes and seeds in which both know it; of a latency percentile, itself
@@ -143,7 +148,12 @@ class AnswersHeld:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold everything that differs between run A and run B, as `compare` finds it."""
+    """Hold everything that differs between run A and run B, as `compare` finds it.
+
+    `settings` has the name of each that differs, with A's value and B's. `answers` has the answers
+    that changed their parse verdict, `held` those to the same question that changed at all.
+    `prompts` is what differs between the prompts: None for nothing, a sentence if it is not known.
+    """
 
     pair: Pair  # the two runs
     # that differ: name, A's value, B's, or None

@@ -252,7 +252,10 @@ def _gate(verdict: Verdict) -> dict[str, Any]:
 
 
 def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str, Any]]:
-    """Return the answers that differ, up to `most` or all, as dicts with the keys `ANSWERS`."""
+    """Return the answers that differ, up to `most` or all, as dicts with the keys `ANSWERS`.
+
+    `held` is the comparison of both runs' answers to the same questions.
+    """
     rows = []
     for answer in held.changed[:most]:
         values = (answer.request, answer.role, *answer.verdicts, answer.a, answer.b)

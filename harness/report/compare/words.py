@@ -159,7 +159,7 @@ def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
 
 
 def paces(pair: Pair) -> list[str]:
-    """Return sentences on prefill and decode times (`notes.pace`), each after its run's letter."""
+    """Return sentences on how long prefill and decode take, each after its run's letter, A or B."""
     sentences = []
     for name, side in (("A", pair.a), ("B", pair.b)):
         pace = findings(side.run, Kind.PACE)
@@ -375,7 +375,7 @@ def answers_held(held: AnswersHeld) -> str:
 
 
 def first_changed(changed: AnswerChanged) -> list[str]:
-    """Return lines on a changed answer: its request and both texts from where they differ."""
+    """Return lines on a changed answer: its request, and each run's text from where they differ."""
     start = max(_alike(changed.a, changed.b) - BEFORE, 0) if changed.a != changed.b else 0
     lines = [f"first: {changed.request}, {role_word(changed.role)}"]
     answers = zip("AB", changed.verdicts, (changed.a, changed.b), strict=True)

@@ -24,7 +24,10 @@ NEAR_M = VIEW_M - MARGIN_M
 
 
 def north_up(points: Floats) -> Floats:
-    """Return points (..., 2), m, of the frame of `harness.world.road` with y to the north."""
+    """Return points (..., 2), m, of the frame of `harness.world.road` with y to the north.
+
+    In that frame y points to the south.
+    """
     return points * [1.0, -1.0]
 
 
