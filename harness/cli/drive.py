@@ -187,7 +187,10 @@ def deciding(scenario: str, agents: str) -> str:
 
 
 def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
-    """Print a closed-loop run's results as a table, or as JSON, or not if `quiet`."""
+    """Print a closed-loop run's results as a table, or as JSON, or not if `quiet`.
+
+    `done` is the run, as it was just evaluated.
+    """
     from harness.runs.folder import read
 
     if as_json:

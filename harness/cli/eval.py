@@ -195,7 +195,7 @@ def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: st
 
 
 def show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
-    """Print a dry run's counts: requests, prompt tokens and cost of an evaluation."""
+    """Print a dry run's counts: requests, prompt tokens and cost of the evaluation `spec`."""
     repeated = f" × {counted['repeats']} repeats" if "repeats" in counted else ""
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"
     if "helper" in by_role and not spec.asks_all:

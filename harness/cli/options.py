@@ -237,7 +237,7 @@ def takes(
 
 
 def as_command(typed: Any, command: Any, parameters: list[inspect.Parameter]) -> Any:
-    """Return the function `typed` with the parameters given, and name and help of `command`.
+    """Return the function `typed` with these parameters, and with the name and help of `command`.
 
     So typer reads it as a command.
     """

@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Column:
-    """Describe a column of a run's table: its head and its metric, with unit or with interval."""
+    """Describe a column of a run's table: its head, and the metric whose scores stand below it.
+
+    With `interval`, a score is shown with its interval, else with its unit.
+    """
 
     head: str
     metric: str
@@ -173,7 +176,8 @@ def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
 class RunGroup:
     """Describe several runs that are made in one folder, such as a suite's.
 
-    `specs` has their evaluations by folder name, `marker` the file that marks the folder as done.
+    `specs` has their evaluations by folder name, and `marker` is the file that marks the folder as
+    done. `what` names it in messages, and `others` are files of it that may be there before.
     """
 
     specs: "Mapping[str, Spec]"  # by the name of the run's own folder in it

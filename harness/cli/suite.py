@@ -26,9 +26,10 @@ MOST_INTERVALS = 3  # conditions whose intervals fit into a line
 
 
 def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
-    """Raise UserError unless a model can be evaluated on a suite.
+    """Raise UserError unless a model can be evaluated on a suite, several datasets at once.
 
-    Each scenario may have one dataset, latency must not be measured, and no model may be a replay.
+    `specs` are the evaluations on them. Each scenario may have one dataset, latency must not be
+    measured, and no model may be a replay.
     """
     from harness.evaluate.latency import MEASURED
 
@@ -63,7 +64,8 @@ def evaluate(
 ) -> Path:
     """Evaluate on every dataset of a suite with one backend; write and print the means.
 
-    `evaluated` evaluates one of them. Returns the suite's folder.
+    `specs` and `datasets` are the evaluation on each, and the dataset; `evaluated` evaluates one of
+    them. Returns the suite's folder, `out` or a default one for None.
     """
     from harness.backends.registry import open_backend
     from harness.report import suite as report

@@ -37,7 +37,9 @@ Value = float | str
 class Axis:
     """Describe one thing that a sweep can vary: a setting of operating points, or vehicles.
 
-    A value times `scale` is the setting `field`, which is None for the number of vehicles.
+    `name` is what `--over` calls it. A value times `scale` is the operating point's setting
+    `field`, which is None for the number of vehicles. `usual` is the text of the default grid, and
+    `worded` says that values are words.
     """
 
     name: str  # what `--over` calls it
@@ -54,7 +56,7 @@ class Axis:
         return ",".join(self.named()) if self.named else self.usual
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
-        """Return the operating point with this axis at a value, which is in the axis's unit.
+        """Return the operating point `point` with this axis at a value, in the axis's unit.
 
         For the number of vehicles it is unchanged. Raises UserError for a value that is not
         allowed.
@@ -202,7 +204,11 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
 
 @dataclass(frozen=True)
 class Setting:
-    """Hold one grid point of a sweep: an operating point, the vehicle count and what was varied."""
+    """Hold one grid point of a sweep: an operating point, the vehicle count and what was varied.
+
+    `vehicles` includes the ego. `value` is that of the axis `variable`: one for each if axes are
+    crossed, None if conditions are compared.
+    """
 
     condition: str  # name of the operating point that it is a change of
     point: OperatingPoint  # the operating point

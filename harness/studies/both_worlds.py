@@ -36,8 +36,9 @@ def rank(
 ) -> dict[str, dict[str, Estimate]]:
     """Drive a dataset's episodes with each reference driver, and compare with its frozen success.
 
-    It returns the estimates of `compared` by driver. `progress` is called with the number of
-    episodes just driven.
+    It returns by driver the estimates of `compared`: success in frozen scenes and in closed loop,
+    their difference, and the share of episodes that end alike. `progress` is called with the number
+    of episodes just driven.
     """
     from harness.world.reference import drive_apart
 

@@ -82,7 +82,8 @@ class WalkResult:
 class Source(Protocol):
     """Describe where a study's intents (distributions over actions) come from.
 
-    It is a finished run, or what an extension draws.
+    It is a finished run, or what an extension draws. `episodes` is the number of episodes for a
+    channel seed, and `same_episodes` says whether all seeds have the same.
     """
 
     name: str  # what figures call it
@@ -98,8 +99,9 @@ class Source(Protocol):
     ) -> Iterator[Iterable[WalkResult]]:
         """Yield for each grid point its results, in parts of some episodes.
 
-        All grid points have the same channel draws. A grid point's vehicles are the ones nearest to
-        the ego. Its parts must be consumed before the next grid point.
+        `seeds` are channel seeds, and all grid points have the same channel draws. A grid point's
+        vehicles are the ones nearest to the ego. Its parts must be consumed before the next grid
+        point.
         """
         ...
 
@@ -110,7 +112,7 @@ SOURCES = Plugins[Source]("swarmdrive.sources", Source, {})  # those that extens
 def metric_columns(part: Decided[Any]) -> dict[str, Floats]:
     """Return the columns of n decisions that a study's metrics need, by name, (n,) each.
 
-    The names are `COLUMNS`.
+    The names are `COLUMNS`; `part` is the decisions of some episodes at one operating point.
     """
     every = columns(part)
     return {name: every[name] for name in COLUMNS}

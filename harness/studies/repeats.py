@@ -45,7 +45,10 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 
 
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
-    """Return the evaluations of several repeats by folder, each with the next sampling seed."""
+    """Return the evaluations of several repeats by folder, each with the next sampling seed.
+
+    `spec` is the first of them; the others differ from it in nothing else.
+    """
     first = spec.settings.sampling_seed
     return {f"repeat-{n + 1}": spec.changed(sampling_seed=first + n) for n in range(repeats)}
 
@@ -183,7 +186,10 @@ class Repeats:
         return [point for point in points if point.flips > 0]
 
     def copies(self) -> Iterator[str]:
-        """Yield a sentence for each group of repeats whose answers are identical texts."""
+        """Yield a sentence for each group of repeats whose answers are identical texts.
+
+        Then chance changed nothing, or one run is a copy of the other.
+        """
         alike: dict[frozenset[tuple[str, str]], list[str]] = {}
         for run in self.runs:
             texts = frozenset((answer.id, answer.raw) for answer in run.answers)
@@ -259,9 +265,9 @@ def _choose(n: Floats, j: int) -> Floats:
 def between_share(values: Floats) -> Estimate:
     """Return the share of the variance of values (E, k) that lies between episodes.
 
-    It is the intraclass correlation ICC(1) of Shrout and Fleiss (1979): below 0 where k repeats of
-    an episode differ more than episodes do, NaN where nothing differs. The interval is a bootstrap
-    over episodes.
+    There are E episodes with k repeats each. It is the intraclass correlation ICC(1) of Shrout and
+    Fleiss (1979): below 0 where k repeats of an episode differ more than episodes do, NaN where
+    nothing differs. The interval is a bootstrap over episodes.
     """
     n, k = values.shape
     unknown = Estimate(math.nan, math.nan, math.nan, n, 0)

@@ -220,7 +220,8 @@ class ReplayedRun:
     def joules(self, scenes: Sequence[Scene], point: OperatingPoint) -> Floats:
         """Return the joules of each vehicle's answer in n scenes, (n, 1 + H); NaN where unknown.
 
-        Column 0 is the ego's, which is unknown if its model is in a cloud.
+        Column 0 is the ego's, which is unknown if its model is in a cloud; then come the H
+        helpers'.
         """
         manifest = self.run.manifest
         if manifest.timer is None:
@@ -228,9 +229,10 @@ class ReplayedRun:
         return manifest.timer.joules(manifest.latency, point, scenes, self._asker.answers)
 
     def energy_j(self, point: OperatingPoint, heard: Exchange, joules: Floats) -> Floats:
-        """Return the joules of each decision, (n,), with those of its answers; NaN where unknown.
+        """Return the joules of each of n decisions with those of its answers, (n,); NaN if unknown.
 
-        `joules`, (n, 1 + H), are those of `joules`, and `heard` is what was sent.
+        `joules` has those of the ego's and H helpers' answers, (n, 1 + H), and `heard` is what was
+        sent.
         """
         timer = self.run.manifest.timer
         if timer is None:
@@ -294,8 +296,8 @@ class ReplayedRun:
     ) -> Intents:
         """Return the intents (distributions over actions) of helpers where `wanted`, a mask (n, H).
 
-        The model is asked `question` for what is not stored. Raises UserError if it may not be
-        asked and an answer is missing.
+        The axes are n scenes and H helpers. The model is asked `question` for what is not stored.
+        Raises UserError if it may not be asked and an answer is missing.
         """
         asked_scenes, places = wanted_in(scenes, wanted)
         if not self._asks and any(self._asker.lacks(asked_scenes, question, places)):
@@ -310,7 +312,7 @@ class ReplayedRun:
             return self._asker.helpers(scenes, wanted, question)
 
     def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
-        """Return the vehicles' intents (distributions over actions) in these scenes, as stored.
+        """Return the vehicles' intents (distributions over actions) in n scenes, as stored.
 
         Where the ego's is missing, the model is asked; if it may not be, `leave_out` is called with
         the mask (n,) of these scenes, whose episodes are left out.
@@ -336,9 +338,10 @@ class ReplayedRun:
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return the ego's answers after hearing messages; the model is asked what is not stored.
+        """Return a function that gives the ego's answers after hearing messages in these scenes.
 
-        Raises UserError if the model may not be asked.
+        `codes` (K,) says which K sets of messages are asked about, and `rewrites` how they are
+        shown. The model is asked what is not stored. Raises UserError if it may not be.
         """
         if not self._asks:
             raise UserError(
@@ -349,7 +352,7 @@ class ReplayedRun:
             return self._asker.fusion_call(scenes, codes, rewrites)
 
     def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
-        """Return a function that asks agents again with the plans they heard.
+        """Return a function that asks agents again with the plans they heard, which `intents` has.
 
         Frozen runs, in which only the ego decides, do not use it. `at` has indices of scenes.
         """

@@ -37,6 +37,7 @@ SOURCE = ("name", "latency")  # of a source, what makes a study another one
 class Study:
     """Hold a finished study: its texts, tables, figures, data and manifest.
 
+    `kind` names its manifest's file; `headline` is the outcome, and `about` says how it was made.
     `data` has tables to write by file name, `answer` is what --json prints, and `figures` draws the
     pictures by file name.
     """
@@ -191,7 +192,10 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
 
 
 class Cells:
-    """Keep finished parts of a study in a file, one a line, so that a killed study can continue."""
+    """Keep finished parts of a study in a file, one a line, so that a killed study can continue.
+
+    A part that was made of other settings than this study's is not taken.
+    """
 
     def __init__(self, path: Path, depends_on: str) -> None:
         """Read a file. Torn lines and those of another digest of all that decides a part do not

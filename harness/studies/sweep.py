@@ -119,7 +119,8 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
 def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
     """Return the paper's panels: the runs' conditions, and sweeps of vehicle count, loss and tau.
 
-    In the sweep of vehicles, packet loss grows with their density.
+    They are grid points by the panel's name. In the sweep of vehicles, packet loss grows with their
+    density.
     """
     vehicles = min(run.vehicles for run in runs)
     points = {name: point for run in runs for name, point in run.points.items()}
@@ -286,7 +287,11 @@ def _map(part: "pd.DataFrame") -> "Figure":
 
 
 def tables(summary: "pd.DataFrame") -> list[Table]:
-    """Return a study's main results from its summary, a table for each source and curve."""
+    """Return a study's main results from its summary, a table for each source and curve.
+
+    A curve is an operating point varied over an axis; the operating points themselves share a
+    table.
+    """
     heads, rows = dict[str, tuple[str, str]](), dict[str, list[Sequence[str]]]()
     places = ["source", "panel", "condition", "value"]
     scores = summary.assign(value=summary.value.where(summary.panel != CORE, None))

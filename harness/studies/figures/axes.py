@@ -20,8 +20,8 @@ def paper_values(
 ) -> "pd.DataFrame":
     """Return the paper's values of a metric in a panel, as rows with `value`, `low` and `high`.
 
-    `place` selects rows by further columns. It is empty if `marks`, the table of the paper's
-    values, is None.
+    `marks` is the table of the paper's values, and `place` selects rows of it by further columns.
+    It is empty if `marks` is None.
     """
     import pandas as pd
 
@@ -34,7 +34,10 @@ def paper_values(
 
 
 def cross(axes: Any, paper_rows: "pd.DataFrame", x: Any) -> None:
-    """Draw the paper's values at `x`: a cross for one value, an error bar for a range."""
+    """Draw the paper's values at `x`: a cross for one value, an error bar for a range.
+
+    `axes` are Matplotlib's; `paper_rows` has the ends of each value in `low` and `high`.
+    """
     low, high = (paper_rows[end].to_numpy(dtype=float) for end in ("low", "high"))
     x, single = np.broadcast_to(x, low.shape), low == high
     if single.any():

@@ -34,7 +34,7 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
 
     `core` has their rows of a study's summary. `paper` has the paper's values to draw beside them:
     `low` and `high` by `panel`, `condition`, `value` and `metric`, equal for a single value; None
-    for none.
+    to draw none.
     """
     figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = drawn = figure.subplots(1, 3)

@@ -22,7 +22,7 @@ def heat_map(
     row: str = "",
     column: str = "",
 ) -> Figure:
-    """Draw heat maps of percentages (R, C), one panel for each title.
+    """Draw heat maps of percentages, (R, C) for R rows and C columns, one panel for each title.
 
     `rows` and `columns` are the names along both axes, `row` and `column` the titles of the axes.
     """

@@ -29,7 +29,10 @@ class Steps:
 
 @dataclass(frozen=True)
 class Rows:
-    """Describe a panel of estimates: a row for each name, an estimate or None for each series."""
+    """Describe a panel of estimates: a row for each name, an estimate or None for each series.
+
+    An estimate is drawn times `scale`, 100 for percent; `quantity` is what it is, with its unit.
+    """
 
     quantity: str  # along the panel, with its unit
     names: Sequence[str]  # of the rows, from top to bottom
