@@ -71,7 +71,11 @@ class Audit:
 
 @dataclass(frozen=True)
 class HiddenPoints:
-    """Hold m decision points of some layouts at which the danger is out of sight."""
+    """Hold m decision points of some layouts at which the danger is out of sight.
+
+    `numbers` (m, k) has the k numbers of the scene graph at each, by `names`, NaN if the ego does
+    not know one; `danger` (m,) is the sector that the danger comes from.
+    """
 
     layout: Ints  # index of each point's layout, (m,)
     step: Ints  # index of its decision, (m,)
@@ -234,7 +238,11 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 
 @dataclass(frozen=True)
 class Ranks:
-    """Hold pairwise comparisons of scores of layouts with the danger in question and without."""
+    """Hold pairwise comparisons of scores of layouts with the danger in question and without.
+
+    `pairs` counts the compared pairs of points by both layouts, and `above` those in which the
+    layout with the danger has the higher score; a tie counts half.
+    """
 
     # number of pairs of points in which the layout with it ranks higher, (with, without); a tie
     # counts half

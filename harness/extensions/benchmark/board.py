@@ -27,7 +27,8 @@ from harness.runs.suite import SuiteRun, plays
 class Line:
     """Hold one entry of a benchmark's board: its rank, its success by condition, and its gain.
 
-    The rank is None for an entry that sees more than a vehicle can.
+    `success` is a mean over families of scenes; `gain` is success in the condition that ranks, less
+    that without V2V. The rank is None for an entry that sees more than a vehicle can.
     """
 
     entry: Rescored  # the file of results, computed again

@@ -48,8 +48,9 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Describe a version of the benchmark that never changes: all that a score on it depends on.
 
-    It pins datasets and prompts by digest, operating points, channel seeds, latency, ties and
-    metrics.
+    It pins datasets and prompts by digest, operating points (`condition`), channel seeds, latency,
+    ties and metrics. `ranked_by` is the operating point by which entries are ranked; `golden` is
+    None in a project's own edition that pins no figures.
     """
 
     name: str  # name of its file, without .toml
@@ -92,7 +93,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def difference(self, pairs: Pairs) -> Estimate:
         """Return the mean difference in success a - b over families, with the edition's interval.
 
-        `pairs` has, for each family, its success rule and both sides' success (S, E).
+        `pairs` has, for each family of scenes, its success rule and both sides' success (S, E), by
+        S channel seeds and E episodes.
         """
         return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 

@@ -26,7 +26,8 @@ from harness.runs.suite import SuiteRun
 class Rescored:
     """Hold a results file whose figures were computed again here from its answers.
 
-    `differences` has, by dataset, the names of the figures that differ from those in the file.
+    `suite` has the runs as computed here, and `compared` is how many figures were compared.
+    `differences` has, by dataset, the names of those that differ from the figures in the file.
     """
 
     contents: Contents  # the file's own `results.json`

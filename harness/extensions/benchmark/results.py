@@ -53,7 +53,8 @@ BROKEN_ZIP = (*BROKEN, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedE
 class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Hold the content of `results.json`, which describes a file of results.
 
-    Raises ValueError for another format, bad names of runs, or a `made_by` that is too long.
+    It has the edition's name and digest, who made the file, and the names of its runs. Raises
+    ValueError for another format, bad names of runs, or a `made_by` that is too long.
     """
 
     format: str  # `FORMAT`

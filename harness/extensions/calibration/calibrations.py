@@ -36,7 +36,11 @@ ONLY_TUNE = "calibration is fitted on tune seeds"
 
 @dataclass(frozen=True)
 class Correction:
-    """Hold the correction of one role's answers: a prior to divide out, and a temperature."""
+    """Hold the correction of one role's answers: a prior to divide out, and a temperature.
+
+    `prior` is a probability for each action, empty for none; a temperature of 1 changes nothing.
+    `answers` is how many answers it was fitted on.
+    """
 
     answers: Count  # number of answers that it was fitted on
     # the exponent is 1 / temperature; 1 changes nothing
@@ -45,7 +49,7 @@ class Correction:
     prior: tuple[Annotated[float, Meta(ge=LEAST_PRIOR, le=1)], ...] = ()
 
     def of(self, p: Floats) -> Floats:
-        """Return intents `(..., A)` corrected; rows with NaN stay as they are."""
+        """Return intents `(..., A)` over A actions corrected; rows with NaN stay as they are."""
         powers = (p / np.array(self.prior or 1.0)) ** (1.0 / self.temperature)
         total = powers.sum(axis=-1, keepdims=True)
         return np.where(total > 0, powers / np.where(total > 0, total, 1.0), p)
@@ -53,7 +57,11 @@ class Correction:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Hold the content of a file of `calibrations/`: corrections for one model and one question."""
+    """Hold the content of a file of `calibrations/`: corrections for one model and one question.
+
+    It was fitted on layouts with seeds from `first_seed` to `last_seed`. `helper` is None if no
+    helper answered.
+    """
 
     level: Level  # L0 divides a prior out, L1 has a temperature, L0+L1 both
     command: str  # the command that made the file

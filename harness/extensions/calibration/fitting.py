@@ -37,7 +37,10 @@ DIGITS = 6  # of a prior
 
 @dataclass(frozen=True)
 class Fitted:
-    """Hold the correction of one role's answers, and their likelihood without and with it."""
+    """Hold the correction of one role's answers, and their likelihood without and with it.
+
+    `before_nats` and `after_nats` are the mean negative log-likelihood of the optimal actions.
+    """
 
     role: str  # `ego` or `helper`
     correction: Correction  # the fitted correction
@@ -84,9 +87,9 @@ def calibrate(
 ) -> tuple[Calibration, list[Fitted]]:
     """Fit a calibration on the answers of a finished run on tune layouts.
 
-    Returns it with what each role gained. `command` is stated in its file. Raises UserError for
-    layouts of another purpose, several models, sampled answers, or if no answer of the ego could be
-    parsed.
+    Returns it with the fitted correction of each role and what it gained. `command` is stated in
+    its file. Raises UserError for layouts of another purpose, several models, sampled answers, or
+    if no answer of the ego could be parsed.
     """
     run, name = read(folder), printable(folder)
     manifest = run.manifest

@@ -17,7 +17,10 @@ Pictured = tuple[Request, Request, Request]
 
 @dataclass(frozen=True)
 class Looks:
-    """Hold a model's answers to an image prompt: with a camera picture, a blank one, and none."""
+    """Hold a model's answers to an image prompt: with a camera picture, a blank one, and none.
+
+    `answers` and `blank` have one for each answer mode; `text` is None if no answer mode worked.
+    """
 
     # answers to the camera picture, one in each answer mode, asked alone after a warm-up
     answers: dict[AnswerMode, Completion]
@@ -54,7 +57,11 @@ class Looks:
 
 @dataclass(frozen=True)
 class Checkup:
-    """Hold the result of checking a language model: its prompt, its tokens and its answers."""
+    """Hold the result of checking a language model: its prompt, its tokens and its answers.
+
+    `tokens` are ids with their texts, and `answers` has one for each answer mode. What only a
+    server knows is None, and so is `looks` if the model takes no pictures.
+    """
 
     prompt: str  # the first question as the model reads it, or as a server is sent it
     # its ids, each with its text; None if only a server knows them

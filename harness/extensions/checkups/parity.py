@@ -38,7 +38,11 @@ PASSES = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """Hold one comparison of an engine with the reference: a figure and its limit."""
+    """Hold one comparison of an engine with the reference: a figure and its limit.
+
+    `measured` is the figure and `allowed` its limit, None without one; `holds` says whether the
+    figure is within it.
+    """
 
     what: str  # what was compared
     measured: float  # the figure
@@ -50,7 +54,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold all findings on one model, and what could not be compared."""
+    """Hold all findings on one model on two engines, and what could not be compared.
+
+    `left_out` says why the same weights in F32 were not compared; None if they were.
+    """
 
     findings: tuple[Finding, ...]  # everything compared
     left_out: str | None  # why llama.cpp was not held to the same float32 weights; None if it was

@@ -28,7 +28,12 @@ CHUNK = 8  # requests that are asked together
 
 
 class Answers(Struct, frozen=True):
-    """Count qualities and faults of one role's answers (ego or helper) to the fixed questions."""
+    """Count qualities and faults of one role's answers (ego or helper) to the fixed questions.
+
+    Of `n` questions, `readable` answers say what to do, and `strict` ones need no repair. `action`
+    is the commonest likeliest action, None without a readable answer; `faults` counts why others
+    cannot be read.
+    """
 
     role: Role  # the role
     n: int  # number of questions
@@ -68,7 +73,10 @@ class Answers(Struct, frozen=True):
 
 
 class Trial(Struct, frozen=True):
-    """Hold what a model does with a prompt: its answers to the fixed questions, by role."""
+    """Hold what a model does with a prompt: its answers to the fixed questions, by role.
+
+    `pairs` says how the ego's answers moved in pairs of scenes that differ in one fact.
+    """
 
     model: str  # name of the model
     prompt: str  # the prompt version

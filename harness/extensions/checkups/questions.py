@@ -45,7 +45,11 @@ class Question(msgspec.Struct, frozen=True):
 
 
 class Pair(NamedTuple):
-    """Hold two requests that differ in one fact, to test whether the answer follows it."""
+    """Hold two requests that differ in one fact, to test whether the answer follows it.
+
+    `present` has the fact and `absent` has not; `expected` is the action that the fact should make
+    likelier.
+    """
 
     fact: Fact  # the kind of fact
     expected: str  # the action that should be likelier with the fact

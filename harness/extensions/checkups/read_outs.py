@@ -33,7 +33,8 @@ COUNT = 12 + 2 * 16  # requests that an examination asks, but for those of scene
 class Moved(Struct, frozen=True):
     """Hold how answers to pairs of questions followed the one fact in which both differ.
 
-    In `moved` of `n` pairs the expected action became clearly likelier with the fact.
+    In `moved` of `n` pairs the expected action became clearly likelier with the fact; `mean` is the
+    mean change of its probability.
     """
 
     fact: str  # the kind of fact
@@ -54,8 +55,10 @@ class Moved(Struct, frozen=True):
 class Findings(Struct, frozen=True):
     """Hold what fixed questions showed of a model's read-outs, for one prompt and answer mode.
 
-    A read-out takes the probabilities of actions from those of one letter each. The findings say
-    how far it follows the letter in place of the action, and whether facts in the scene move it.
+    A read-out takes the probabilities of actions from those of one letter each. `letter_share` and
+    `follows_letter` say how far it follows the letter in place of the action, in `n` questions;
+    `pairs` whether facts in the scene move it, and `others` the same with the other way to read
+    letters.
     """
 
     prompt: str  # the prompt version that they were asked with

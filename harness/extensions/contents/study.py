@@ -89,7 +89,8 @@ class Model:
 class Outcome:
     """Hold the metrics of a model's runs with one content of messages at one grid point.
 
-    `families` has, by scenario and metric, an array (S, E) of channel seeds and episodes.
+    `families` has, by scenario and metric, an array (S, E) of S channel seeds and E episodes;
+    `success_rules` says for each scenario how success is averaged.
     """
 
     families: Mapping[str, Mapping[str, Floats]]  # metrics by family, each (S, E)
@@ -144,9 +145,9 @@ class Outcome:
             yield rule, self.families[name][SUCCESS], other.families[name][SUCCESS]
 
     def pooled(self, groups: Mapping[str, Bools]) -> Floats:
-        """Return success of the episodes in a group, all families together, (S, n).
+        """Return success of the n episodes in a group, all families together, (S, n).
 
-        `groups` has a mask of each family's episodes, (E,).
+        `groups` has a mask of each family's E episodes, (E,); S is the number of channel seeds.
         """
         parts = []
         for family, values in self.families.items():
@@ -159,7 +160,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Result:
-    """Hold the outcomes of one model with every content of messages at every grid point."""
+    """Hold the outcomes of one model with every content of messages at every grid point.
+
+    `outcomes` has them by operating point, which includes the content, and number of vehicles.
+    """
 
     model: Model  # the model and its runs
     panels: Sequence[Panel]  # the axes and conditions that were played
@@ -435,7 +439,7 @@ def _columns(parameters: Parameters, part: Decided[Any]) -> dict[str, Floats]:
 
 
 def witnesses(run: ReplayedRun) -> Ints:
-    """Return how many helpers have the danger in sight at the first decision of each episode, (E,).
+    """Return how many helpers see the danger at the first decision of each of E episodes, (E,).
 
     It is `SAFE` (-1) without a danger, and `HEARD` (-2) if the danger has a radio, whose beacons
     tell of it.

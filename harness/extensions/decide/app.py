@@ -42,7 +42,11 @@ _OVERFLOW = "context overflow"
 
 @dataclass(frozen=True)
 class Shape:
-    """Describe one HTTP API for decisions: its path, and how its JSON is read and written."""
+    """Describe one HTTP API for decisions: its path, and how its JSON is read and written.
+
+    `body` is the type of a request's JSON; `read` makes questions of it, and `write` makes JSON of
+    the model's name and the answers.
+    """
 
     path: str  # path of the POST request
     body: type[Any]  # msgspec type of the request's JSON

@@ -25,7 +25,10 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class Asked:
-    """Hold one question of a client's request, with its options as the client writes them."""
+    """Hold one question of a client's request, with its options as the client writes them.
+
+    `values` has the options in their order; `name` is None if the client gives the question none.
+    """
 
     name: str | None  # name of the question in the client's request, if it has one
     question: Question  # state, instructions, and each option's meaning
@@ -45,7 +48,10 @@ class Asked:
 
 @dataclass(frozen=True)
 class Enquiry:
-    """Hold a client's request: questions about one state, and pictures of it."""
+    """Hold a client's request: questions about one state, and URLs of pictures of it.
+
+    `model` is the name of the model that it asks for; None takes the one that is served.
+    """
 
     model: str | None  # name of the model that it asks for; None takes the served one
     questions: tuple[Asked, ...]
@@ -54,7 +60,10 @@ class Enquiry:
 
 @dataclass(frozen=True)
 class Answered:
-    """Hold the answer to one question: a probability for each option, None if the model refused."""
+    """Hold the answer to one question: a probability for each option, None if the model refused.
+
+    `tokens` is the number of prompt tokens, None if nobody counts them.
+    """
 
     asked: Asked
     # probability of each option, as the model states it; None where the model refused

@@ -43,7 +43,8 @@ def fits(
 ) -> list[Fit]:
     """Return the time and energy of each kind of answer with each row (model) of a device profile.
 
-    `window_s` is the longest time from seeing to the answer that counts as in time.
+    `answers` has their token counts. `window_s` is the longest time from seeing to the answer that
+    counts as in time.
     """
     results = []
     for row in rows:
@@ -56,8 +57,8 @@ def fits(
 class Answers:
     """Hold the token counts of n answers whose time and energy on a device are asked for.
 
-    `output` has output tokens by kind of answer; `episodes` is the episode of each, None for one
-    assumed answer.
+    `prompt` has the tokens read, (n,), `output` those written by kind of answer, (n,) each;
+    `episodes` is the episode of each, None for one assumed answer.
     """
 
     prompt: Floats  # tokens read, (n,)
@@ -118,7 +119,8 @@ def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: 
 class Comparison:
     """Hold a measured time or token rate of a run beside what a device profile states for it.
 
-    `what` names it, `role` is whose answers were measured.
+    `what` names it: `seconds` of an answer, or a rate in tokens a second. `role` is whose answers
+    were measured.
     """
 
     what: str  # `seconds` of an answer, or a rate by its name in a profile

@@ -50,8 +50,10 @@ def notes(run: Shown) -> Iterator[str]:
 
 
 def energies(run: Run) -> Table:
-    """Return the joules of a decision, by who takes them, with the total's interval;
-    no condition of which one of them is not known.
+    """Return the joules of a decision as rows: one for each condition and who takes them.
+
+    A row has `condition`, `part`, `joules`, and the total with its interval. A condition of which
+    one of these is not known is left out.
     """
     rows = []
     for condition in run.conditions:
@@ -75,7 +77,7 @@ def energies(run: Run) -> Table:
 
 
 def chart(rows: Table) -> dict[str, Any]:
-    """Return the chart of these rows."""
+    """Return the Vega-Lite chart of rows as `energies` returns them: the joules of a decision."""
     return charts.stacked(rows, "condition", "part", PARTS, "J per decision", amount="joules")
 
 

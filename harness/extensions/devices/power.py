@@ -26,7 +26,8 @@ WINDOWS = 5  # of asking; the intervals are over them
 class Power:
     """Hold the power and energy that one meter measured while a model answered.
 
-    `answer_j` is joules an answer, `more_j` the part of it above idle power.
+    `idle_watts` was measured before. `answer_j` is joules an answer, `more_j` the part of it above
+    idle power.
     """
 
     meter: str  # its name

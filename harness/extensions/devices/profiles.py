@@ -28,7 +28,11 @@ _SIZE = re.compile(r"(\d{1,7}(?:\.\d{1,9})?)b", re.ASCII)
 
 
 class Speed(Struct, frozen=True):
-    """Hold how fast a computer answers one request with a model, and the energy for each token."""
+    """Hold how fast a computer answers one request with a model, and the energy for each token.
+
+    Rates are tokens a second, energies joules a token. `answer_s` is the seconds of an answer of
+    any length, in place of rates. None where unknown.
+    """
 
     model: str  # the model of the row in the device profile
     prefill_tokens_per_s: Rate | None  # prompt tokens read in a second
@@ -40,7 +44,10 @@ class Speed(Struct, frozen=True):
 
 
 class Constant(Struct, frozen=True):
-    """Hold a number of a device profile, whether it is measured or modelled, and its source."""
+    """Hold a number of a device profile, whether it is measured or modelled, and its source.
+
+    The field that holds it says its unit.
+    """
 
     value: Annotated[float, between(1e-9, 1e9)]
     status: Status
@@ -77,7 +84,11 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
 
 
 class Device(Struct, frozen=True, kw_only=True):
-    """Hold a device profile, a file of `devices/`: an on-board computer, a row for each model."""
+    """Hold a device profile, a file of `devices/`: an on-board computer, a row for each model.
+
+    The others are power in watts, radiated power in dBm, least time on air in ms and memory in 10^9
+    bytes; None where unknown. `scaling` says how a model without a row is timed; None refuses it.
+    """
 
     name: str  # the file's name
     description: str  # one sentence for lists

@@ -271,7 +271,7 @@ def answer_j(speed: Speed, answer: Answer) -> float:
 
 
 def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
-    """Return the joules of all helpers that infer for each decision, `(n,)`.
+    """Return the joules of all H helpers that infer for each of n decisions, `(n,)`.
 
     `infers`, `(n, H)`, says who does; columns beyond the vehicles (an attacker's further voices)
     run no model. `vehicles`, `(n, 1+H)`, has the joules of each vehicle's answer, the ego first.

@@ -26,7 +26,11 @@ STILLS_HZ = 10  # while no decision is open
 
 @dataclass(frozen=True)
 class Turn:
-    """Hold the latest decision of one agent, at the time of a still."""
+    """Hold the latest decision of one agent, at the time of a still.
+
+    `since_s` is the seconds since it began, `open` whether it has not acted yet, and `outcome` how
+    the agent's journey ended, empty until it has.
+    """
 
     decision: Decision  # the decision, open or taken
     since_s: float  # seconds since it began
@@ -36,7 +40,11 @@ class Turn:
 
 @dataclass(frozen=True)
 class Still:
-    """Hold the state of an episode at the time of one picture of its video."""
+    """Hold the state of an episode at the time of one picture of its video.
+
+    `seen` is the state when the last decision began, `turns` the latest decision of each agent by
+    its id, and `danger` the id of the dangerous vehicle, None without one.
+    """
 
     state: WorldState  # the state of the world
     seen: WorldState  # the state when the last decision began

@@ -163,7 +163,10 @@ class CalibratedWorld:
         return range(len(self._knows))
 
     def __call__(self, decision_points: Sequence[int]) -> Intents:
-        """Return the intents of all vehicles at this step, in every episode."""
+        """Return the intents of all vehicles at this step, in every episode.
+
+        The decision points are not read: all intents are drawn.
+        """
         ego_intents = np.where(self._knows[:, None], self._now.knowing, self._now.intents.own)
         return replace(self._now.intents, own=ego_intents)
 
@@ -298,8 +301,8 @@ class Calibrated:
 def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
     """Return uniform draws in [0, 1), (n,), stratified within each of the `kinds`, (n,).
 
-    Of the k rows of one kind, each k-th of [0, 1) has one. One such column for each dimension is a
-    Latin hypercube (McKay, Beckman and Conover 1979).
+    `kinds` has the kind of each of n rows. Of the k rows of one kind, each k-th of [0, 1) has one.
+    One such column for each dimension is a Latin hypercube (McKay, Beckman and Conover 1979).
     """
     # a kind's rows together, in random order
     order = np.lexsort((generator.random(len(kinds)), kinds))
@@ -313,7 +316,8 @@ def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
 def peaked(nats: Floats, top: Ints) -> Floats:
     """Return intents `(..., A)` of given entropies `nats`, with the most on the action `top`.
 
-    The rest is shared evenly by the other actions.
+    Both are `(...)`, and A is the number of actions. The rest is shared evenly by the other
+    actions.
     """
     entropies, shares = _by_entropy()
     most = np.interp(nats, entropies, shares)[..., None]
@@ -330,7 +334,7 @@ def _by_entropy() -> tuple[Floats, Floats]:
 
 
 def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
-    """Return normal draws with mean and standard deviation `sd`, by quantiles of `uniforms`.
+    """Return normal draws with mean `mean` and standard deviation `sd`, by quantiles of `uniforms`.
 
     The distribution is cut at `CUT` standard deviations on either side.
     """

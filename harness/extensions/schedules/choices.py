@@ -38,7 +38,10 @@ PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 
 @dataclass(frozen=True)
 class Level:
-    """Hold all choices at N decision points of one step, for S seeds and K sets of helpers."""
+    """Hold all choices at N decision points of one step, for S seeds and K sets of helpers.
+
+    `action` is what the ego does if it asks a set, and `costs` what that costs, NaN where unknown.
+    """
 
     at: Ints  # indices of the decision points in the forest, ascending, (N,)
     action: Ints  # index of the ego's action if it asks a set, (S, N, K)
@@ -54,7 +57,8 @@ Choose = Callable[[Level, Floats, Floats], Ints]
 class Choices:
     """Hold what follows at each decision point of a dataset if the ego asks each set of helpers.
 
-    `sets` (K, H) has the helpers of each set, the empty one first.
+    `sets` (K, H) has the H helpers' membership in each of K sets, the empty one first; `levels` has
+    the decision points by step, the first step's first.
     """
 
     forest: Forest  # of the run's dataset
@@ -64,8 +68,9 @@ class Choices:
     def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
         """Yield each level, the last first, with what its sets lead to and the chosen sets.
 
-        A tuple has the level, success (S, N, K), costs (S, N, K, C) until the episode's end, and
-        the chosen sets' indices (S, N).
+        A level has the decision points of one step. The axes are S channel seeds, N decision
+        points, K sets of helpers and C costs. A tuple has the level, success (S, N, K), costs (S,
+        N, K, C) until the episode's end, and the chosen sets' indices (S, N).
 
         Args:
             choose: returns the index of the set asked in each decision, (S, N), given the level,
@@ -93,7 +98,8 @@ class Choices:
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
         """Return success, (S, E), and costs, (S, E, C), of every episode under the rule `choose`.
 
-        The rule is as in `backwards`: it returns the set to ask in each decision.
+        The axes are S channel seeds, E episodes and C costs (`COSTS`). The rule is as in
+        `backwards`: it returns the set to ask in each decision.
         """
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
@@ -102,7 +108,8 @@ class Choices:
     def oracle(self) -> tuple[Floats, Floats]:
         """Return success, (S, E), and costs, (S, E, C), of the best sets of helpers to ask.
 
-        Of equally good sets, those with the fewest messages are taken.
+        The axes are S channel seeds, E episodes and C costs (`COSTS`). Of equally good sets, those
+        with the fewest messages are taken.
         """
 
         def best(level: Level, ends: Floats, spent: Floats) -> Ints:
@@ -112,7 +119,10 @@ class Choices:
         return self.played(best)
 
     def index(self, mask: Bools) -> Ints:
-        """Return the index in `sets` of each set of helpers, given as a mask `(..., H)`."""
+        """Return the index in `sets` of each set of helpers, given as a mask `(..., H)`.
+
+        The last axis has the H helpers.
+        """
         helpers = self.sets.shape[1]
         bits = 1 << np.arange(helpers)
         codes = self.sets @ bits
@@ -125,7 +135,8 @@ class Choices:
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
         """Return the rule that asks the helpers whom an operating point's schedule asks.
 
-        `worths` has what asking is worth at each level, if it is known, as `worths` returns it.
+        A schedule says whom the ego asks in a decision. `worths` has what asking is worth at each
+        level, if it is known, as the method `worths` returns it.
         """
         lookup = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
@@ -141,7 +152,8 @@ class Choices:
     def worths(self, point: OperatingPoint) -> list[Floats]:
         """Return what asking each helper is worth to a schedule: an array `(S x N, H)` a level.
 
-        It is `(S x N, 1)` where the worth is the same for all helpers.
+        The axes are S channel seeds by N decision points of the level, and H helpers. It is `(S x
+        N, 1)` where the worth is the same for all helpers.
         """
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 

@@ -7,7 +7,11 @@ from harness.core.arrays import Floats
 
 
 def always(inputs: ScheduleInputs) -> Floats:
-    """Return infinite worth for every helper, so that all are always asked: `(..., 1)`."""
+    """Return infinite worth for every helper, so that all are always asked: `(..., 1)`.
+
+    `inputs` has what a schedule may use, with leading axes `(...)`; what is worth the same of each
+    helper has one column.
+    """
     return np.full((*inputs.entropy_nats.shape, 1), np.inf)
 
 
@@ -31,7 +35,7 @@ def risk(inputs: ScheduleInputs) -> Floats:
 def deadline(inputs: ScheduleInputs) -> Floats:
     """Return the entropy in nats times the probability that a reply comes in time, `(..., H)`.
 
-    It is NaN for a helper that may not be asked.
+    It is NaN for one of the H helpers that may not be asked.
     """
     assert inputs.in_time is not None
     return np.where(inputs.may_ask, inputs.entropy_nats[..., None] * inputs.in_time, np.nan)
@@ -40,8 +44,8 @@ def deadline(inputs: ScheduleInputs) -> Floats:
 def coverage(inputs: ScheduleInputs) -> Floats:
     """Return the mean share of the regions that a helper sees and the ego does not, `(..., H)`.
 
-    It is NaN for a helper that may not be asked. This is need times supply at each point of a
-    region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
+    It is NaN for one of the H helpers that may not be asked. This is need times supply at each
+    point of a region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
     """
     assert inputs.outlook is not None
     regions = max(inputs.outlook.added.shape[-1], 1)

@@ -60,8 +60,9 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
 def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
     """Return training data: inputs (n, F), and gains (n,) in success from asking one helper alone.
 
-    It has a row for each helper that may be asked at a decision point of the tree. `choose` decides
-    whom the ego asks in the rest of the episode.
+    It has a row for each of n cases, a helper that may be asked at a decision point of the tree,
+    with the F inputs of a learnt schedule. `choose` decides whom the ego asks in the rest of the
+    episode.
     """
     alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
@@ -76,7 +77,7 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
 
 
 def fit(x: Floats, y: Floats) -> Network:
-    """Fit a network that predicts y (n,) from x (n, F), by least squares.
+    """Fit a network that predicts y (n,) from F inputs x (n, F), by least squares.
 
     The optimiser is Adam on whole batches, with weight decay.
     """

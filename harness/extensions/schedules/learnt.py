@@ -47,23 +47,26 @@ class Network:
     base: float  # bias of the output
 
     def __call__(self, inputs: Floats) -> Floats:
-        """Return the output `(...)` for inputs `(..., F)`."""
+        """Return the output `(...)` for the F inputs `(..., F)`."""
         units = np.tanh(((inputs - self.centre) / self.scale) @ self.into + self.bias)
         return np.asarray(units @ self.out + self.base)
 
 
 @dataclass(frozen=True)
 class Learnt:
-    """Schedule requests by a network: the expected gain in success from asking one helper alone."""
+    """Schedule requests by a network: the expected gain in success from asking one helper alone.
+
+    A helper is asked if its gain is above `threshold`, unless a condition has its own.
+    """
 
     network: Network  # from `inputs` to the gain in success probability
     threshold: float  # gain above which a helper is asked, unless the condition has its own
     needs: ClassVar[tuple[str, ...]] = ("outlook",)
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Return the expected gain from asking each helper, `(..., H)`.
+        """Return the expected gain in success from asking each of H helpers, `(..., H)`.
 
-        It is NaN for a helper that may not be asked.
+        `known` has what a schedule may use. It is NaN for a helper that may not be asked.
         """
         return np.where(known.may_ask, self.network(inputs(known)), np.nan)
 
@@ -82,7 +85,10 @@ class Weights:
 
 @dataclass(frozen=True)
 class Stated:
-    """Hold the content of a schedule's file in `schedules/`."""
+    """Hold the content of a schedule's file in `schedules/`: a learnt rule of whom the ego asks.
+
+    `learnt_from` and `tuned_on` name runs with their layout seeds; `network` has the weights.
+    """
 
     description: str  # one sentence
     command: str  # the command that made the file
@@ -121,9 +127,9 @@ class Stated:
 
 
 def inputs(facts: ScheduleInputs) -> Floats:
-    """Return the network's inputs for each helper, `(..., H, F)`, in the order of `INPUTS`.
+    """Return the network's F inputs for each of H helpers, `(..., H, F)`, in the order of `INPUTS`.
 
-    They are arbitrary for a helper that may not be asked.
+    `facts` has what a schedule may use. Inputs are arbitrary for a helper that may not be asked.
     """
     outlook, may_ask = facts.outlook, facts.may_ask
     assert outlook is not None

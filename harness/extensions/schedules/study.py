@@ -51,7 +51,11 @@ FIRST = (PAPER, NEVER, ALWAYS, "margin", "risk", "deadline", "coverage", RANDOM)
 
 @dataclass(frozen=True)
 class Candidate:
-    """Describe one setting of a schedule: its threshold and how many helpers it asks at most."""
+    """Describe one setting of a schedule: its threshold and how many helpers it asks at most.
+
+    A schedule says whom the ego asks in a decision. The threshold is what asking must be worth;
+    None for a schedule without one.
+    """
 
     schedule: str  # its name
     threshold: float | None  # what asking must be worth; None for a schedule without threshold
@@ -73,8 +77,8 @@ class Candidate:
 class Play:
     """Hold the outcome of one setting of a schedule for S channel seeds and E episodes.
 
-    `success` is (S, E), and `costs` (S, E, C) has `COSTS`: messages, air time, latency, energy and
-    so on.
+    `success` is (S, E), and `costs` (S, E, C) has the C costs `COSTS`: messages, air time, latency,
+    energy and so on.
     """
 
     candidate: Candidate
@@ -137,9 +141,10 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
 class Chosen:
     """Compare a schedule, at its chosen setting, with the paper's schedule and the oracle.
 
-    It has success, its difference to the paper's schedule and to random asking, the share of the
-    gap to the oracle that it closes, messages as a share of the paper's, and success averaged over
-    budgets.
+    The paper's schedule asks by the entropy of the ego's intent; the oracle knows how each episode
+    ends. It has success, its difference to the paper's schedule and to random asking, the share of
+    the gap to the oracle that it closes, messages as a share of the paper's, and success averaged
+    over budgets.
     """
 
     play: Play  # the setting, with success and costs of every episode
@@ -176,7 +181,10 @@ class Compared:
 
     @property
     def paper(self) -> Play:
-        """Return the outcome of the paper's schedule at the operating point's own setting."""
+        """Return the outcome of the paper's schedule at the operating point's own setting.
+
+        The paper's schedule asks where the entropy of the ego's intent is above a threshold.
+        """
         return _at(self.plays[PAPER], self._untuned(PAPER))
 
     @property
@@ -198,7 +206,7 @@ class Compared:
     def counts(self) -> Ints:
         """Return how often each episode counts in each bootstrap resample, (1 + RESAMPLES, E).
 
-        The first row is the episodes as played, once each.
+        There are E episodes; the first row has them as played, once each.
         """
         return self.success_rule.resampled(noise.generator("schedule", "episodes"), RESAMPLES)
 
@@ -323,7 +331,8 @@ class Compared:
     def random_like(self, play: Play) -> Floats:
         """Return the success of asking at random with as many messages as `play`, (S, E).
 
-        It is interpolated between the two nearest random shares.
+        The axes are S channel seeds and E episodes. It is interpolated between the two nearest
+        random shares.
         """
         most = self.point.ask.max_helpers
         every = [play for play in self.plays[RANDOM] if play.candidate.most == most]
@@ -536,7 +545,11 @@ def name_of(row: Chosen) -> str:
 
 
 def headline(compared: Compared) -> list[str]:
-    """Return sentences on the oracle's lead over the paper's schedule, and the best schedule."""
+    """Return sentences on the oracle's lead over the paper's schedule, and the best schedule.
+
+    The oracle knows how each episode ends; the paper's schedule asks by the entropy of the ego's
+    intent.
+    """
     regret, words = compared.regret, compared.success_rule.words
     bound = compared.oracle.means["messages"]
     sentences = [

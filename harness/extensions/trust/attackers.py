@@ -36,8 +36,9 @@ class Attackers:
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         """Return what every vehicle sends in n decisions, after the attacks; a `Speaker` method.
 
-        `truth` has what they intend, and `episode` and `seed` (n,) say whose decision each is.
-        Raises UserError if the world has no layouts, by which attackers are drawn.
+        `truth` has what they intend, `draws` the channel's random numbers, and `episode` and `seed`
+        (n,) say whose decision each is. Raises UserError if the world has no layouts, by which
+        attackers are drawn.
         """
         episodes = list(zip(episode.tolist(), seed.tolist(), strict=True))
         if draws.trips is None:

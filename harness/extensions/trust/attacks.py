@@ -117,7 +117,7 @@ class Attack:
     def intend(self, sent: Intents, turn: Turn, intents: Floats) -> Intents:
         """Return `sent` with the attackers' intents replaced by `intents` `(n, H, A)`.
 
-        A row with NaN changes nothing.
+        The axes are n decisions, H helpers and A actions. A row with NaN changes nothing.
         """
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
         return replace(sent, helpers=np.where(lies, intents, sent.helpers))
@@ -132,9 +132,9 @@ class Attack:
     ) -> Intents:
         """Return `sent` with false positions of the attackers, in metres.
 
-        `to_zone_m` (a number or `(n, H)`) is the claimed distance to the conflict zone, and
-        `to_ego_m` `(n, H)` that to the ego; `claims` has the claimed coordinates, or is None
-        without.
+        `to_zone_m` (a number or `(n, H)`, for n decisions and H helpers) is the claimed distance to
+        the conflict zone, and `to_ego_m` `(n, H)` that to the ego; `claims` has the claimed
+        coordinates, or is None without.
         """
         ego_m, helpers_m = np.split(sent.distance_m, [1], axis=1)
         return replace(
@@ -496,7 +496,7 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
 
     Args:
         share: the share of the present helpers that attack; their number is rounded.
-        present: which helpers are present, `(n, H)`.
+        present: which of H helpers are present in n decisions, `(n, H)`.
         draws: draws in [0, 1), `(n, H)`.
     """
     rank = np.argsort(np.argsort(np.where(present, draws, np.inf), axis=-1, kind="stable"), axis=-1)
@@ -507,7 +507,8 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
 def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:
     """Return `sent` with `voices` - 1 more identities (voices) of each of the `talkers`, `(n, H)`.
 
-    They follow all helpers, 2 m apart; `voice_of` says which helper each voice belongs to.
+    `talkers` is a mask of H helpers in n decisions. The voices follow all helpers, 2 m apart;
+    `voice_of` says which helper each voice belongs to.
     """
     n, helpers = talkers.shape
     places = np.argsort(~talkers, axis=-1, kind="stable")[

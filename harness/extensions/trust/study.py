@@ -55,8 +55,9 @@ LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, 
 class Cell:
     """Hold the result of one consensus rule under one attack: S channel seeds, E episodes.
 
-    Success, unsafe ends, and the negative log-likelihood of safe actions are (S, E); `flagged` (4,
-    E) counts messages of attackers that the rule suspected and did not, then of honest helpers.
+    Success, unsafe ends, and the negative log-likelihood of safe actions, in nats, are (S, E);
+    `flagged` (4, E) counts messages of attackers that the rule suspected and did not, then of
+    honest helpers. It is None if the rule judges no helper.
     """
 
     rule: str  # the consensus rule, such as `linear:weight_cap=0.3`
@@ -199,7 +200,8 @@ def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
 class Bench:
     """Hold a study of trust: a cell for every consensus rule, attack and share of attackers.
 
-    `alone` (S, E) is the success of an ego that never asks.
+    `cells` has them by these three. `alone` (S, E) is the success of an ego that never asks, by S
+    channel seeds and E episodes; `success_rule` says how success is averaged.
     """
 
     name: str  # name of the run that is played again
@@ -280,7 +282,10 @@ class Bench:
         return self.success_rule.estimate(self.over_attacks(rule, share))
 
     def over_attacks(self, rule: str, share: float) -> Floats:
-        """Return a rule's success of every seed and episode, (S, E), as a mean over all attacks."""
+        """Return a rule's success of every seed and episode, (S, E), as a mean over all attacks.
+
+        The axes are S channel seeds and E episodes; `share` is that of the attackers.
+        """
         values = [self.at(rule, attack, share).success for attack in self.attacks]
         return np.asarray(np.mean(values, axis=0))
 

@@ -33,7 +33,10 @@ class Line:
 
 @dataclass(frozen=True)
 class Group:
-    """Hold the runs of the same scenes, by date, and the metric and condition of their values."""
+    """Hold the runs of the same scenes, by date, and the metric and condition of their values.
+
+    `of` names the scenes, for people; `lines` has the runs, the oldest first.
+    """
 
     of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
     # condition of the values: the given one, or the last of those that most of the runs have;

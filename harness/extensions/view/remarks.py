@@ -26,7 +26,7 @@ class Remarks:
                         yield Markup(template.render(note=note, place=place, runs=runs))
 
     def left_out(self, run: Run) -> LeftOut:
-        """Return nothing: notes are not about what was left out of a prompt."""
+        """Return an empty mapping: notes are not about what was left out of a prompt."""
         return {}
 
 

@@ -40,7 +40,11 @@ class Spent(Exception):
 
 
 class Decision(NamedTuple):
-    """Hold one decision of an episode: its scene, the messages heard, the policy and the action."""
+    """Hold one decision of an episode: its scene, the messages heard, the policy and the action.
+
+    `policy` is the distribution over A actions after fusion, (A,); `action` is the index of the one
+    taken, and `raw` the ego's own answer.
+    """
 
     dataset: Dataset  # the layouts that were played, with their trees
     scene: Scene
@@ -167,8 +171,8 @@ class Tuning:
     def score(self, candidate: Candidate, layouts: Ints) -> float:
         """Return a candidate's mean score on the layouts of these indices (n,).
 
-        A score is success plus 0.001 times the worth. Raises Spent before the budget would be
-        exceeded.
+        A score is success plus 0.001 times the worth, the mean probability of success if all later
+        actions are drawn evenly. Raises Spent before the budget would be exceeded.
         """
         scores = [played.score for played in self.play(candidate, layouts.tolist())]
         return float(self.weights(layouts) @ scores)
@@ -238,7 +242,7 @@ class Tuning:
         return played
 
     def take(self, record: Record, questions: Iterable[Hashable]) -> None:
-        """Charge the new ones of these questions to the budget.
+        """Charge those of these questions that the candidate has not asked before to the budget.
 
         Raises Spent, and charges none, if the budget has too few left.
         """

@@ -79,9 +79,10 @@ def intent(
     extension: str = "",
     reasons_first: bool = False,
 ) -> tuple[float, ...] | None:
-    """Return the distribution (A,) that an answer states; None if it cannot be parsed.
+    """Return the distribution over A actions, (A,), that an answer states; None for none.
 
-    `answer` is the answer mode; the other arguments are as `read_by` returns them.
+    There is none if the text cannot be parsed. `answer` is the answer mode; the other arguments are
+    as `read_by` returns them.
     """
     if answer == "readout":
         letter = readout.spelt(text)[:1]
@@ -114,7 +115,8 @@ def driven(p: Sequence[float], values: Sequence[float]) -> float:
 def expected_success(p: Sequence[float], values: Sequence[float]) -> float:
     """Return the mean of `values` (A,), each action's probability of success, under `p` (A,).
 
-    Unlike `driven`, it tells apart distributions with the same likeliest action.
+    `p` is a distribution over the A actions. Unlike `driven`, it tells apart distributions with the
+    same likeliest action.
     """
     return float(np.dot(p, values))
 

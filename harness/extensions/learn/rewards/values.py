@@ -69,7 +69,8 @@ class Values:
         return values if p is None else np.einsum("na,na->n", p, values)
 
     def at(self, ids: Sequence[str]) -> Ints:
-        """Return the indices of decision points in `self.ids`, (n,).
+        """Return the indices in `self.ids` of the n decision points with these ids, (n,).
+
         Raises KeyError for an unknown id.
         """
         return np.fromiter(map(self.place.__getitem__, ids), np.intp, len(ids))
@@ -80,12 +81,12 @@ class Values:
 
     @cached_property
     def lost(self) -> Bools:
-        """Return at which decision points no action can lead to success, (N,)."""
+        """Return at which of the N decision points no action can lead to success, (N,)."""
         return np.asarray(~self.table.any(axis=-1))
 
     @cached_property
     def decides(self) -> Bools:
-        """Return at which decision points the actions differ in worth, (N,)."""
+        """Return at which of the N decision points the actions differ in worth, (N,)."""
         return np.asarray(self.table.max(axis=-1) > self.table.min(axis=-1))
 
 
@@ -110,9 +111,10 @@ def best_constant(forest: Forest, dangerous: Bools) -> int:
 def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario: str) -> Ints:
     """Draw about `per_level` decision points for each step of each tree: ascending indices, (n,).
 
-    Only points where `of` (N,) is true are drawn, keyed by scenario and layout seed; where a step
-    has too few, they repeat. `dangerous` (E,) says which trees' layouts have a danger; of the rarer
-    kind of layout more are drawn, so that both kinds have as many in all.
+    Only points where `of` (N,), a mask of all N points, is true are drawn, keyed by scenario and
+    layout seed; where a step has too few, they repeat. `dangerous` (E,) says which of the E trees'
+    layouts have a danger; of the rarer kind of layout more are drawn, so that both kinds have as
+    many in all.
     """
     alike = np.where(dangerous, dangerous.sum(), (~dangerous).sum())
     kinds = len(np.unique(dangerous))
@@ -135,7 +137,7 @@ def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario:
 
 
 def optimal(values: Floats) -> Bools:
-    """Return which actions have the greatest worth, a mask (..., A), for `values` (..., A).
+    """Return which of A actions have the greatest worth, a mask (..., A), for `values` (..., A).
 
     It is false for all where every action is worth 0 or NaN (unknown).
     """

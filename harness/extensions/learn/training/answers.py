@@ -74,8 +74,8 @@ def message(
     """Return a helper's message that states an intent (A,), with all fields that a prompt may show.
 
     They are `evidence`, `risk`, `intent` (in steps of 1/20), `recommended_maneuver` and
-    `confidence`. `actions` has the names of the A actions, the most careful first; `named` is as in
-    `evidence`.
+    `confidence`. `actions` has the names of the A actions, the most careful first. If `named` is
+    false, the prompt names no vehicle, and the evidence says "one".
     """
     parts = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
@@ -100,7 +100,8 @@ def answer(
 ) -> str:
     """Return the JSON answer that a viewer should give to `prompt` to state an intent (A,).
 
-    If `bare`, its free text is left empty, as in a constrained answer; `named` is as in `evidence`.
+    `actions` has the names of the A actions. If `bare`, its free text is left empty, as in a
+    constrained answer. If `named` is false, the prompt names no vehicle, and the text says "one".
     """
     sent = message(view, intent, actions, named)
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, sent["intent"], strict=True))

@@ -31,7 +31,11 @@ FACTS = "training.json"  # written last
 
 @dataclass(frozen=True)
 class Curriculum:
-    """Describe what a model is trained from: scenarios, prompts, layouts, and initial weights."""
+    """Describe what a model is trained from: scenarios, prompts, layouts, and initial weights.
+
+    `layouts` is the number of layouts of each scenario, `seed` the layout seed of the first. `base`
+    is the model that it begins as; None begins with random weights.
+    """
 
     prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
     layouts: int  # number of layouts of each scenario

@@ -32,7 +32,11 @@ _TELLING = 1e-3  # largest difference of logits that is rounding
 
 @dataclass(frozen=True)
 class Adapt:
-    """Describe how a published model is fine-tuned: its LoRA rank (None: all weights) and rate."""
+    """Describe how a published model is fine-tuned: its LoRA rank (None: all weights) and rate.
+
+    `rate` is the learning rate, `dtype` the number format in which layers compute, and `report` the
+    weight of the loss of the words behind an answer's letter.
+    """
 
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
     rate: float  # learning rate of AdamW
@@ -96,7 +100,10 @@ class Published:
         return [token for (token,) in tokens]
 
     def write(self, out: Path, weights: Mapping[str, Any]) -> None:
-        """Write the LoRA adapter, or the whole checkpoint with these weights, to a folder."""
+        """Write the LoRA adapter, or the whole checkpoint with these weights, to the folder `out`.
+
+        `weights` has the model's weights by name.
+        """
         if any(isinstance(module, low_rank.LowRank) for module in self.model.modules()):
             low_rank.write(self.model, out, base_name(self.card))
             return

@@ -25,7 +25,12 @@ ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 
 @dataclass(frozen=True)
 class Question:
-    """Hold one prompt for one viewer of a scene, and the answer (soft label) that it should get."""
+    """Hold one prompt for one viewer of a scene, and the answer (soft label) that it should get.
+
+    `label` (A,) has the probabilities that a model should give to the A actions; `image` is None
+    for a prompt without a picture, and `excerpt` unless the prompt shows a part of the scene graph
+    alone.
+    """
 
     key: str  # scenario, scene, viewer and prompt version, and `+m` where messages are in it
     scenario: Scenario  # what is decided in
@@ -127,8 +132,8 @@ def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
 def value(labels: Floats, p: Floats, weights: Sequence[float]) -> float:
     """Return the weighted mean probability of success of answers to n questions.
 
-    `p` (n, A) has the stated distributions, and `labels` (n, A) the soft labels, which are above 0
-    for the actions after which the episode succeeds; `weights` has n.
+    `p` (n, A) has the stated distributions over A actions, and `labels` (n, A) the soft labels,
+    which are above 0 for the actions after which the episode succeeds; `weights` has n.
     """
     return float(np.average((p * (labels > 0)).sum(axis=1), weights=weights))
 
@@ -138,8 +143,8 @@ def references(
 ) -> dict[str, float]:
     """Return the value of drivers that need no model at n questions, by the driver's name.
 
-    They are `uniform`, `local-view` and, where the scenario has one, `constant`; `labels` (n, A)
-    are soft labels, and the value is that of the function `value`.
+    They are `uniform`, `local-view` and, where the scenario has one, `constant`. `labels` (n, A)
+    are soft labels over A actions; a value is the weighted mean probability of success (`value`).
     """
     scenario = questions[0].scenario
     each = np.eye(len(scenario.actions))
@@ -152,7 +157,10 @@ def references(
 
 
 def kl_nats(labels: Floats, p: Floats) -> float:
-    """Return the mean KL divergence in nats of answers `p` (n, A) from soft labels (n, A)."""
+    """Return the mean KL divergence in nats of answers `p` (n, A) from soft labels (n, A).
+
+    They are distributions over A actions, for n questions.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.where(labels > 0, labels * np.log(labels / np.maximum(p, 1e-12)), 0.0)
     return float(terms.sum(axis=1).mean())

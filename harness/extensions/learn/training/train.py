@@ -70,7 +70,11 @@ class Sample:
 
 @dataclass(frozen=True)
 class Plan:
-    """Describe a training: its length, batch size, learning rates, seed and objective."""
+    """Describe a training: its length, batch size, learning rates, seed and objective.
+
+    `samples` is the number of sequences by stage, `batch` that of a step. `adapt` says how a
+    published model is changed; None for a model of our own.
+    """
 
     samples: dict[str, int]  # sequences per stage, by name
     batch: int = 16  # sequences a step
@@ -304,9 +308,9 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
 def fitting(logits: Any, labels: Any, objective: Objective) -> Any:
     """Return the mean loss of letter logits (n, A) beside soft labels (n, A).
 
-    `imitation` is the KL divergence from the label, in nats. `values` is 1 - sum_a p(a) v(a), where
-    p is the softmax of the logits and v(a) is 1 if the episode succeeds after action a: its
-    gradient is the exact policy gradient.
+    There are n answers and A actions, each with a letter. `imitation` is the KL divergence from the
+    label, in nats. `values` is 1 - sum_a p(a) v(a), where p is the softmax of the logits and v(a)
+    is 1 if the episode succeeds after action a: its gradient is the exact policy gradient.
     """
     if objective == "imitation":
         return F.kl_div(F.log_softmax(logits, -1), labels, reduction="batchmean")
@@ -341,7 +345,7 @@ def _cells_loss(logits: Any, pictures: Sequence[Sight]) -> Any:
 def read_out(
     model: Any, samples: Sequence[Sample], letters: Sequence[int], batch: int = 64
 ) -> list[Floats]:
-    """Return the model's distribution over the action letters at each sample's answer, (A,) each.
+    """Return the model's distribution over A action letters at each sample's answer, (A,) each.
 
     `letters` has the letters' token ids; `batch` is the number of samples computed at once.
     """

@@ -17,8 +17,9 @@ FILE = "attribution.json"
 class LeftOut(Struct, frozen=True, kw_only=True):
     """Hold what changed when one object or message was left out of a prompt or of the fusion.
 
-    `change` is that of the likeliest action's probability, `shift` the total variation distance of
-    both answers; None if the answer without the item failed.
+    `item` is what was left out, `role` of whose prompt or of the fusion; `action` is the likeliest
+    action with it. `change` is that of this action's probability, `shift` the total variation
+    distance of both answers; None if the answer without the item failed.
     """
 
     scene: str  # id of the decision point

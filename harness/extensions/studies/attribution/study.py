@@ -264,7 +264,7 @@ def _left_out(
 def rows(result: Attribution) -> list[Row]:
     """Return a row for each kind of object or message that was left out, with 95 % intervals.
 
-    The intervals are over episodes.
+    `result` is the attribution that has them. The intervals are over episodes.
     """
     by_kind: dict[tuple[str, str], list[LeftOut]] = {}
     for each in result.left_out:

@@ -82,7 +82,7 @@ class Cell:
     def values(self) -> Mapping[str, Floats]:
         """Return success, latency (ms) and tokens of a decision, by metric, each (C, S, E).
 
-        The axes are conditions, channel seeds and episodes; unknown values are NaN.
+        The axes are C conditions, S channel seeds and E episodes; unknown values are NaN.
         """
         run = self.run
         metrics = [METRICS[SUCCESS], METRICS[LATENCY]]
@@ -98,7 +98,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class Effect:
-    """Describe how the headline metric changes with a factor, averaged over all other factors."""
+    """Describe how the headline metric changes with a factor, averaged over all other factors.
+
+    `estimate` is the second level less the first, with its interval, and `p` the corrected p-value
+    of no effect, None without an interval.
+    """
 
     condition: str  # the operating point
     what: str  # the factor and its two levels, in words; for an interaction, two factors
@@ -118,9 +122,9 @@ class Effect:
 class Halves:
     """Hold which shares of the variance between cells the choices of ego and helpers explain.
 
-    The variance is that of the headline metric over the grid's cells. What the random choice of
-    episodes adds is taken off, as estimated by a bootstrap over episodes, which also makes the
-    intervals.
+    `together` is the share of their interaction, and `apart` is `ego` less `helpers`. The variance
+    is that of the headline metric over the grid's cells. What the random choice of episodes adds is
+    taken off, as estimated by a bootstrap over episodes, which also makes the intervals.
     """
 
     condition: str  # the operating point

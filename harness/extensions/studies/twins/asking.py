@@ -35,7 +35,11 @@ Asked = tuple[Twin, str, Request, Request]  # the role, the question and its twi
 
 @dataclass(frozen=True)
 class Questions:
-    """Describe what is asked in a study of twins: a model, decision points, and their twins."""
+    """Describe what is asked in a study of twins: a model, decision points, and their twins.
+
+    A twin is the same question put another way, to which the answer is known to be related. `twins`
+    has names of kinds of twins, and `seed` is that of the draw of decision points.
+    """
 
     spec: Spec  # the evaluation: model, prompt, answer mode and episodes
     twins: tuple[str, ...]  # names of the twins
@@ -118,7 +122,10 @@ class Questions:
 
 
 def lack(spec: Spec, twin: Twin) -> str | None:
-    """Return in words what a twin needs and this evaluation lacks; None if it may apply."""
+    """Return in words what a twin needs and this evaluation lacks; None if it may apply.
+
+    A twin is a question put another way, which may need a picture or a language model.
+    """
     language_model = spec.ego.can.language_model
     if twin.actions and spec.scenario.one_sided is not None:
         return f"{twin.needs}: {spec.scenario.one_sided}"
@@ -136,9 +143,10 @@ def ask(
 ) -> tuple[list[Pair], str]:
     """Ask a model about decision points and their twins; any number of workers gives the same.
 
-    A stopped study in the folder `out` goes on; its working folder stays until `work.tidy` is
-    called. `progress` is called with 1 for each finished episode. Completions are kept in the file
-    `cache`, if there is one. Each worker has a backend of its own.
+    A twin is the same question put another way. A stopped study in the folder `out` goes on; its
+    working folder stays until `work.tidy` is called. `progress` is called with 1 for each finished
+    episode. Completions are kept in the file `cache`, if there is one. Each worker has a backend of
+    its own.
 
     Returns:
         The pairs of answers, and a text on how many questions to helpers got no answer, empty if

@@ -77,7 +77,10 @@ class Twin:
 
     @property
     def holds(self) -> str:
-        """Return what must hold of both answers, in a word or two: `same` or `TV <= 0.1`."""
+        """Return how both answers must be related, in a word or two: `same` or `TV <= 0.1`.
+
+        TV is the total variation distance of both distributions.
+        """
         if self.within is not None:
             return f"TV <= {self.within:g}"
         return "mirrored" if self.actions else "same"

@@ -20,8 +20,9 @@ ROUNDING = 1e-9
 class Pair:
     """Hold the answers to a question and to its twin, the same question put another way.
 
-    `p` and `q` (A,) are their distributions over the actions, `distance` is the total variation
-    between them, and `holds` says whether they agree as the twin demands.
+    `p` and `q` (A,) are their distributions over A actions, None if an answer failed. `distance` is
+    the total variation between them, and `holds` says whether they have the same likeliest action,
+    or are as near as the twin demands.
     """
 
     twin: str  # name of the twin
@@ -44,7 +45,8 @@ class Pair:
 class Row:
     """Hold the result of one twin in one role (who was asked), over all its pairs of answers.
 
-    `invariance_rate` is the share of pairs that agree as the twin demands, `broken` has the others.
+    `invariance_rate` is the share of pairs whose answers are related as the twin demands, `broken`
+    has the other pairs, and `failed_rate` is the share in which an answer failed.
     """
 
     twin: Twin  # how the questions were changed
@@ -63,9 +65,10 @@ def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | No
 
 
 def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bool:
-    """Return whether two answers (A,) agree as a twin demands; false if one is missing.
+    """Return whether two answers (A,) are related as a twin demands; false if one is missing.
 
-    They must be within a total variation distance, or have the same likeliest action.
+    They are distributions over A actions, and must be within a total variation distance of each
+    other, or have the same likeliest action.
     """
     if not p or not q:
         return False
@@ -104,7 +107,10 @@ def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
 
 
 def headline(table: Sequence[Row]) -> str:
-    """Return a sentence on how many twins hold in every question, and which holds least often."""
+    """Return a sentence on how many twins hold in every question, and which holds least often.
+
+    A twin holds if both answers are related as it demands.
+    """
     whole = sum(not row.broken for row in table)
     least = min(table, key=lambda row: row.invariance_rate.value)
     if not least.broken:

@@ -213,15 +213,18 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
 
 
 def constant_holds(questions: Questions, twin: Twin) -> bool:
-    """Return whether a twin holds for an ego that always gives the same answer.
+    """Return whether a twin's demand is met by an ego that always gives the same answer.
 
-    With cyclic letter orders it does: one letter then is every action alike.
+    With cyclic letter orders it is: one letter then is every action alike.
     """
     return twin.constant or questions.spec.ego.letters == "cyclic"
 
 
 def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
-    """Return a sentence on which twins hold for an ego that always gives the same answer."""
+    """Return a sentence on which twins hold for an ego that always gives the same answer.
+
+    A twin holds if the answers to both versions of a question are related as it demands.
+    """
     broken = [row.twin.name for row in rows if not constant_holds(questions, row.twin)]
     twins = "every twin"
     if broken:
