@@ -95,7 +95,8 @@ class Judged:
     def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
         """Return the decisions of policies p (n, A) that have exactly one optimal action.
 
-        `optimal` is a mask (n, A), `episode` (n,) the index of each decision's episode.
+        `optimal` is a mask (n, A) over A actions, `episode` (n,) the index of each decision's
+        episode.
         """
         hits = right(p, optimal)
         is_judged = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)

@@ -138,7 +138,7 @@ class Success:
         return Spread(np.array([part.mean() for part in parts]), np.stack(variances, axis=-1))
 
     def resampled(self, draws: np.random.Generator, times: int) -> Ints:
-        """Return how often each episode counts in bootstrap resamples, (1 + times, E).
+        """Return how often each of E episodes counts in bootstrap resamples, (1 + times, E).
 
         The first row is the sample itself. Episodes with and without a danger are resampled apart.
         """
@@ -148,15 +148,19 @@ class Success:
         return counts
 
     def weights(self, counts: Ints) -> Floats:
-        """Return each episode's weight in the mean, (..., E), if it counts `counts` times."""
+        """Return each episode's weight in the mean, (..., E), if it counts `counts` times.
+
+        The last axis has the E episodes of the rule, in `counts` as well.
+        """
         shares = sum(part / (len(self.parts) * part.sum()) for part in self.parts)
         return np.asarray(counts * shares)
 
     @property
     def parts(self) -> list[Bools]:
-        """Return the masks (E,) of the groups that are averaged first: all, or both halves.
+        """Return the masks (E,) of the groups of E episodes that are averaged first.
 
-        The mean by this rule is the mean of the groups' means.
+        It is one of all, or those with a danger and those without. The mean by this rule is the
+        mean of the groups' means.
         """
         halves = [self.dangerous, ~self.dangerous]
         return halves if self.metric == BALANCED else [np.ones_like(self.dangerous)]

@@ -64,7 +64,7 @@ Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, 
 
 @dataclass(frozen=True)
 class WalkResult:
-    """Hold the results of one operating point for all channel seeds S and some episodes E.
+    """Hold the results of one operating point for S channel seeds and E of the episodes.
 
     `ends` has outcomes by metric, (S, E); `columns` has values of the n decisions, and `places`
     each decision's index in the flattened (S, E).
@@ -134,9 +134,9 @@ def walk_through(
         points: the operating points.
         ask: returns what vehicles intend in scenes.
         seeds: channel seeds, S of them.
-        episodes: numbers of the episodes, ascending, (E,).
+        episodes: numbers of the E episodes, ascending, (E,).
         ties: which of equally likely actions is taken, `drawn` or `first`.
-        read: returns columns of some decisions, (n,), or (n, H) for messages; they are rounded, and
+        read: returns columns of n decisions, (n,), or (n, H) for H messages; they are rounded, and
             NaN where a step has fewer helpers. The index is into (S, E) in row-major order.
     """
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
@@ -284,7 +284,7 @@ def _estimates(
 
 
 def over_own_episodes(name: str, values: Floats) -> Estimate:
-    """Return the mean of a metric's values (S, E) with Student's t over seeds.
+    """Return the mean of a metric's values (S, E) with Student's t over S seeds.
 
     It is for seeds that have different episodes. A stratified share of E episodes is exact but for
     rounding to whole ones, so that seeds may agree to the last episode and be wrong by the same.

@@ -226,7 +226,7 @@ class Repeats:
 def flips(counts: Ints) -> Floats:
     """Return the share of pairs of repeats with different actions, (...); NaN without any pair.
 
-    `counts` (..., A) is the number of repeats that took each action.
+    `counts` (..., A) is the number of repeats that took each of A actions.
     """
     n = counts.sum(axis=-1)
     pairs, same = n * (n - 1), (counts * (counts - 1)).sum(axis=-1)
@@ -236,7 +236,7 @@ def flips(counts: Ints) -> Floats:
 def stable(counts: Ints) -> Floats:
     """Return 1 where all repeats took the same action, else 0, (...); NaN for fewer than two.
 
-    `counts` (..., A) is the number of repeats that took each action.
+    `counts` (..., A) is the number of repeats that took each of A actions.
     """
     n = counts.sum(axis=-1)
     return np.where(n > 1, counts.max(axis=-1) == n, np.nan)

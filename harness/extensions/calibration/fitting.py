@@ -52,8 +52,9 @@ class Fitted:
 def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
     """Fit a correction on answers `p` (n, A) and a mask of the optimal actions there, (n, A).
 
-    Level `L0` has a prior, the mean of all answers; `L1` the temperature with the best likelihood,
-    of equal ones that nearest to 1. Raises UserError for `L1` if no action is optimal anywhere.
+    There are n answers over A actions. Level `L0` has a prior, the mean of all answers; `L1` the
+    temperature with the best likelihood, of equal ones that nearest to 1. Raises UserError for `L1`
+    if no action is optimal anywhere.
     """
     prior: tuple[float, ...] = ()
     if "L0" in level:
@@ -76,8 +77,8 @@ def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
 def nats_of(p: Floats, optimal: Bools) -> float:
     """Return the mean negative log-likelihood of the optimal actions, in nats.
 
-    `p` (n, A) has answers and `optimal` (n, A) a mask; answers without an optimal action are left
-    out. NaN if that leaves none.
+    `p` (n, A) has n answers over A actions and `optimal` (n, A) is a mask; answers without an
+    optimal action are left out. NaN if that leaves none.
     """
     return float(np.nanmean(likelihood_nats(p, optimal))) if optimal.any() else float("nan")
 

@@ -465,7 +465,7 @@ def witnesses(run: ReplayedRun) -> Ints:
 def groups(model: Model) -> dict[str, dict[str, Bools]]:
     """Return groups of episodes by how many helpers see the danger, by the group's name.
 
-    Each has a mask of the episodes, (E,), of every family.
+    Each has a mask of the E episodes of every family of scenes, (E,), by the family's name.
     """
     counts = {family: witnesses(run) for family, run in model.runs.items()}
     most = max(int(of_family.max()) for of_family in counts.values())

@@ -218,8 +218,8 @@ class Computer(Timer):
     ) -> Floats:
         """Return the joules of each vehicle's answer in n scenes, `(n, 1+H)`, the ego first.
 
-        `answers` are by request id. NaN for an answer that is missing, has no known tokens, or came
-        from a cloud; 0 where there is no vehicle.
+        The H helpers follow. `answers` are by request id. NaN for an answer that is missing, has no
+        known tokens, or came from a cloud; 0 where there is no vehicle.
         """
         joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
         for n, scene in enumerate(scenes):

@@ -92,12 +92,12 @@ class Play:
         return self.success_rule.mean(self.success)
 
     def of(self, cost: str) -> Floats:
-        """Return one of `COSTS`, by its name, of every episode, (S, E)."""
+        """Return one of `COSTS`, by its name, of E episodes under S channel seeds, (S, E)."""
         return np.asarray(self.costs[..., COSTS.index(cost)])
 
     @property
     def messages(self) -> Floats:
-        """Return the number of messages of every episode, (S, E)."""
+        """Return the number of messages of E episodes under S channel seeds, (S, E)."""
         return self.of("messages")
 
     @property

@@ -88,7 +88,10 @@ class Pair:
     episodes: tuple[int, ...]  # numbers of the episodes that both have, ascending
 
     def values(self, side: Side, metric: str, condition: str) -> Floats:
-        """Return a run's metric in the shared episodes and seeds, (E, S); NaN where unknown."""
+        """Return a metric of a run in the E shared episodes and S shared seeds, (E, S).
+
+        NaN where unknown. `side` is the run, A or B.
+        """
         grid = side.run.grid
         seeds = [grid.seeds.index(seed) for seed in self.seeds]
         episodes = [grid.episodes.index(episode) for episode in self.episodes]

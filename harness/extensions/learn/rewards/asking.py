@@ -106,7 +106,7 @@ Worth = Callable[[Sequence[float], Sequence[float]], float]
 def driven(p: Sequence[float], values: Sequence[float]) -> float:
     """Return the worth of a distribution's likeliest action; of equally likely ones, their mean.
 
-    `p` (A,) is the distribution, `values` (A,) each action's probability of success.
+    `p` (A,) is the distribution over A actions, `values` (A,) each one's probability of success.
     """
     likeliest = np.array(p) == max(p)
     return float(np.mean(np.array(values)[likeliest]))
@@ -126,9 +126,9 @@ def earned(
 ) -> float:
     """Return the advantage of an answer: its worth less that of the scenario's constant action.
 
-    `values` (A,) has each action's worth, `constant` is an action's index, and `worth` says what a
-    distribution is worth. An answer that cannot be parsed has worth 0. `how` are arguments of
-    `intent`.
+    `values` (A,) has the worth of each of A actions, `constant` is an action's index, and `worth`
+    says what a distribution is worth. An answer that cannot be parsed has worth 0. `how` are
+    arguments of `intent`.
     """
     p = intent(text, **how)
     return (0.0 if p is None else worth(p, values)) - float(values[constant])

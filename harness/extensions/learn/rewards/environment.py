@@ -147,10 +147,11 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         return self._look()
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Take an action, given as an index or as a distribution (A,), which is normalised.
+        """Take an action, given as an index or as a distribution over A actions, (A,).
 
-        Returns observation, reward, whether the episode ended, False, and `info`, as Gymnasium
-        asks. Raises UserError before `reset`, after the end, or if it is not an action.
+        A distribution is normalised. Returns observation, reward, whether the episode ended, False,
+        and `info`, as Gymnasium asks. Raises UserError before `reset`, after the end, or if it is
+        not an action.
         """
         if self.trip is None or self.trip.success is not None:
             raise UserError("no episode is under way; call reset() first")

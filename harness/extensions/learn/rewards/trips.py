@@ -40,7 +40,7 @@ class Trip(Protocol):
 
     @property
     def values(self) -> Floats:
-        """Return the probability of success after each action at this point, (A,)."""
+        """Return the probability of success after each of A actions at this point, (A,)."""
         ...
 
     @property

@@ -59,7 +59,7 @@ class Values:
         return cls(forest.ids, forest.actions, then, table)
 
     def __call__(self, points: Sequence[str] | Ints, p: Floats | None = None) -> Floats:
-        """Return the worth of each action at n decision points, (n, A).
+        """Return the worth of each of A actions at n decision points, (n, A).
 
         Given distributions `p` (n, A), return their mean worth, (n,). The points are ids, or
         indices into `ids`, which is faster. Raises KeyError for an unknown id.
@@ -91,7 +91,7 @@ class Values:
 
 
 def balanced(success: Floats | Bools, dangerous: Bools) -> float:
-    """Return the mean success (E,) of layouts, where those with and without a danger weigh alike.
+    """Return the mean success (E,) of E layouts, where those with and without a danger weigh alike.
 
     `dangerous` (E,) says which have one. If all are of one kind, it is their plain mean.
     """
@@ -102,7 +102,7 @@ def balanced(success: Floats | Bools, dangerous: Bools) -> float:
 def best_constant(forest: Forest, dangerous: Bools) -> int:
     """Return the index of the action that succeeds most if always taken, by balanced success.
 
-    `dangerous` (E,) says which layouts have a danger. Of equal actions it is the first.
+    `dangerous` (E,) says which of E layouts have a danger. Of equal actions it is the first.
     """
     success = [balanced(forest.constant_success(action), dangerous) for action in forest.actions]
     return int(np.argmax(success))

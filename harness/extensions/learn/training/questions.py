@@ -88,8 +88,9 @@ def with_messages(
 ) -> Iterator[Question]:
     """Yield questions to the ego that show helpers' messages, by scene and prompt version.
 
-    `intents` has each helper's intent (A,), by the `key` of its question. Each message arrives with
-    probability 0.85, by draws keyed by layout and scene; a scene in which none arrives is left out.
+    `intents` has each helper's intent over A actions, (A,), by the `key` of its question. Each
+    message arrives with probability 0.85, by draws keyed by layout and scene; a scene in which none
+    arrives is left out.
     """
     for scene in scenes:
         ego, *helpers = scene.viewers

@@ -113,7 +113,10 @@ class Student:
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
-        """Return samples of questions, answered by JSON that states these intents, (A,) each."""
+        """Return samples of questions, answered by JSON that states these intents.
+
+        An intent is a distribution over A actions, (A,).
+        """
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         samples = []
         for q, intent, is_bare in zip(questions, intents, bare.tolist(), strict=True):

@@ -51,8 +51,8 @@ KEEP_S = 60.0  # a killed run loses at most so much
 class Sample:
     """Hold one training sequence: token ids of a prompt and its answer, and the answer's target.
 
-    The target (A,) is a distribution over action letters; None where the answer is free text. The
-    first `shared` tokens are equal in all samples of a `kind`.
+    The target (A,) is a distribution over the letters of A actions; None where the answer is free
+    text. The first `shared` tokens are equal in all samples of a `kind`.
     """
 
     ids: NDArray[np.int32]  # token ids, the shared beginning included
