@@ -117,7 +117,7 @@ def calibrate(
     if not fitted or fitted[0].role != "ego":
         raise UserError(f"{name}: no answer of the ego could be read, so there is nothing to fit")
     corrections = {each.role: each.correction for each in fitted}
-    seeds = stated(first, last - first + 1)
+    seeds = seeds_text(first, last - first + 1)
     calibration = Calibration(
         level,
         command,

@@ -169,7 +169,7 @@ def check(
     lines = []
     for result in results:
         what, factor = scales[result.what]
-        measured = shown(result.measured, Unit(factor=factor))
+        measured = interval_of(result.measured, Unit(factor=factor))
         profile_says = _or_unknown(result.stated, f"{result.stated * factor:.1f}")
         role, n = role_word(result.role), str(result.measured.n)
         lines.append((role, what, measured, profile_says, n))

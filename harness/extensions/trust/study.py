@@ -578,7 +578,7 @@ def _detections(bench: Bench) -> Iterator[Table]:
         rows = []
         for cell in bench.cells.values():
             if cell.rule == rule and cell.flagged is not None:
-                shares = [shown(estimate) for estimate in cell.detection().values()]
+                shares = [interval_of(estimate) for estimate in cell.detection().values()]
                 time = f"{cell.time_to_detection:.0f}" if cell.caught else "–"
                 caught = f"{len(cell.caught)} of {len(cell.first)}"
                 attack = cell.attack or "nobody attacks"
