@@ -21,6 +21,11 @@ RULES = {
     "spread": "`*map(…)`, or `**(… if … else …)`",
     "walrus": "`:=` outside the test of an if or while",
     "unformatted": "`fmt: skip` or `fmt: off`",
+    "word": "a variable, parameter or function named by a participle or a pronoun alone",
+}
+ALONE = {
+    *("asked", "begun", "found", "going", "its", "known", "lead", "leading", "leads", "own", "said"),
+    *("shown", "stated", "theirs", "told"),
 }
 Place = tuple[str, int]  # a rule, and the line that breaks it
 
@@ -32,6 +37,7 @@ def broken(source: str) -> Iterator[Place]:
             yield "unformatted", number
     tree = ast.parse(source)
     in_tests = {id(node) for test in _tests(tree) for node in ast.walk(test)}
+    fields = {id(field) for field in _fields(tree)}
     for node in ast.walk(tree):
         if isinstance(node, COMPREHENSIONS):
             inner = [each for each in ast.walk(node) if isinstance(each, COMPREHENSIONS)]
@@ -41,6 +47,19 @@ def broken(source: str) -> Iterator[Place]:
             yield "walrus", node.lineno
         elif _is_spread(node):
             yield "spread", getattr(node, "lineno", 0)
+        if _named(node).strip("_") in ALONE and id(node) not in fields:
+            yield "word", getattr(node, "lineno", 0)
+
+
+def _named(node: ast.AST) -> str:
+    """Return the name that a node gives a variable, a parameter or a function; else nothing."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+        return node.name
+    if isinstance(node, ast.arg):
+        return node.arg
+    if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+        return node.id
+    return ""
 
 
 def _tests(tree: ast.AST) -> Iterator[ast.expr]:
@@ -48,6 +67,13 @@ def _tests(tree: ast.AST) -> Iterator[ast.expr]:
     for node in ast.walk(tree):
         if isinstance(node, ast.If | ast.While):
             yield node.test
+
+
+def _fields(tree: ast.AST) -> Iterator[ast.expr]:
+    """Yield the names of fields of classes: they are read behind the name of their object."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ClassDef):
+            yield from (each.target for each in node.body if isinstance(each, ast.AnnAssign))
 
 
 def _is_spread(node: ast.AST) -> bool:

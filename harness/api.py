@@ -77,8 +77,8 @@ class Run(Tables):
         from harness.report.findings import Kind, findings
 
         def cell(score: Score) -> str:
-            shown = words.score_texts(score)
-            return shown["value"] + (f" [{shown['interval']}]" if shown["interval"] else "")
+            texts = words.score_texts(score)
+            return texts["value"] + (f" [{texts['interval']}]" if texts["interval"] else "")
 
         import pandas as pd
 

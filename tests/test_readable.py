@@ -19,6 +19,8 @@ BROKEN = {
     "x = [a for b in c if (a := b)]": ["walrus"],
     "if (a := f()):\n    pass\nwhile b := g():\n    pass": [],
     "x = 1  # fmt: skip": ["unformatted"],
+    "def found(self, own):\n    for its in own:\n        pass": ["word", "word", "word"],
+    "class A:\n    own: int\n    own_s: float": [],
 }
 
 

@@ -157,7 +157,7 @@ def _settings(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
         "purpose": purpose(seed, episodes),
         "versions": versions,
     }
-    if scenario.world and (config := scenario.world.stated(scenario)):
+    if scenario.world and (config := scenario.world.configuration(scenario)):
         settings["environment"] = config
     return settings
 

@@ -98,7 +98,7 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
         yield f"[parameters] has no {', '.join(sorted(missing))}"
     if scenario.world is None:
         return
-    here, stated_environment = scenario.world.stated(scenario) or {}, manifest.environment
+    here, stated_environment = scenario.world.configuration(scenario) or {}, manifest.environment
     if stated_environment != here:
         there = stated_environment or {}
         differing = sorted(key for key, value in here.items() if there.get(key, here) != value)

@@ -44,7 +44,7 @@ class OwnWorld(World):
         """
 
     @classmethod
-    def stated(cls, scenario: Scenario) -> Mapping[str, Any] | None:
+    def configuration(cls, scenario: Scenario) -> Mapping[str, Any] | None:
         """Return what a dataset's manifest holds of how such worlds are made, as plain values;
         None for nothing.
         """

@@ -101,7 +101,7 @@ class EnvironmentWorld(OwnWorld):
         examine(scenario, seed)
 
     @classmethod
-    def stated(cls, scenario: Scenario) -> dict[str, Any]:
+    def configuration(cls, scenario: Scenario) -> dict[str, Any]:
         """Return the environment's whole configuration, by key, for a dataset's manifest.
 
         Its name and package decide what that is.
