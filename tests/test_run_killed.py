@@ -292,6 +292,25 @@ def test_other_settings_are_refused_by_name_and_change_nothing(
     assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
 
+@pytest.mark.parametrize(
+    "latency",
+    [
+        {"ego_s": 0.001, "helper_s": 0.001, "fusion_s": 0.001},
+        {"source": "measured"},
+        {"source": "declared"},
+    ],
+)
+def test_a_resumed_run_has_the_latency_that_its_settings_say(
+    latency: dict[str, Any], answers: bytes, small: Dataset, tmp_path: Path
+) -> None:
+    out = unfinished(spec_of(small), tmp_path / "stopped", answers)
+    config = out / ".work" / "config.json"
+    start = json.loads(config.read_text())
+    config.write_text(json.dumps({**start, "latency": {**start["latency"], **latency}}))
+    with pytest.raises(UserError, match="the run began with times of answers from"):
+        run(spec_of(small), out)
+
+
 @pytest.mark.parametrize("world", [None, [], "frozen"])
 def test_a_begun_run_whose_world_is_damaged_is_another_run(
     world: Any, answers: bytes, small: Dataset, tmp_path: Path

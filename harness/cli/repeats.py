@@ -41,9 +41,9 @@ def evaluate(
     spec: "Spec", repeats: int, out: Path | None, cache: Path | None, quiet: bool, as_json: bool
 ) -> None:
     """Evaluate every repeat, write the study of how they differ, and print it."""
-    from harness.studies.repeats import FIGURES, MARKER, PAGE, each, repeats_study, run_repeats
+    from harness.studies.repeats import MARKER, WRITTEN, each, repeats_study, run_repeats
 
-    group = RunGroup(each(spec, repeats), "finished repeats", MARKER, (FIGURES, PAGE))
+    group = RunGroup(each(spec, repeats), "finished repeats", MARKER, WRITTEN)
     folder = out or free_folder([spec], f"{spec.source.name}-repeats", group.goes_on)
     group.check(folder)
     name = printable(spec.ego.card.name, 30)

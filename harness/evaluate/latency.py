@@ -107,6 +107,11 @@ def declared(text: str) -> Latency:
     )
 
 
+def same_times(one: Latency, other: Latency) -> bool:
+    """Return whether two latencies are of one source and give every answer the same seconds."""
+    return replace(one, basis="", sample={}) == replace(other, basis="", sample={})
+
+
 def as_declared(latency: Latency) -> str:
     """Return the text by which `declared` gives these times."""
     helpers = ":".join(map(str, latency.helpers_s or (latency.helper_s,)))

@@ -20,7 +20,7 @@ from harness.backends.base import Backend, Served, same_model
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
-from harness.core.errors import Unanswered, UserError, in_range
+from harness.core.errors import Unanswered, UserError, in_range, printable
 from harness.core.files import write_whole
 from harness.core.formats import WORK
 from harness.core.memory import uncollected
@@ -611,13 +611,25 @@ def _identity_and_latency(spec: Spec, run_start: RunStart | None) -> tuple[dict[
 
 
 def _latency(spec: Spec, run_start: RunStart | None, models: Sequence[Backend]) -> Latency:
-    """Return the latency that a resumed run began with, or that of a new run."""
-    if run_start:
-        return run_start.latency
+    """Return the latency of a run: what its settings say, or what is measured.
+
+    A resumed run has what it measured when it began. Raises UserError if it began with another
+    latency than its settings say.
+    """
     if spec.timer:
-        return spec.timer.latency(spec.agents)
-    declared = latencies.chosen_latency(spec.settings.latency, spec.agents, models)
-    return declared or timing.measured(spec, together(spec.cards, models), _trial(spec))
+        declared: Latency | None = spec.timer.latency(spec.agents)
+    else:
+        declared = latencies.chosen_latency(spec.settings.latency, spec.agents, models)
+    if run_start is None:
+        return declared or timing.measured(spec, together(spec.cards, models), _trial(spec))
+    began = run_start.latency
+    is_measured = declared is None and began.source == latencies.MEASURED
+    if not is_measured and (declared is None or not latencies.same_times(began, declared)):
+        raise UserError(
+            f"the run began with times of answers from {printable(began.source)} that its settings "
+            "do not give; choose another folder, or delete this one"
+        )
+    return began if declared is None else declared
 
 
 def _trial(spec: Spec) -> Sequence[Scene]:

@@ -34,7 +34,7 @@ from harness.report.findings import Kind, of_runs
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, METRICS, SUCCESS, by_episode, in_range
 from harness.runs.records import Score
-from harness.studies.study import Study
+from harness.studies.study import DRAWN, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -300,6 +300,8 @@ def _doubt(p: Floats) -> tuple[float, float]:
 
 
 MARKER, FIGURES, PAGE = "repeats.json", "repeats.csv", "index.html"
+# what stands in the folder before its marker: pictures, tables and the page
+WRITTEN = (*(f"repeats.{kind}" for kind in ("csv", "jsonl", *DRAWN)), PAGE)
 MOST_POINTS = 12  # of those at which repeats disagree
 MOST_DRAWN = 5  # of j of pass^j and any@j, besides the last
 NATS = Unit("nats", 2)

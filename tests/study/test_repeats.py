@@ -25,9 +25,11 @@ from harness.runs.metrics import ALL, SUCCESS
 from harness.studies.repeats import (
     DOUBT,
     FLIPS,
+    MARKER,
     SAMPLED,
     STABLE,
     STATED,
+    WRITTEN,
     Repeats,
     all_of,
     any_of,
@@ -282,6 +284,10 @@ def test_the_folder_has_a_page_and_all_figures(
     found = {listed.name: (listed.kind, listed.state) for listed in runs(tmp_path)}
     assert found["repeats"] == ("repeats", "finished")
     assert found["repeats/repeat-2"] == ("eval", "finished")
+    # killed before its last file, the command goes on in this folder
+    (of.path / MARKER).unlink()
+    names = {path.name for path in of.path.iterdir()}
+    assert "repeats.svg" in names <= {*WRITTEN, *(run.path.name for run in of.runs)}
 
 
 @pytest.mark.slow
