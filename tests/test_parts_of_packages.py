@@ -241,3 +241,19 @@ def test_an_obstacle_is_one_line_or_none() -> None:
     for said in ("", " \n", 5, ["x"]):
         with pytest.raises(UserError, match=r"^part mine of package by-hand fails .* no text, and"):
             told(said)
+
+
+class Echo(Part, frozen=True, kw_only=True):
+    echo: int = 0
+    loud: bool = False
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "allowed"),
+    [("echo", "abc", "a whole number"), ("loud", 3, "true or false")],
+)
+def test_a_setting_whose_type_says_no_range_is_refused_by_its_type(
+    setting: str, value: Any, allowed: str
+) -> None:
+    with pytest.raises(ValueError, match=f"{setting} is .*; it must be {allowed}"):
+        Echo(**{setting: value})

@@ -39,6 +39,8 @@ RELAY, FUSION = "relay", "fusion"
 EDGES = ("none", RELAY, FUSION)
 MOST_HELPERS = 1000
 
+# what a setting must be whose type says no more
+BARE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 Metres = Annotated[float, Meta(gt=0, le=1e6, description="metres above 0, at most 1000000")]
 Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -10000 to 10000")]
 Text = Annotated[str, Meta(description="a text")]
@@ -163,7 +165,8 @@ class Part(Struct, frozen=True, kw_only=True):
                 if isinstance(converted, float) and not math.isfinite(converted):
                     raise ValidationError
             except (ValidationError, OverflowError):
-                raise wrong(key, value, str(description(hint))) from None
+                allowed = description(hint) or BARE.get(hint, "of its type")
+                raise wrong(key, value, allowed) from None
             if isinstance(converted, float) and abs(converted) > LARGEST:
                 raise wrong(key, value, f"{description(hint)}, and no larger than {LARGEST:.2g}")
             structs.force_setattr(self, key, converted)
