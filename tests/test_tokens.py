@@ -6,7 +6,10 @@ from typing import Any
 
 import pytest
 
+from harness.backends.base import Request
 from harness.backends.cards import resolve
+from harness.backends.registry import capabilities
+from harness.backends.token_counts import too_few
 from harness.backends.tokens import counter, tokenizer
 from harness.core.errors import UserError
 from harness.core.resources import find
@@ -167,3 +170,24 @@ def test_a_token_around_a_whole_prompt_is_not_counted_for_each_message(tmp_path:
     assert len(tokenizer(tmp_path).encode("a").ids) == 2
     counts = [counted(MESSAGES) for source in (SHIPPED, tmp_path) if (counted := counter(source))]
     assert counts[0] == counts[1]
+
+
+@pytest.mark.parametrize(
+    ("engine", "answer", "counts", "said"),
+    [
+        ("transformers", "json", (5, 2), None),
+        ("transformers", "json", (4, 2), "4 tokens of a prompt with 80 characters"),
+        ("transformers", "json", (5, 1), "1 tokens of a text with 17 characters"),
+        ("transformers", "readout", (5, 1), None),  # whose text is made here
+        ("openai", "json", (1, 2), None),  # a server may have cut its prompt
+        ("openai", "json", (5, 1), "1 tokens of a text with 17 characters"),
+        ("transformers", "json", (None, None), None),
+        ("proxy", "json", (None, 0), None),
+    ],
+)
+def test_a_text_has_a_token_in_sixteen_characters(
+    engine: str, answer: Any, counts: tuple[int | None, int | None], said: str | None
+) -> None:
+    messages: Any = ({"role": "system", "content": "s" * 30}, {"role": "user", "content": "u" * 50})
+    request = Request("s/v1", "ego", messages, ("IDLE", "FASTER"), answer=answer)
+    assert too_few(request, capabilities(engine), "a" * 17, *counts) == said

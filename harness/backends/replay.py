@@ -13,7 +13,8 @@ from harness.backends.base import AGAIN, BARE, Backend, Completion, Request, fai
 from harness.backends.cache import cached, default_file
 from harness.backends.card import Card
 from harness.backends.cards import find_own
-from harness.backends.registry import BUILT_IN, ENGINES, open_backend
+from harness.backends.registry import BUILT_IN, ENGINES, capabilities, open_backend
+from harness.backends.token_counts import too_few
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
@@ -169,6 +170,13 @@ class Replay:
             )
         if delay := self._run.undeclared_delay(answer):
             raise UserError(f"{printable(self._run.path)} states {delay}")
+        can = capabilities(agent["model"]["engine"])
+        counts = answer.prompt_tokens, answer.completion_tokens
+        if answer.error is None and (few := too_few(request, can, answer.raw, *counts)):
+            raise UserError(
+                f"{printable(self._run.path)} states {few}, too few, of {request.id}; make the run "
+                "again"
+            )
         whole = Completion(request.id, answer.raw, **{name: answer.cell(name) for name in _KEPT})
         return _turn(whole, answer.first, again) if answer.first else whole
 

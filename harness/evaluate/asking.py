@@ -20,6 +20,7 @@ from msgspec import UNSET, UnsetType
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
 from harness.backends.card import Card
+from harness.backends.token_counts import too_few
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
@@ -260,6 +261,14 @@ class Asker:
             raise UserError(
                 f"{printable(self._kept.file)}: answer {printable(request.id)} is to another "
                 f"prompt or picture than is asked; {ASKED_AGAIN}"
+            )
+        can = self.spec.agents[request.agent].can
+        counts = answer.prompt_tokens, answer.completion_tokens
+        if few := too_few(request, can, answer.raw, *counts):
+            assert self._kept
+            raise UserError(
+                f"{printable(self._kept.file)}: answer {printable(request.id)} states {few}, too "
+                f"few; {ASKED_AGAIN}"
             )
         self._unasked.remove(request.id)
 

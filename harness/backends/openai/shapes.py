@@ -16,6 +16,7 @@ from harness.backends.openai.constraint import broken, constraint
 from harness.backends.openai.endings import ending
 from harness.backends.openai.said import NoText, in_texts, refusal, thought
 from harness.backends.servers import MOST_LOGPROBS, Kind, Server
+from harness.backends.token_counts import least_tokens
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.prompts.readout import answer_json, letters, spelt
@@ -24,8 +25,6 @@ _REMEDY = (
     "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
 )
 MOST_TOKENS = 10**7  # more than any context; what a server counts beyond is no count
-# of a token, on average over a text: whoever counts fewer tokens has not counted
-MOST_CHARACTERS = 16
 # Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1,
 # vLLM by the checkpoint's generation_config.json), and JSON repeats itself.
 _PENALTY: Mapping[Kind, str] = {
@@ -207,5 +206,5 @@ def tokens_in(value: Any, characters: int = 0) -> int | None:
 
     None if it is no count, or too small or large for the text: latency and energy follow from it.
     """
-    least = math.ceil(characters / MOST_CHARACTERS)
-    return value if type(value) is int and least <= value <= MOST_TOKENS else None
+    is_count = type(value) is int and least_tokens(characters) <= value <= MOST_TOKENS
+    return value if is_count else None

@@ -101,7 +101,9 @@ def distill(
         raise unknown("--objective", objective, OBJECTIVES)
     start, adapt = _base(base, lora, rank, rate, dtype, report)
     versions = [prompts.load(version) for version in dict.fromkeys(prompt)]
-    driven = [ready_to_drive(name, layouts, first_seed) for name in dict.fromkeys(scenario)]
+    driven = [
+        ready_to_drive(name, layouts, first_seed, "--layouts") for name in dict.fromkeys(scenario)
+    ]
     if purpose(first_seed, layouts) != "train":
         raise UserError(
             f"--first-seed {first_seed}: {seeds_text(first_seed, layouts)}; a model learns from "

@@ -1,0 +1,36 @@
+"""Bound token counts by their texts: latency and energy follow from them."""
+
+import math
+
+from harness.backends.base import Request
+from harness.backends.registry import Capabilities
+
+MOST_CHARACTERS = 16  # of a token, on average over a text: whoever counts fewer has not counted
+
+
+def least_tokens(characters: int) -> int:
+    """Return the fewest tokens that a text of so many characters has."""
+    return math.ceil(characters / MOST_CHARACTERS)
+
+
+def too_few(
+    request: Request,
+    can: Capabilities,
+    text: str,
+    prompt_tokens: int | None,
+    completion_tokens: int | None,
+) -> str | None:
+    """Return which count of a model's answer is too small for its text, as a phrase; None if none.
+
+    `text` is the answer's. The text of a read-out is not its model's, so its tokens are not held
+    against it; nor are those of a server's prompt, which it may have cut.
+    """
+    of_prompt = sum(len(message["content"]) for message in request.messages)
+    of_text = 0 if request.bare or not can.language_model else len(text)
+    for tokens, characters, what in (
+        (prompt_tokens, of_prompt if can.has_weights else 0, "prompt"),
+        (completion_tokens, of_text, "text"),
+    ):
+        if tokens is not None and tokens < least_tokens(characters):
+            return f"{tokens} tokens of a {what} with {characters} characters"
+    return None
