@@ -189,5 +189,6 @@ def test_a_text_has_a_token_in_sixteen_characters(
     engine: str, answer: Any, counts: tuple[int | None, int | None], said: str | None
 ) -> None:
     messages: Any = ({"role": "system", "content": "s" * 30}, {"role": "user", "content": "u" * 50})
-    request = Request("s/v1", "ego", messages, ("IDLE", "FASTER"), answer=answer)
+    actions = ("IDLE", "FASTER")
+    request = Request("s/v1", "ego", messages, actions, max_tokens=9, answer=answer)
     assert too_few(request, capabilities(engine), "a" * 17, *counts) == said
