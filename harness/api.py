@@ -269,6 +269,7 @@ def run(
         for name, value in options.items()
     }
     run_settings = settings.changed(settings.Settings(world=kind()), given)
+    settings.check_extensions(run_settings, "settings")
     source: Source
     if isinstance(run_settings.world, settings.FrozenSettings):
         source = resolve.frozen(run_settings.world, run_settings.world.dataset)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, sayable
 
 PROMPT = "v3"  # what one's own prompt begins as
 
@@ -24,14 +24,16 @@ def command(
     from harness.core import resources
 
     starter = Path(__file__).parent / "starter"
+    sayable("folder", folder.name)
+    place = folder.resolve()  # `absent/../mine` is there once `absent` is made
     try:
-        if folder.exists() and (
-            not folder.is_dir() or {path.name for path in folder.iterdir()} - {".git"}
+        if place.exists() and (
+            not place.is_dir() or {path.name for path in place.iterdir()} - {".git"}
         ):
             raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")
-        folder.mkdir(parents=True, exist_ok=True)
+        place.mkdir(parents=True, exist_ok=True)
         # so that a full disk leaves nothing half-written
-        with TemporaryDirectory(dir=folder) as draft:
+        with TemporaryDirectory(dir=place) as draft:
             # Contents alone: what is installed may be read-only, and a project is there to be
             # changed.
             copytree(starter, draft, copy_function=copyfile, dirs_exist_ok=True)
@@ -41,7 +43,7 @@ def command(
                 copy_function=copyfile,
             )
             for whole in Path(draft).iterdir():
-                whole.rename(folder / whole.name)
+                whole.rename(place / whole.name)
     except OSError as error:
         reason = printable(error.strerror)
         raise UserError(

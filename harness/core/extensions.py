@@ -170,7 +170,7 @@ def control_settings() -> dict[str, str]:
 
 def part_of(extension: str) -> str:
     """Return the phrase, for messages, that something is part of an extension not installed."""
-    return f"part of the extension {extension}, which is not installed"
+    return f"part of the extension {printable(extension)}, which is not installed"
 
 
 def _extension_of(entry: Any) -> str:

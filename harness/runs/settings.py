@@ -653,7 +653,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     settings = changed(_as_driven(file_settings, file.parent), given)
     if not isinstance(settings.world, world):
         raise UserError(f"{where} are of `harness {COMMANDS[kind_of(settings)]}`; type that")
-    _check_extensions(settings, where)
+    check_extensions(settings, where)
     if file.name == FILE and (file.parent / "run.json").is_file():
         _say_otherwise(changed(file_settings, given), file, given)
     typed_only = {name: words for name, words in _only_typed(settings).items() if name not in given}
@@ -704,7 +704,7 @@ def _say_otherwise(settings: Settings, file: Path, given: Mapping[str, Any]) -> 
             )
 
 
-def _check_extensions(settings: Settings, where: str) -> None:
+def check_extensions(settings: Settings, where: str) -> None:
     """Raise UserError if a file sets what no extension has, or to another kind of value."""
     known_settings = of_extensions()
     for name, value in settings.extensions.items():

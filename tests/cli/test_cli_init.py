@@ -171,3 +171,17 @@ def test_an_empty_folder_will_do(harness: Harness, tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {
         "README.md", "models", "prompts", "settings.toml", "swarmdrive.toml",
     }  # fmt: skip
+
+
+def test_what_is_there_already_is_not_written_over(harness: Harness, tmp_path: Path) -> None:
+    """By whatever path it is named; nor is a folder made whose name nothing can show."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "README.md").write_text("mine")
+    for typed in (mine, tmp_path / "absent" / ".." / "mine"):
+        code, _, err = harness("init", typed)
+        assert (code, "is not empty; give a new folder" in err) == (2, True)
+    assert (mine / "README.md").read_text() == "mine"
+    code, _, err = harness("init", tmp_path / "x\x1b[31m")
+    assert (code, "has characters that nothing can show" in err) == (2, True)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]

@@ -21,7 +21,7 @@ from harness.cli.terminal import echo_json, echo_prompt_tokens
 from harness.core import extras, resources, work
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import WORK
-from harness.core.seeds import FIRST
+from harness.core.seeds import FIRST, LAST_EPISODE
 from harness.runs.formats import settings_as_file
 from harness.runs.settings import OUTPUT, FrozenSettings, Settings
 
@@ -103,6 +103,8 @@ def command(
     sizes = {} if reflect else choices(base)
     given_layouts = given(tune, [manifest for manifest, _ in manifests]) if tune else []
     in_range("--layouts", layouts, 2, FIRST["train"])
+    if (limit := settings.world.limit) is not None:  # type: ignore[union-attr]
+        in_range("--limit", limit, 1, LAST_EPISODE + 1)
     only_for("tune", "--first-seed", str(first_seed), first_seed, layouts)
     silent, who = as_json or quiet, options.workers_of(workers)
     engine_name = f"GEPA with {reflect}" if reflect else "alternatives"
