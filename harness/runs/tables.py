@@ -140,4 +140,4 @@ def tables_of(run: Path, kind: type[T]) -> T:
     Raises UserError if it holds no finished run, or one of another format version.
     """
     source = read(run)
-    return kind(run, msgspec.json.decode(msgspec.json.encode(source.manifest)), source)
+    return kind(run, msgspec.json.decode(msgspec.json.encode(source.manifest.as_file())), source)
