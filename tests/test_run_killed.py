@@ -99,6 +99,19 @@ def test_killed_at_one_place_of_each_kind_and_resumed_it_is_the_same_run(
     _becomes_whole(out, whole, to_kill)
 
 
+def test_a_finished_part_whose_answers_say_otherwise_than_their_texts_is_refused(
+    to_kill: Spec, in_parts: None, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    killed_at(to_kill, out, at(*PLACES["between two parts"]))
+    [file] = out.glob(".work/episodes-*/answers.jsonl")
+    text = file.read_text()
+    assert '"intent":[0.12,0.78,' in text
+    file.write_text(text.replace('"intent":[0.12,0.78,', '"intent":[0.78,0.12,'))
+    with pytest.raises(UserError, match="states another intent than its text says"):
+        run(to_kill, out)
+
+
 @pytest.mark.exhaustive
 def test_killed_between_two_walks_of_a_part_it_is_the_same_run(
     whole: Path, to_kill: Spec, in_parts: None, tmp_path: Path

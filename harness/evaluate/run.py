@@ -54,6 +54,7 @@ from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import walk
 from harness.runs import folder, run_parts, writer
 from harness.runs import sources as kept_sources
+from harness.runs.contradictions import refuse
 from harness.runs.decisions import Decisions
 from harness.runs.difficulty import Layout, adjusted_scores
 from harness.runs.formats import FORMAT
@@ -107,7 +108,8 @@ def evaluate(
         given: answers by request id that need not be asked for; frozen scenes only.
 
     Raises UserError if the folder holds another run or something else, or the model is not
-    available; nothing is written then. Raises Unanswered if a question of the ego or a fusion call,
+    available; nothing is written then. Raises UserError if what a stopped run kept contradicts
+    itself. Raises Unanswered if a question of the ego or a fusion call,
     or too many of the helpers', got no answer; the folder keeps all answers, and the same call asks
     the others again.
     """
@@ -119,9 +121,26 @@ def evaluate(
     if not run_start and spec.settings.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        return _frozen(
+        done = _frozen(
             spec, spec.source, out, run_start, progress, cache, more, opens, given, workers
         )
+    else:
+        done = _driven(spec, out, run_start, progress, cache, workers)
+    if run_start:  # whose parts anybody may have written
+        resumed = folder.read(out)
+        refuse(resumed)
+        refuse_others(resumed)
+    return done
+
+
+def _driven(
+    spec: Spec,
+    out: Path,
+    run_start: RunStart | None,
+    progress: Callable[[int], None],
+    cache: Path | None,
+    workers: Workers,
+) -> Evaluated:
     made_of = sources(spec)
     run_start, chunks = _begin_driving(spec, out, run_start, workers)
     with work.working(out, run_start, "run.json") as place:
