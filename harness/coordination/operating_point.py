@@ -536,7 +536,11 @@ class OperatingPoint:
 
     @property
     def asks_again(self) -> bool:
-        """Whether the settings ask for such a second question, even if the point has no channel."""
+        """Whether the ego's model is to be asked a second time, with what it has heard.
+
+        That is so with the consensus `ego-prompt` or a content that has a call, even if the point
+        has no channel over which the ego could hear anything.
+        """
         return self.fusion.consensus == EGO_PROMPT or self.content.call is not None
 
     @property
@@ -618,7 +622,8 @@ class OperatingPoint:
     ) -> "tuple[SentIntents, Exchange]":
         """Return what is sent and heard after all that vehicles tell each other before they act.
 
-        Each part that ships may add to it in turn (`Part.again`), as further rounds do.
+        Each part of the condition that is the harness's own may add to it in turn (`Part.again`),
+        as further rounds of messages do; without such a part both stay as they are.
 
         Args:
             sent: what n decisions' vehicles have sent so far.

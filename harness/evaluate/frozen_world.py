@@ -73,7 +73,7 @@ class FrozenSource:
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes to evaluate, fewer if the run stops early (`until`)."""
+        """Numbers of the episodes to evaluate; a run that stops early uses the first of them."""
         return self.dataset.episodes
 
     def stopped(self, looks: Looks) -> "FrozenSource":

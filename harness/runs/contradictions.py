@@ -162,7 +162,9 @@ def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
 
 
 def unchecked(run: Run) -> Iterator[str]:
-    """Yield sentences on a run's figures that cannot be checked, and on those it may lack."""
+    """Yield a sentence on a run's figures that nothing here computes again, such as those of a
+    package's metric, and one on figures that a run by older rules is allowed to lack.
+    """
     figures = {score.key: score for score in run.scores}
     here = {} if current(run) else {score.key: score for score in _scores(run)}
     held = {

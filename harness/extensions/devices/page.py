@@ -37,7 +37,10 @@ def caveats(manifest: Manifest) -> Iterator[str]:
 
 
 def notes(run: Shown) -> Iterator[str]:
-    """Yield what a decision takes in each condition; nothing without a device profile."""
+    """Yield a sentence for each condition on the joules of a decision, and their parts.
+
+    Yields nothing for a run without a device profile.
+    """
     for name in run.conditions:
         total, helpers = run.score(name, "energy_j"), run.score(name, "helpers_j")
         radio = run.score(name, "radio_mj")

@@ -15,7 +15,11 @@ from harness.studies.paper_numbers import paper_numbers
 
 
 def fit() -> Parameters:
-    """Compute the proxy's parameters from the rows of `paper_numbers.csv` named in `FITTED_ON`."""
+    """Compute the parameters of the rule that stands for the paper's models (the proxy).
+
+    They follow in closed form from the paper's results in the rows of `paper_numbers.csv` that
+    `FITTED_ON` names; KeyError if one of these is missing.
+    """
     from harness.core.special import ndtri
 
     paper = {row["id"]: row for row in paper_numbers()}

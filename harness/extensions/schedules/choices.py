@@ -150,10 +150,11 @@ class Choices:
         return choose
 
     def worths(self, point: OperatingPoint) -> list[Floats]:
-        """Return what asking each helper is worth to a schedule: an array `(S x N, H)` a level.
+        """Return what asking each helper is worth to the point's schedule, in the schedule's unit.
 
-        The axes are S channel seeds by N decision points of the level, and H helpers. It is `(S x
-        N, 1)` where the worth is the same for all helpers.
+        One array for each level of the decision trees (the decision points that are equally many
+        decisions from the start), `(S x N, H)`: S channel seeds by N decision points, and H
+        helpers; `(S x N, 1)` where the worth is the same for all helpers.
         """
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 
