@@ -106,9 +106,22 @@ def test_a_finished_part_whose_answers_say_otherwise_than_their_texts_is_refused
     killed_at(to_kill, out, at(*PLACES["between two parts"]))
     [file] = out.glob(".work/episodes-*/answers.jsonl")
     text = file.read_text()
-    assert '"intent":[0.12,0.78,' in text
-    file.write_text(text.replace('"intent":[0.12,0.78,', '"intent":[0.78,0.12,'))
-    with pytest.raises(UserError, match="states another intent than its text says"):
+    assert '"mass":1.0' in text
+    file.write_text(text.replace('"mass":1.0', '"mass":0.9'))
+    with pytest.raises(UserError, match="states another mass than its text says"):
+        run(to_kill, out)
+
+
+def test_a_finished_part_whose_tables_are_not_what_its_answers_make_is_refused(
+    to_kill: Spec, in_parts: None, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    killed_at(to_kill, out, at(*PLACES["between two parts"]))
+    [file] = out.glob(".work/episodes-*/episodes.csv")
+    text = file.read_text()
+    assert ",left,True," in text
+    file.write_text(text.replace(",left,True,", ",left,False,"))
+    with pytest.raises(UserError, match=r"episodes\.csv is not what its answers make"):
         run(to_kill, out)
 
 

@@ -21,15 +21,15 @@ from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError, in_range, printable
-from harness.core.files import write_whole
-from harness.core.formats import WORK
+from harness.core.files import bytes_of, sha256_file, write_whole
+from harness.core.formats import CONFIG, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.progress import Progress
 from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
-from harness.dataset.select import drawn
+from harness.dataset.select import drawn, spot_check
 from harness.evaluate import costs, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
@@ -272,8 +272,11 @@ def _frozen(
             together(spec.cards, models).identity(),
             _latency(spec, run_start, models),
         )
+    resumes = run_start is not None
     run_start = begin(spec, out, run_start, identity, latency)
     with work.working(out, run_start, "run.json") as place:
+        if resumes:
+            _check_parts(spec, chunks, place, latency)
 
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
             before = read_kept(_answered_file(place, chunk))
@@ -313,6 +316,40 @@ def _frozen(
         return _gather(
             out, as_finished(spec, run_start, looked), seen, place, made_of, layouts=layouts
         )
+
+
+def _check_parts(
+    spec: Spec, chunks: Sequence[Sequence[int]], place: Path, latency: Latency
+) -> None:
+    """Walk one of the parts again that a stopped run has finished, with its own answers.
+
+    Raises UserError if its tables are others. A part that lacks answers is walked again later.
+    """
+    finished_chunks = [chunk for chunk in chunks if (place / _folder_name(chunk)).is_dir()]
+    digest_of_start = sha256_file(place / CONFIG, "record")
+    for chunk in spot_check(finished_chunks, digest_of_start, 1):
+        part = place / _folder_name(chunk)
+        answers = read_kept(part / "answers.jsonl")
+        if len(answers) < run_parts.answers_in(part):
+            continue
+
+        def asker_of(
+            n: int, so_far: Mapping[str, Answer], answers: Mapping[str, Answer] = answers
+        ) -> Asker:
+            return Asker(spec, _nobody, latency, answers={**answers, **so_far})
+
+        here = _walk(spec, chunk, asker_of)
+        for name in ("decisions.parquet", "episodes.csv"):
+            if here[name] != bytes_of(part / name, "rows"):
+                raise UserError(
+                    f"{printable(part / name)} is not what its answers make; delete that folder, "
+                    "and its episodes are walked again"
+                )
+
+
+def _nobody() -> Backend:
+    """Raise UserError: a finished part has all the answers that it needs."""
+    raise UserError("a finished part of the stopped run lacks answers; delete it, or start again")
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
