@@ -260,6 +260,7 @@ def test_what_a_scenario_says_of_itself_is_checked(
     package = type("Package", (), {"name": "by-hand"})
     entry = SimpleNamespace(value="packages:MINE", load=lambda: scenario, dist=package)
     monkeypatch.setattr(scenarios.PLUG_INS, "_entries", lambda: {SCENARIO.name: entry})
+    monkeypatch.setattr(scenarios.PLUG_INS, "_loaded", {})
     with pytest.raises(UserError) as error:
         scenarios.PLUG_INS[SCENARIO.name]
     plug_in = f"plug-in '{SCENARIO.name}' (swarmdrive.scenarios) of package by-hand"

@@ -29,6 +29,7 @@ from harness.extensions.environments.examination import examine
 from harness.extensions.environments.place import CAREFUL_FIRST
 from harness.extensions.environments.world import EnvironmentWorld
 from harness.report.drawing.scene import draw
+from harness.runs import formats
 from harness.runs.folder import read
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
@@ -756,3 +757,17 @@ def test_what_is_typed_may_be_imported_and_what_a_file_names_may_not(harness, fo
         code, _, err = harness("dataset", command, folder)
         assert (code, err.count("\n")) == (2, 1)
         assert "set SWARMDRIVE_IMPORTS=my_roads in your environment" in err
+
+
+@pytest.mark.parametrize(
+    ("typed", "name", "may_be"),
+    [
+        ('env:a-v0:decisions=3:config={"a":1,"b":2}', 'env:a-v0:config={"a":1,"b":2}', True),
+        ('env:a-v0:config={"a":1,"b":2}', 'env:a-v0:config={"a":1}', False),
+        ("env:a-v0", "env:b-v0", False),
+    ],
+)
+def test_what_was_typed_may_open_the_environment_of_its_id_and_configuration(
+    typed: str, name: str, may_be: bool
+) -> None:
+    assert formats._may_be(typed, name) == may_be
