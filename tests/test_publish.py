@@ -196,6 +196,8 @@ def test_the_tools_of_others_read_the_folder(
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(tmp_path))
     datasets = pytest.importorskip("datasets")
+    if not hasattr(datasets, "load_dataset"):
+        pytest.skip("needs the package; the folder of that name here is none")
     hub = pytest.importorskip("huggingface_hub")
     assert hub.DatasetCard.load(published / "README.md").data.pretty_name == "small"
     loaded = datasets.load_dataset(

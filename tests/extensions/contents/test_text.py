@@ -169,6 +169,7 @@ def test_a_dry_run_counts_words_as_intents_and_one_more_question_a_set(few: Data
 @pytest.mark.slow
 def test_a_run_is_read_as_it_was_asked(few: Dataset, tmp_path: Path) -> None:
     """With the words of a model that ships."""
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     six = spec_of(few, "swarm-tiny-six", "v12", points=(TEXT,), seeds=(0,))
     stored = folder.read(run(six, tmp_path / "run").out)
     fused = 0

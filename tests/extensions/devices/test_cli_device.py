@@ -24,6 +24,7 @@ Said = tuple[int, str, str]
 @pytest.fixture(scope="module")
 def alone(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the model that ships, each answer asked alone."""
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     out = tmp_path_factory.mktemp("runs") / "alone"
     points = (POINTS["6g"],)
     few = course(small, steps=1).of_episodes([0, 1])

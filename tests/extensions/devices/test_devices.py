@@ -411,6 +411,7 @@ def test_batches_change_no_row(small: Dataset, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_read_out_writes_one_token(small: Dataset, tmp_path: Path) -> None:
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     orin, alone = Computer(profiles.load("agx-orin"), "qwen3-4b"), (ALONE,)
     spec = spec_of(
         small, "swarm-tiny", answer="readout", limit=1, timer=orin,
