@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.core.plugins import Plugins
+from harness.core.plugins import Shipped
 from harness.core.statistics import rate_interval
 from harness.parsing.status import Status
 from harness.report import charts
@@ -61,7 +61,7 @@ class AddedPanel:
     spec: Callable[[Table], dict[str, Any]]  # of the rows of all runs
 
 
-PANELS = Plugins[AddedPanel]("swarmdrive.panels", AddedPanel, {})
+PANELS = Shipped[AddedPanel]("swarmdrive.panels", AddedPanel, {})
 
 
 def panels(runs: Runs) -> Iterator[Panel]:
@@ -169,8 +169,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
             "lost.",
             charts.stacked(rows, "condition", "reply", charts.REPLIES, "replies"),
         )
-    for name in filter(PANELS.is_ours, PANELS):
-        added = PANELS[name]
+    for name, added in PANELS.items():
         if rows := joined(added.rows):
             yield Panel(name, added.part, added.title, added.caption, added.spec(rows))
     if rows := joined(arrivals):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.extensions import owner_of_plugin, part_of
-from harness.core.plugins import Plugins
+from harness.core.plugins import Shipped
 
 if TYPE_CHECKING:
     from harness.coordination.exchange import Exchange
@@ -126,7 +126,7 @@ class Timer(ABC):
         """
 
 
-TIMERS = Plugins[Timer]("swarmdrive.timers", Timer, {})
+TIMERS = Shipped[Timer]("swarmdrive.timers", Timer, {})
 
 
 def timer(source: str) -> Timer:
@@ -134,7 +134,7 @@ def timer(source: str) -> Timer:
 
     Raises ValueError if there is none of this name, and UserError if its extension is gone.
     """
-    if TIMERS.is_ours(source):
+    if source in TIMERS:
         return TIMERS[source]
     if owner := owner_of_plugin("timers", source):
         raise UserError(f"what timed the answers of a run, {source}, is {part_of(owner)}")
@@ -143,7 +143,7 @@ def timer(source: str) -> Timer:
 
 def chosen(settings: Mapping[str, Any]) -> Timer | None:
     """Return what a run's settings of extensions choose to time answers; None for `--latency`."""
-    for each in _timers():
+    for each in TIMERS.values():
         if opened := each.opened(settings):
             return opened
     return None
@@ -151,22 +151,18 @@ def chosen(settings: Mapping[str, Any]) -> Timer | None:
 
 def options() -> list[str]:
     """Return what is typed to choose each timer."""
-    return [each.option for each in _timers()]
+    return [each.option for each in TIMERS.values()]
 
 
 def without(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings of extensions without those that choose a timer."""
-    choosing = {name for each in _timers() for name in each.chosen_by}
+    choosing = {name for each in TIMERS.values() for name in each.chosen_by}
     return {name: value for name, value in settings.items() if name not in choosing}
 
 
 def added_columns() -> dict[str, str]:
     """Return the columns that timers add to decisions, each with the one that it follows."""
     columns: dict[str, str] = {}
-    for each in _timers():
+    for each in TIMERS.values():
         columns |= each.adds
     return columns
-
-
-def _timers() -> list[Timer]:
-    return [TIMERS[name] for name in TIMERS if TIMERS.is_ours(name)]
