@@ -4,8 +4,7 @@ operating points and seeds in place of names.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
@@ -21,10 +20,9 @@ from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.looks import until
-from harness.evaluate.spec import Source, Spec
+from harness.evaluate.spec import Source, Spec, replayed
 from harness.prompts import versions
 from harness.runs import timers
-from harness.runs.folder import read
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.runs.timers import Timer
 from harness.world.scenario import Scenario
@@ -55,11 +53,8 @@ def spec(settings: Settings, source: Source) -> Spec:
 
 def _of_replayed(ego: Agent, settings: Settings) -> Timer | None:
     """Return what timed the answers of the run that is replayed, unless --latency is given."""
-    if settings.latency is not None or not ego.can.own_latency:
-        return None
-    with suppress(UserError):  # what is no run is refused when it is opened
-        return read(Path(ego.card.weights or "")).manifest.timer
-    return None
+    manifest = replayed(ego) if settings.latency is None else None
+    return manifest.timer if manifest else None
 
 
 def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:

@@ -332,19 +332,24 @@ def _check_parts(
         answers = read_kept(part / "answers.jsonl")
         if len(answers) < run_parts.answers_in(part):
             continue
-
-        def asker_of(
-            n: int, so_far: Mapping[str, Answer], answers: Mapping[str, Answer] = answers
-        ) -> Asker:
-            return Asker(spec, _nobody, latency, answers={**answers, **so_far})
-
-        here = _walk(spec, chunk, asker_of)
+        here = _walked_again(spec, chunk, latency, answers)
         for name in ("decisions.parquet", "episodes.csv"):
             if here[name] != bytes_of(part / name, "rows"):
                 raise UserError(
                     f"{printable(part / name)} is not what its answers make; delete that folder, "
                     "and its episodes are walked again"
                 )
+
+
+def _walked_again(
+    spec: Spec, chunk: Sequence[int], latency: Latency, answers: Mapping[str, Answer]
+) -> dict[str, bytes]:
+    """Return the files of a part whose answers are all there; raise UserError if one is not."""
+
+    def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
+        return Asker(spec, _nobody, latency, answers={**answers, **so_far})
+
+    return _walk(spec, chunk, asker_of)
 
 
 def _nobody() -> Backend:

@@ -30,7 +30,7 @@ from harness.radio.profiles import CHANNELS
 from harness.runs import formats, timers
 from harness.runs.folder import read
 from harness.runs.metrics import World
-from harness.runs.records import ClosedLoop, FrozenScenes, Looks
+from harness.runs.records import ClosedLoop, FrozenScenes, Looks, Manifest
 from harness.runs.settings import (
     DriveSettings,
     FrozenSettings,
@@ -491,10 +491,8 @@ class Spec:
         """How ties between actions fall, `drawn` or `first`: by default as in a replayed run."""
         if self.settings.ties is not None:
             return self.settings.ties
-        if self.ego.can.own_latency:
-            with suppress(UserError):  # what is no run is refused when it is opened
-                return read(Path(self.ego.card.weights or "")).manifest.settings.ties or TIES[0]
-        return TIES[0]
+        manifest = replayed(self.ego)
+        return manifest.settings.ties or TIES[0] if manifest else TIES[0]
 
     @property
     def opening(self) -> dict[str, Any]:
@@ -509,3 +507,15 @@ class Spec:
             agent.letters == replace(agent, letters=None).letters for agent in reads
         )
         return None if is_cards_choice else reads[0].letters
+
+
+def replayed(ego: Agent) -> Manifest | None:
+    """Return the manifest of the run whose answers the ego's model replays; None for others.
+
+    Also None for what is no run, which is refused when it is opened.
+    """
+    if not ego.can.own_latency:
+        return None
+    with suppress(UserError):
+        return read(Path(ego.card.weights or "")).manifest
+    return None
