@@ -419,7 +419,7 @@ def test_answers_of_a_strangers_server_are_not_those_of_ones_own(
         assert asked_at([evil], file) == "evil", "nothing was replaced"
         monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", f"{good.url}, http://elsewhere*")
         assert asked_at([better], file) == "better", "one that the user does not name"
-        monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", f"{good.url},{better.url[:-5]}*")
+        monkeypatch.setenv("SWARMDRIVE_SAME_SERVERS", f"{good.url},{better.url[:-1]}*")
         assert asked_at([good], file) == "good"
         assert asked_at([better], file) == "good", "the user says that both serve the same"
         assert asked_at([evil], file) == "evil"
