@@ -32,7 +32,7 @@ from harness.core.statistics import Estimate, resampled, resampled_estimate
 from harness.dataset.load import find, load
 from harness.runs.difficulty import REFERENCES, Pool
 from harness.runs.folder import read
-from harness.runs.leading import IN_WORDS
+from harness.runs.headline import IN_WORDS
 from harness.runs.success import Success, by_condition
 
 SMALLEST = "--models constant --layouts 12 --studies 2 --answered 12"

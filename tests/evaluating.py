@@ -36,7 +36,7 @@ from harness.prompts import versions as prompts
 from harness.report.details import prompts_of
 from harness.runs import folder, writer
 from harness.runs.decisions import Decisions
-from harness.runs.leading import PAIRED
+from harness.runs.headline import PAIRED
 from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency, Score
 from harness.runs.settings import Settings

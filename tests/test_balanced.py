@@ -27,7 +27,7 @@ from harness.report.matrix import BEST, WORSE, headline, lines
 from harness.report.runs import Runs
 from harness.report.words import headline as of_one
 from harness.runs.folder import Run, read
-from harness.runs.leading import SUCCESS, lead_of
+from harness.runs.headline import SUCCESS, headline_of
 from harness.runs.listing import runs
 from harness.runs.metrics import BALANCED, GAINS, METRICS, of_ends
 from harness.runs.success import Success, alike, half_difference
@@ -111,7 +111,7 @@ def test_two_runs_are_compared_in_it_and_a_gate_takes_it(tmp_path: Path) -> None
 
 def test_what_counts_by_single_episodes_is_what_a_summary_states(tmp_path: Path) -> None:
     done = made(tmp_path / "run", 0, 1, 7)
-    how = Success.of(done.episodes[:8], lead_of(done))
+    how = Success.of(done.episodes[:8], headline_of(done))
     alone, best = of_ends(METRICS[SUCCESS], done.grid, done.episodes)
     for e, metric in (
         (how.estimate(best), BALANCED),

@@ -31,7 +31,7 @@ from harness.report.caveats import looked_at
 from harness.report.compare.pair import pair
 from harness.report.compare.words import caveats as of_pair
 from harness.runs.folder import read
-from harness.runs.leading import ANY_TIME
+from harness.runs.headline import ANY_TIME
 
 pytestmark = pytest.mark.slow
 

@@ -34,7 +34,7 @@ from harness.dataset.load import Dataset
 from harness.evaluate.asking import answer_of
 from harness.evaluate.latency import inference_s
 from harness.evaluate.requests import requests
-from harness.runs.leading import PAIRED
+from harness.runs.headline import PAIRED
 from harness.runs.metrics import METRICS, of_decisions
 from harness.runs.records import Answer, Latency, Score, Variant
 from harness.runs.writer import csv_text

@@ -17,7 +17,7 @@ from tiers import some
 from harness.core.statistics import mean_of, paired_difference
 from harness.dataset.build import build
 from harness.report.words import compared
-from harness.runs.leading import BALANCED, PAIRED
+from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.listing import runs
 from harness.runs.metrics import METRICS, of_ends
 from harness.runs.suite import read

@@ -14,7 +14,7 @@ from harness.coordination.operating_point import POINTS
 from harness.dataset.load import Dataset
 from harness.evaluate.live_world import LiveSource
 from harness.runs.folder import Run, read
-from harness.runs.leading import PAIRED
+from harness.runs.headline import PAIRED
 from harness.runs.metrics import GAIN
 from harness.runs.records import Score
 

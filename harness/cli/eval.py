@@ -14,7 +14,7 @@ from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.figures import crossed
 from harness.core.seeds import seeds_text
-from harness.runs import leading
+from harness.runs import headline
 from harness.runs.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
 
 if TYPE_CHECKING:
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.spec import Spec
 
-SUCCESS = Column("success % [95 % CI]", leading.SUCCESS, interval=True)
+SUCCESS = Column("success % [95 % CI]", headline.SUCCESS, interval=True)
 GAINS = {  # by headline metric
-    leading.SUCCESS: Column("gain, points", "success_gain_over_single-local", interval=True),
-    leading.BALANCED: Column(
+    headline.SUCCESS: Column("gain, points", "success_gain_over_single-local", interval=True),
+    headline.BALANCED: Column(
         "balanced gain, in points", "balanced_success_gain_over_single-local", interval=True
     ),
 }
@@ -151,7 +151,7 @@ def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool) -> 
 
     every_reference = in_trees(dataset)
     references = {name: every_reference[name] for name in BESIDE if name in every_reference}
-    gain = GAINS[leading.lead_of(done)]
+    gain = GAINS[headline.headline_of(done)]
     has_gain = any(score.metric == gain.metric for score in done.scores)
     columns = (SUCCESS, gain, *COLUMNS) if has_gain else (SUCCESS, *COLUMNS)
     episodes = dataset.manifest.episodes if selected else len(dataset.episodes)

@@ -17,7 +17,7 @@ from harness.cli.terminal import console, table
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.formats import WORK
-from harness.runs import leading
+from harness.runs import headline
 
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
@@ -270,7 +270,7 @@ def show(
         every_column = (*BALANCED, *columns)
         rows[name] = {each.metric: figures.get((name, each.metric)) for each in every_column}
     rows |= beside or {}
-    if leading.lead_of(done) == leading.BALANCED:
+    if headline.headline_of(done) == headline.BALANCED:
         _scores_table(BALANCED, rows)
         halves = [rows[names[0]][column.metric] for column in BALANCED[1:]]
         episodes = " and ".join(str(half.n) for half in halves if half)

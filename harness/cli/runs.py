@@ -14,7 +14,7 @@ from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount, dataset_size
 from harness.core.formats import SUITE
-from harness.runs.leading import BALANCED
+from harness.runs.headline import BALANCED
 
 if TYPE_CHECKING:
     from harness.runs.listing import Listed

@@ -113,7 +113,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     """Print success, gains and what needs no model, each a table of families."""
     from harness.report.findings import LAST, Kind, findings
     from harness.report.suite import seeds_of
-    from harness.runs.leading import IN_WORDS, lead_of
+    from harness.runs.headline import IN_WORDS, headline_of
     from harness.runs.metrics import BASELINE
     from harness.world.drivers import ALWAYS
 
@@ -124,7 +124,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     for finding in findings(done, Kind.VOID, Kind.CAVEAT):
         text.print(finding.sentence)
     gaining = [c for c in done.conditions if c != BASELINE] if BASELINE in done.conditions else []
-    _matrix(f"{IN_WORDS[lead_of(done)]}, % [95 % CI]", "success", done.conditions, lines)
+    _matrix(f"{IN_WORDS[headline_of(done)]}, % [95 % CI]", "success", done.conditions, lines)
     _matrix(f"gain over {BASELINE}, points", "gain", gaining, lines)
     # `constant` stands for the two that always take one action: a line has no room for all.
     drivers = [name for name in lines[-1].drivers if name not in ALWAYS]

@@ -14,7 +14,7 @@ from harness.core.statistics import Estimate
 from harness.report.runs import Runs
 from harness.report.words import score_texts
 from harness.runs.folder import Run
-from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.headline import IN_WORDS, headline_of
 from harness.runs.metrics import BALANCED, LATENCY, SUCCESS, entry
 from harness.runs.records import Score
 from harness.runs.success import Success
@@ -52,8 +52,8 @@ class Line:
     """Hold the results of one run under one condition: a row of the report's main table.
 
     `scores` has its scores by metric, None where unknown. `mark` says whether it is the best run,
-    not told from it, or worse, and `behind` how far it is behind, None for the best; `lead` is the
-    headline metric and `tokens` the median numbers of prompt and answer tokens.
+    not told from it, or worse, and `behind` how far it is behind, None for the best. `headline` is
+    the headline metric and `tokens` the median numbers of prompt and answer tokens.
     """
 
     name: str  # of the run
@@ -66,12 +66,12 @@ class Line:
     tokens: tuple[float | None, float | None]
     mark: str  # `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best
     behind: Behind | None  # how it stands to the best; None for the best
-    lead: str  # the headline metric, by which the runs are read together
+    headline: str  # the headline metric, by which the runs are read together
 
     @property
     def success(self) -> Score | None:
         """Return the headline metric's score; None where the run has none."""
-        return self.scores[self.lead]
+        return self.scores[self.headline]
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ METRICS = (
 def lines(runs: Runs) -> list[Line]:
     """Return a row for each run and condition, by condition, then in the runs' order."""
     lengths = [_tokens(run) for run in runs.runs]
-    headline_metric = lead_of(*runs.runs)
+    headline_metric = headline_of(*runs.runs)
     all_marks = _marks(runs, headline_metric)
     rows = []
     for condition in runs.conditions:
@@ -123,7 +123,7 @@ def lines(runs: Runs) -> list[Line]:
                 tokens=lengths[n],
                 mark=mark,
                 behind=behind,
-                lead=headline_metric,
+                headline=headline_metric,
             )
             rows.append(line)
     return rows
@@ -275,7 +275,7 @@ def figures(results: Sequence[Line]) -> list[dict[str, str]]:
     rows = []
     for line in results:
         if line.mark == BEST and line.success:
-            name = f"{IN_WORDS[line.lead]} with {line.condition}, {_rank(line, results)}"
+            name = f"{IN_WORDS[line.headline]} with {line.condition}, {_rank(line, results)}"
             rows.append({"what": name, **score_texts(line.success)})
     return rows
 
@@ -317,5 +317,5 @@ def headline(results: Sequence[Line]) -> str:
             outcomes.append(f"{condition}: {outcome}")
     if not outcomes:
         return "No two runs have a condition in common."
-    measure = " by balanced success" if results[0].lead == BALANCED else ""
+    measure = " by balanced success" if results[0].headline == BALANCED else ""
     return f"Best{measure} under {'; '.join(outcomes)}."

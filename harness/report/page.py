@@ -33,7 +33,7 @@ from harness.report.runs import Runs
 from harness.report.sections import sections
 from harness.report.templating import environment
 from harness.runs.folder import Run
-from harness.runs.leading import IN_WORDS
+from harness.runs.headline import IN_WORDS
 from harness.runs.reliability import LEAST
 
 PARTS_SHARED = 8  # fewest parts for which starting workers takes less time than they save
@@ -154,7 +154,7 @@ def _pieces(
             key_figures=key_figures,
             actions=_actions(runs),
             lines=lines,
-            lead=IN_WORDS[lines[0].lead],
+            metric=IN_WORDS[lines[0].headline],
             grids=matrix.grids(lines),
             shared=matrix.shared(lines),
             uneven=matrix.uneven(runs),

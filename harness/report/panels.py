@@ -19,7 +19,7 @@ from harness.report import charts
 from harness.report.references import driven, in_trees, label, sentences
 from harness.report.runs import Runs
 from harness.runs.folder import Run
-from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.headline import IN_WORDS, headline_of
 from harness.runs.metrics import LATENCY
 from harness.runs.records import Score, role_word
 from harness.runs.reliability import BINS, LEAST
@@ -77,7 +77,7 @@ def panels(runs: Runs) -> Iterator[Panel]:
     tau_nats = sorted({c["tau_nats"] for c in points})
     windows_ms = sorted({c["window_s"] * 1000 for c in points})
 
-    metric = lead_of(*runs.runs)
+    metric = headline_of(*runs.runs)
     if rows := joined(lambda run: success(run, metric)):
         references, scenario = _references(runs, metric), runs.scenario
         rates = {}

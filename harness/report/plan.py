@@ -16,7 +16,7 @@ from harness.core.power import Spread
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.report.compare.pair import pair
 from harness.runs.folder import Run, read
-from harness.runs.leading import lead_of
+from harness.runs.headline import headline_of
 from harness.runs.metrics import BASELINE, METRICS, SUCCESS, of_ends
 from harness.runs.records import Answer
 from harness.runs.success import Success
@@ -139,7 +139,7 @@ def _gains(path: Path) -> _Sides:
     successes = of_ends(METRICS[SUCCESS], run.grid, run.episodes)
     by_condition = dict(zip(run.conditions, successes, strict=True))
     alone = by_condition.pop(BASELINE)
-    success = Success.of(run.episodes[: len(run.grid.episodes)], lead_of(run))
+    success = Success.of(run.episodes[: len(run.grid.episodes)], headline_of(run))
     values = {name: (alone, b) for name, b in by_condition.items()}
     return _Sides(printable(path), f"gain over {BASELINE}", success, values, _cost([run]))
 
@@ -148,7 +148,7 @@ def _difference(a: Path, b: Path) -> _Sides:
     both = pair(a, b)
     condition, seed = both.conditions[0], both.seeds[0]
     ends = [both.a.ends[condition, seed, episode] for episode in both.episodes]
-    success = Success.of(ends, lead_of(both.a.run, both.b.run))
+    success = Success.of(ends, headline_of(both.a.run, both.b.run))
     values = {}
     for name in both.conditions:
         of_a, of_b = both.values(both.a, SUCCESS, name), both.values(both.b, SUCCESS, name)

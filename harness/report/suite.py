@@ -21,7 +21,7 @@ from harness.report.page import save
 from harness.report.references import in_trees
 from harness.runs.contradictions import refuse
 from harness.runs.folder import Run
-from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.headline import IN_WORDS, headline_of
 from harness.runs.metrics import BASELINE, GAINS, entry
 from harness.runs.records import Score
 from harness.runs.run_dataset import dataset_of
@@ -74,7 +74,7 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
     if datasets is None:  # else they were just made
         refuse(suite)
         datasets = _datasets(suite)
-    metric = lead_of(suite)
+    metric = headline_of(suite)
     p_values = _p_of_gains(suite)
     lines, drivers = list[Line](), list[dict[str, Score]]()
     for family, run in suite.runs.items():
@@ -176,7 +176,7 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
             f"{amount(len(suite.manifest.seeds), 'channel seed')}; figures are means over "
             "families, with 95 % intervals over episodes."
         ],
-        [_families(lines, place, lead_of(suite)), _metrics(suite)],
+        [_families(lines, place, headline_of(suite)), _metrics(suite)],
         warnings=[finding.sentence for finding in findings(suite, Kind.VOID)],
         caveats=[finding.sentence for finding in findings(suite, Kind.CAVEAT, Kind.LIMIT)],
         numbers=_numbers(suite),
@@ -187,7 +187,7 @@ def _section(suite: SuiteRun, lines: Sequence[Line], place: Place) -> Section:
 def _numbers(suite: SuiteRun) -> list[dict[str, str]]:
     """Return success under each condition, and the gain of the best."""
     best, base = words.compared(suite)
-    metric = lead_of(suite)
+    metric = headline_of(suite)
     scores = {}
     for condition in suite.conditions:
         scores[f"{IN_WORDS[metric]} with {condition}"] = suite.score(condition, metric)

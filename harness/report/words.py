@@ -15,7 +15,7 @@ from harness.core.statistics import Estimate
 from harness.report.caveats import doubted
 from harness.runs import metrics
 from harness.runs.folder import Run
-from harness.runs.leading import ANY_TIME, IN_WORDS, best_of, lead_of
+from harness.runs.headline import ANY_TIME, IN_WORDS, best_of, headline_of
 from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, SUCCESS, entry, written
 from harness.runs.records import Score
 from harness.runs.success import half_difference, mean_difference, p_of_mean
@@ -51,7 +51,7 @@ def headline(run: Run | SuiteRun) -> str:
     best, base = compared(run)
     if not best:
         return f"{model} on {run.source}: the run has no success rate."
-    metric = lead_of(run)
+    metric = headline_of(run)
     families = f" (mean over {len(run.runs)} families)" if isinstance(run, SuiteRun) else ""
     value = _value_text(run, best, metric)
     if not base:
@@ -104,7 +104,7 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
     The baseline is the first condition without V2V, else the worst; an empty string where there is
     none.
     """
-    metric = lead_of(run)
+    metric = headline_of(run)
     values = {}
     for condition in run.conditions:
         score = run.score(condition, metric)
@@ -122,7 +122,7 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
 def figures(run: Run) -> list[dict[str, str]]:
     """Return the key figures of a run, each as text: `what` it is, `value`, `interval` and `n`."""
     best, base = compared(run)
-    metric = lead_of(run)
+    metric = headline_of(run)
     scores = {f"{IN_WORDS[metric]} under {best}": run.score(best, metric)}
     if better := adjusted(run, best, metric):
         score, worth_of_it = better
@@ -179,7 +179,7 @@ def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
     For a suite, the gain is the mean over families. They are not corrected for multiplicity; 1
     where the gain has no interval.
     """
-    played = plays(_runs(run), lead_of(run))
+    played = plays(_runs(run), headline_of(run))
     p_values = {}
     for condition in run.conditions:
         if condition != base:

@@ -15,7 +15,7 @@ from harness.core.versions import FIGURES
 from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run
-from harness.runs.leading import PAIRED
+from harness.runs.headline import PAIRED
 from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
 from harness.runs.records import Episode, Score
 from harness.runs.reliability import SAME

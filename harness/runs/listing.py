@@ -18,7 +18,7 @@ from harness.core.files import BROKEN, opened, text_of
 from harness.core.formats import CONFIG, SOURCES, SUITE, WORK
 from harness.runs import formats
 from harness.runs.doubts import OFF_LAG, doubted
-from harness.runs.leading import ANY_TIME, BALANCED, SUCCESS, best_of, headline_metric
+from harness.runs.headline import ANY_TIME, BALANCED, SUCCESS, best_of, headline_metric
 
 # how deep to look: a sweep lies in its run's folder, a closed-loop study's run in the study's
 DEPTH = 2

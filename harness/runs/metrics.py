@@ -35,7 +35,7 @@ from harness.core.statistics import (
 )
 from harness.core.strangers import aside
 from harness.parsing.status import Repair
-from harness.runs import leading, reliability
+from harness.runs import headline, reliability
 from harness.runs.decisions import Decisions
 from harness.runs.records import (
     PLAIN_ROLES,
@@ -52,7 +52,7 @@ World = Literal["frozen", "closed-loop"]
 Better = Literal["higher", "lower", "neither"]
 Answers = Sequence[Answer | AnswerFacts]
 BASELINE = "single-local"  # the condition without V2V
-SUCCESS, BALANCED, IN_WORDS = leading.SUCCESS, leading.BALANCED, leading.IN_WORDS
+SUCCESS, BALANCED, IN_WORDS = headline.SUCCESS, headline.BALANCED, headline.IN_WORDS
 LATENCY, GAIN = "latency_proxy_ms", f"success_gain_over_{BASELINE}"
 GAINS = {SUCCESS: GAIN, BALANCED: f"balanced_success_gain_over_{BASELINE}"}  # by what is gained
 # What is corrected by the layouts' difficulty, by what it corrects

@@ -22,7 +22,7 @@ from harness.core.statistics import (
     paired_difference,
     resampled,
 )
-from harness.runs.leading import ANY_TIME, BALANCED, IN_WORDS, PAIRED, SUCCESS
+from harness.runs.headline import ANY_TIME, BALANCED, IN_WORDS, PAIRED, SUCCESS
 from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
 from harness.runs.records import Episode, Score
 

@@ -14,7 +14,7 @@ from harness.core.formats import SUITE
 from harness.core.statistics import mean_of
 from harness.runs import folder
 from harness.runs.folder import Run
-from harness.runs.leading import BALANCED, PAIRED
+from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.listing import own_name
 from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant

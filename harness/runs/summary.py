@@ -17,7 +17,7 @@ from harness.core.statistics import (
     seed_rate_interval,
 )
 from harness.runs.decisions import Decisions
-from harness.runs.leading import PAIRED
+from harness.runs.headline import PAIRED
 from harness.runs.metrics import (
     ALL,
     BALANCED,

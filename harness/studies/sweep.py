@@ -11,7 +11,7 @@ from harness.coordination.parts import PLAIN
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.report.document import Table
-from harness.runs.leading import IN_WORDS, headline_metric
+from harness.runs.headline import IN_WORDS, headline_metric
 from harness.studies.axes import (
     AXES,
     CORE,

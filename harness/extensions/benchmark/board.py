@@ -16,7 +16,7 @@ from harness.report.page import save
 from harness.report.templating import visible
 from harness.report.words import cell
 from harness.runs import pinned
-from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.headline import IN_WORDS, headline_of
 from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.records import Score
 from harness.runs.success import Pairs
@@ -65,7 +65,7 @@ def lines(entries: Sequence[Rescored]) -> list[Line]:
             f"{': ' * bool(names)}{listed}; give files of one"
         )
     edition = entries[0].edition
-    metric = lead_of(*[entry.suite for entry in entries])
+    metric = headline_of(*[entry.suite for entry in entries])
     conditions = dict.fromkeys((edition.ranked_by, *edition.condition))
     contestants = [entry.suite for entry in entries if not _privileged(entry.suite)]
     board = []
@@ -131,7 +131,7 @@ def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
     first = ordered[0].entry
     edition, suite = first.edition, first.suite
     by = edition.ranked_by
-    metric = IN_WORDS[lead_of(*[line.entry.suite for line in ordered])]
+    metric = IN_WORDS[headline_of(*[line.entry.suite for line in ordered])]
     others = [name for name in ordered[0].success if name != by]
     scores = [line.success[by] for line in ordered]
     _, most = reach([score for score in scores if score])

@@ -26,7 +26,7 @@ from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs import pinned
 from harness.runs.folder import Run
-from harness.runs.leading import PAIRED
+from harness.runs.headline import PAIRED
 from harness.runs.metrics import METRICS
 from harness.runs.records import FrozenScenes, Manifest, Score
 from harness.runs.settings import FrozenSettings, Settings, deciding, parse_seeds

@@ -30,7 +30,7 @@ from harness.extensions.contents.study import (
 )
 from harness.report.document import Table, strong
 from harness.report.drawing.colours import COLOURS, MARKERS
-from harness.runs.leading import SUCCESS
+from harness.runs.headline import SUCCESS
 from harness.runs.metrics import LATENCY, difference, entry, over_episodes
 from harness.studies.axes import Setting
 from harness.studies.paper_numbers import paper_numbers

@@ -26,7 +26,7 @@ from harness.core.statistics import Estimate, mean_of
 from harness.evaluate.dry_run import lacking
 from harness.evaluate.walk import Decided
 from harness.report.suite import MEAN
-from harness.runs.leading import BALANCED, IN_WORDS, SUCCESS
+from harness.runs.headline import BALANCED, IN_WORDS, SUCCESS
 from harness.runs.metrics import LATENCY, entry, over_episodes
 from harness.runs.success import Success, mean_difference, p_of_mean
 from harness.runs.suite import contents_of

@@ -29,7 +29,7 @@ from harness.extensions.schedules.choices import COSTS, Choices, choices
 from harness.extensions.schedules.learning import layouts
 from harness.report.document import Table
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
-from harness.runs.leading import BALANCED
+from harness.runs.headline import BALANCED
 from harness.runs.success import Success
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import Study, corrected, p_cell, refuse_other

@@ -17,7 +17,7 @@ from harness.report.findings import Kind, findings
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import Run
-from harness.runs.leading import IN_WORDS, lead_of
+from harness.runs.headline import IN_WORDS, headline_of
 from harness.runs.listing import Listed, runs
 from harness.runs.metrics import BASELINE, GAINS
 from harness.runs.suite import SuiteRun
@@ -141,7 +141,7 @@ def _parts(done: Run | SuiteRun) -> Mapping[str, Run]:
 
 def _row(run: Listed, done: Run | SuiteRun) -> tuple[str, ...]:
     best, _ = words.compared(done)
-    headline = lead_of(done)
+    headline = headline_of(done)
     n = sum(len(part.grid.episodes) for part in _parts(done).values())
     figures = (
         words.cell(done.score(best, metric))

@@ -15,7 +15,7 @@ from harness.report.document import Section, Table, document, forest, linked, re
 from harness.report.page import save
 from harness.report.words import cell
 from harness.runs.folder import Run, read
-from harness.runs.leading import lead_of
+from harness.runs.headline import headline_of
 from harness.runs.listing import runs as listed
 from harness.runs.metrics import ALL, entry
 from harness.runs.records import Score
@@ -108,7 +108,7 @@ def _group(lines: Sequence[Line], metric: str | None, condition: str | None) -> 
         most = max(count.values())
         condition = next(name for name in reversed(list(count)) if count[name] == most)
 
-    metric = metric or lead_of(*(line.run for line in lines))
+    metric = metric or headline_of(*(line.run for line in lines))
     scored = tuple(
         replace(line, score=line.run.score(condition, metric) or line.run.score(ALL, metric))
         for line in lines

@@ -17,7 +17,7 @@ from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
 from harness.runs.folder import Run
-from harness.runs.leading import lead_of
+from harness.runs.headline import headline_of
 from harness.runs.metrics import (
     ADJUSTED,
     METRICS,
@@ -342,7 +342,7 @@ def _adjusted(pair: Pair, condition: str, a: Floats, b: Floats) -> Iterator[Diff
     if pool is None:
         return
     ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
-    success = Success.of(ends, lead_of(pair.a.run, pair.b.run))
+    success = Success.of(ends, headline_of(pair.a.run, pair.b.run))
     for by in success.ways:
 
         def change(level: float, by: Success = by) -> Estimate:

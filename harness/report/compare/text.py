@@ -24,7 +24,7 @@ from harness.report.compare.difference import (
 )
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side, where
-from harness.runs.leading import SUCCESS
+from harness.runs.headline import SUCCESS
 
 WIDTH = 80
 # of an answer that changed

@@ -23,7 +23,7 @@ from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.findings import FIRST, Kind, findings, of_runs
 from harness.report.words import SHOWN_FROM, as_good_as, p_value
-from harness.runs.leading import IN_WORDS, SUCCESS, headline_metric, lead_of
+from harness.runs.headline import IN_WORDS, SUCCESS, headline_metric, headline_of
 from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
 from harness.runs.records import role_word
 from harness.runs.success import Success
@@ -181,7 +181,7 @@ def _any_time(pair: Pair) -> Iterator[str]:
         return
     for condition in pair.conditions:
         ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
-        success = Success.of(ends, lead_of(pair.a.run, pair.b.run))
+        success = Success.of(ends, headline_of(pair.a.run, pair.b.run))
         a = pair.values(pair.a, SUCCESS, condition).T
         b = pair.values(pair.b, SUCCESS, condition).T
         change = interval_of(success.any_time_difference(b, a), POINTS, "+")

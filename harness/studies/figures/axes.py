@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.report.drawing.colours import INK, PALE
-from harness.runs.leading import headline_metric
+from harness.runs.headline import headline_metric
 
 if TYPE_CHECKING:
     import pandas as pd

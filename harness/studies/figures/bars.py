@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from harness.report.drawing.colours import GREY, INK, conditions
 from harness.report.drawing.pictures import styled
-from harness.runs.leading import IN_WORDS, SUCCESS
+from harness.runs.headline import IN_WORDS, SUCCESS
 from harness.studies.axes import CORE
 from harness.studies.figures.axes import (
     cross,

@@ -9,7 +9,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.report.drawing.colours import COLOURS, FAINT, GREY, MARKERS, conditions
 from harness.report.drawing.pictures import styled
-from harness.runs.leading import IN_WORDS, SUCCESS
+from harness.runs.headline import IN_WORDS, SUCCESS
 from harness.studies.axes import axis_of
 from harness.studies.figures.axes import (
     cross,

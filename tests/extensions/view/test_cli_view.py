@@ -21,7 +21,7 @@ from harness.extensions.view.access import cookie
 from harness.report.document import Section, document
 from harness.report.words import cell
 from harness.runs.folder import read
-from harness.runs.leading import lead_of
+from harness.runs.headline import headline_of
 from harness.runs.metrics import GAINS
 
 Said = tuple[int, str, str]
@@ -147,7 +147,7 @@ def test_an_exported_folder_has_a_list_and_a_page_of_each_run_and_no_path_of_thi
         if name != "index.html"
     )
     run = read(reports / "first")
-    lead = lead_of(run)
+    lead = headline_of(run)
     figures = [cell(run.score("6g", metric)) for metric in (lead, GAINS[lead], "unsafe_rate")]
     assert "".join(f"<td>{figure}</td>" for figure in figures) in site["index.html"]
     assert not any(str(tmp_path) in page for page in site.values())

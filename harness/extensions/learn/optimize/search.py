@@ -30,7 +30,7 @@ from harness.extensions.learn.optimize.tuning import Record, Spent, Tuning, chan
 from harness.prompts.versions import ROLES, Prompt, load
 from harness.report.document import Table
 from harness.runs.folder import Run
-from harness.runs.leading import BALANCED, SUCCESS
+from harness.runs.headline import BALANCED, SUCCESS
 from harness.runs.metrics import METRICS, by_episode
 from harness.runs.success import Success, alike, mean_difference
 from harness.studies.study import Study, ends

@@ -31,7 +31,7 @@ from harness.report.compare.page import beside
 from harness.report.document import Table, linked
 from harness.report.drawing.colours import conditions
 from harness.runs.folder import Run
-from harness.runs.leading import lead_of
+from harness.runs.headline import headline_of
 from harness.runs.metrics import LATENCY, METRICS, SUCCESS, by_episode, mean_by_place, over_episodes
 from harness.runs.records import Answer, is_helper
 from harness.runs.success import Success
@@ -198,7 +198,7 @@ def run_cells(
         cells.append(Cell(ego, helper, run))
     runs = [cell.run for cell in cells]
     episodes = runs[0].episodes[: len(runs[0].grid.episodes)]
-    return Grid(tuple(cells), len(egos), len(helpers), Success.of(episodes, lead_of(*runs)))
+    return Grid(tuple(cells), len(egos), len(helpers), Success.of(episodes, headline_of(*runs)))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ def headline_metric(*names: Container[str]) -> str:
     return BALANCED if all(BALANCED in each for each in names) else SUCCESS
 
 
-def lead_of(*runs: Scored) -> str:
+def headline_of(*runs: Scored) -> str:
     """Return the headline metric of runs: balanced success if all of them have it, else success."""
     names_by_run = []
     for run in runs:
