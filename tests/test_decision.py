@@ -15,7 +15,7 @@ from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.parsing.parse import Status, parse

@@ -33,7 +33,7 @@ from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate import flip
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec
 from harness.prompts import versions

@@ -23,7 +23,7 @@ from harness.core.resources import folder
 from harness.dataset.load import Dataset, load
 from harness.dataset.select import Selection
 from harness.evaluate.agent import example_actions
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.requests import fusion_request, requests

@@ -21,7 +21,7 @@ from harness.backends.skeleton import Skeleton
 from harness.core import resources
 from harness.core.errors import UserError
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.parsing.parse import Status, parse
 from harness.prompts import extension, versions
 from harness.prompts.answer_schema import Shape, answer_schema, longest, number_texts, plainest

@@ -20,7 +20,8 @@ from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import Asker, answer_of
+from harness.evaluate.answers import answer_of
+from harness.evaluate.asking import Asker
 from harness.evaluate.latency import PAPER
 from harness.evaluate.lifecycle import finished_with
 from harness.evaluate.requests import requests

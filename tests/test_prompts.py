@@ -20,7 +20,7 @@ from harness.backends.tokens import counter, tokenizer
 from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, load
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.requests import fusion_request, requests
 from harness.prompts import versions as prompts
 from harness.prompts.densest import EVIDENCE, densest_messages

@@ -26,6 +26,7 @@ from harness.evaluate.kept_answers import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
+from harness.runs.run_parts import write_part
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 RESULT = {*FILES, "run.json", "run.toml", "sources"}
@@ -112,17 +113,37 @@ def test_a_finished_part_whose_answers_say_otherwise_than_their_texts_is_refused
         run(to_kill, out)
 
 
-def test_a_finished_part_whose_tables_are_not_what_its_answers_make_is_refused(
-    to_kill: Spec, in_parts: None, tmp_path: Path
+@pytest.mark.parametrize("forged", ["its tables", "its tables and seal", "all of another part"])
+def test_a_finished_part_that_was_not_finished_here_is_walked_again(
+    forged: str,
+    whole: Path,
+    to_kill: Spec,
+    in_parts: None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Whatever it states: another's key seals nothing, nor does one part's seal another part."""
     out = tmp_path / "run"
-    killed_at(to_kill, out, at(*PLACES["between two parts"]))
-    [file] = out.glob(".work/episodes-*/episodes.csv")
-    text = file.read_text()
-    assert ",left,True," in text
-    file.write_text(text.replace(",left,True,", ",left,False,"))
-    with pytest.raises(UserError, match=r"episodes\.csv is not what its answers make"):
-        run(to_kill, out)
+    killed_at(to_kill, out, at(*PLACES["before a table"]))
+    part, other = sorted(out.glob(".work/episodes-*"))
+    files = {file.name: file.read_bytes() for file in part.iterdir()}
+    shutil.rmtree(part)
+    if forged == "all of another part":
+        shutil.copytree(other, part)
+        shutil.copy(other.with_name(f"seal-{other.name}"), part.with_name(f"seal-{part.name}"))
+    else:
+        assert b",left,True," in files["episodes.csv"]
+        files["episodes.csv"] = files["episodes.csv"].replace(b",left,True,", b",left,False,")
+        with monkeypatch.context() as elsewhere:
+            elsewhere.setenv("SWARMDRIVE_CACHE", str(tmp_path / "another"))
+            seal = part.with_name(f"seal-{part.name}")
+            of_user = seal.read_bytes()
+            write_part(part, files)
+        if forged == "its tables":
+            seal.write_bytes(of_user)
+    _becomes_whole(out, whole, to_kill)
+    assert "has 1 finished part that nobody finished here with your key" in capsys.readouterr().err
 
 
 @pytest.mark.exhaustive
@@ -236,6 +257,15 @@ def test_answers_that_are_all_there_are_not_asked_for_again(
     assert b'"retries":1' in (out / "answers.jsonl").read_bytes()
 
 
+FIRST_TURN = {
+    "raw": "?",
+    "status": "no_json",
+    "finish_reason": "stop",
+    "prompt_tokens": None,
+    "completion_tokens": None,
+    "seconds": None,
+    "slow_s": 0.0,
+}
 SURE = '{"action_distribution": {"SLOWER": 1.0, "IDLE": 0.0, "FASTER": 0.0}}'
 
 
@@ -246,6 +276,12 @@ SURE = '{"action_distribution": {"SLOWER": 1.0, "IDLE": 0.0, "FASTER": 0.0}}'
         ("raw", SURE, "answer 00000-0-.* is not what the rule here gives; delete that file"),
         ("slow_s", -0.1, "states a delay of -0.1 s, which no card of this run declares"),
         ("prompt_tokens", -5, r"answers\.jsonl is damaged .*prompt_tokens"),
+        ("agent", 1, "answer 00000-0-.* states another model than is asked there; delete that"),
+        ("label_mass", 1.0, "states a label_mass, which only a read-out has"),
+        ("flipped", False, "states a flipped, which only a read-out has"),
+        ("first", FIRST_TURN, "states a repair turn, and the text before it calls for none"),
+        ("first", FIRST_TURN | {"status": "bad_sum"}, "another status of its first turn than"),
+        ("first", FIRST_TURN | {"slow_s": 2.0}, "states less slow_s than its first turn"),
     ],
 )
 def test_a_kept_answer_is_one_to_what_is_asked(

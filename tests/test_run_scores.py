@@ -31,7 +31,7 @@ from harness.backends.base import Completion, Role
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.statistics import wilson
 from harness.dataset.load import Dataset
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.latency import inference_s
 from harness.evaluate.requests import requests
 from harness.runs.headline import PAIRED

@@ -13,7 +13,7 @@ from harness.backends.base import Completion, Sums
 from harness.core import resources
 from harness.core.errors import UserError
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.lifecycle import finished_with
 from harness.prompts import versions
 from harness.report.caveats import divided

@@ -11,33 +11,31 @@ from functools import cache, partial
 from itertools import compress, repeat
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET
 
 from harness.backends import cards
-from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
+from harness.backends.base import Backend, Request, Served, forget, served, window
 from harness.backends.card import Card
-from harness.backends.token_counts import too_few
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import Unanswered, UserError, printable
-from harness.core.files import sha256_bytes
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
-from harness.evaluate import flip, repair, servers
+from harness.evaluate import flip, kept_faults, repair, servers
 from harness.evaluate.answer_arrays import intents_of, models_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.fusion import (
     FusionAnswers,
     plan_keys,
     source_of,
 )
-from harness.evaluate.kept_answers import KeptAnswers
+from harness.evaluate.kept_answers import KeptAnswers, read_kept
 from harness.evaluate.latency import fusion_s
 from harness.evaluate.requests import (
     EGO,
@@ -53,24 +51,19 @@ from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import ASKED_AGAIN, refuse_other_kept
 from harness.evaluate.walk import Fuses
-from harness.parsing.parse import parse
 from harness.runs.records import (
-    ASKED,
     REWRITTEN,
     Answer,
     Latency,
-    Role,
     is_helper,
 )
 from harness.runs.unanswered import Tally
 
-T = TypeVar("T")
 CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 # questions without an answer, one after the other, after which nothing more is asked
 IN_A_ROW = CHUNK
 WITH_EXAMPLES = "v10"  # the prompt for every scenario that small models answer in its form
-_TEXTS = msgspec.json.Encoder(order="sorted")  # as `canonical_bytes`, where there is no number
 
 
 @cache  # once: a run has an asker for each of its parts
@@ -86,67 +79,6 @@ def _say_unread(card: Card, prompt: str) -> None:
         "list` shows all",
         file=sys.stderr,
     )
-
-
-def answer_of(request: Request, completion: Completion) -> Answer:
-    """Return the answer that a completion of a request gives: its text parsed, with its facts."""
-    raw = completion.text
-    scene, _, viewers = request.id.partition("/")
-    key, *heard = viewers.split("+")
-    viewer, _, question = key.partition(ASKED)
-    role: Role = "merge" if heard else question or request.role
-    parsed = parse(
-        raw,
-        **request.shape._asdict(),
-        thinking=request.thinking,
-        reasons_first=request.reasons_first,
-        divides=request.divides,
-        finish_reason=completion.finish_reason,
-        error=completion.error,
-    )
-    prompt_sha256, image_sha256 = digests(request)
-    return Answer(
-        scene=scene,
-        viewer=viewer,
-        heard=tuple(heard),
-        role=role,
-        raw=raw,
-        finish_reason=completion.finish_reason,
-        error=completion.error,
-        prompt_tokens=completion.prompt_tokens,
-        completion_tokens=completion.completion_tokens,
-        seconds=completion.seconds,
-        batch_size=completion.batch_size,
-        label_mass=completion.label_mass,
-        retries=completion.retries,
-        cached=completion.cached,
-        slow_s=completion.slow_s,
-        first_token_s=completion.first_token_s,
-        token_s=completion.token_s,
-        letter_share=_or_unset(completion.letter_share),
-        follows_letter=_or_unset(completion.follows_letter),
-        flipped=_or_unset(completion.flipped),
-        prompt_sha256=prompt_sha256,
-        image_sha256=image_sha256,
-        status=str(parsed.status),
-        verdict=parsed.verdict,
-        repairs=tuple(map(str, parsed.repairs)),
-        intent=parsed.intent,
-        mass=parsed.mass,
-        message=parsed.message,
-        detail=parsed.detail,
-        faults=tuple(map(str, parsed.faults)) if len(parsed.faults) > 1 else UNSET,
-        extension=_or_unset(parsed.extension),
-    )
-
-
-def digests(request: Request) -> tuple[str, str | UnsetType]:
-    """Return SHA-256 digests of a request's chat and of its picture; unset without a picture."""
-    return sha256_bytes(_TEXTS.encode(request.messages)), request.image_sha256 or UNSET
-
-
-def _or_unset(value: T | None) -> T | UnsetType:
-    return UNSET if value is None else value
 
 
 class Asker:
@@ -173,16 +105,19 @@ class Asker:
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
         checks_kept: bool = False,
+        earlier: Path | None = None,
     ) -> None:
         """Create an asker. `backend` opens the backend, at the first request.
 
         `kept` is the file of the answers so far; `answers` need not be asked for. `progress` gets
         the number of new answers, those kept by a stopped run included; `more` that of requests
         before they are made. With `checks_kept`, an answer of the file counts only once its
-        question is asked here, and UserError is raised if it answers another prompt.
+        question is asked here, and UserError is raised if it answers another prompt. `earlier` is
+        another file of kept answers, to which none are added.
         """
         self.spec, self._backend, self.latency = spec, backend, latency
         self._kept = KeptAnswers(kept) if kept else None
+        self._earlier = KeptAnswers(earlier) if earlier else None
         self._progress, self._more = progress, more
         self._given, self.served = frozenset(answers or {}), list[Served]()
         recalled = self._recalled()
@@ -247,30 +182,27 @@ class Asker:
 
     def _recalled(self, cut: bool = False) -> dict[str, Answer]:
         """Return the answers kept since they were last recalled, each as its text says."""
-        if not self._kept:
-            return {}
-        recalled = self._kept.recall(cut)
-        refuse_other_kept(self._kept.file, recalled.values(), self.spec.agents, self.spec.actions)
+        recalled: dict[str, Answer] = {}
+        for file in (self._earlier, self._kept):
+            if file:
+                of_file = file.recall(cut)
+                agents, actions = self.spec.agents, self.spec.actions
+                refuse_other_kept(file.file, of_file.values(), agents, actions)
+                recalled |= of_file
         return recalled
 
     def _check_kept(self, request: Request) -> None:
-        """Raise UserError if an answer was kept of another prompt or picture."""
-        answer = self.answers[request.id]
-        if digests(request) != (answer.prompt_sha256, answer.image_sha256):
-            assert self._kept
-            raise UserError(
-                f"{printable(self._kept.file)}: answer {printable(request.id)} is to another "
-                f"prompt or picture than is asked; {ASKED_AGAIN}"
-            )
-        can = self.spec.agents[request.agent].can
-        counts = answer.prompt_tokens, answer.completion_tokens
-        if few := too_few(request, can, answer.raw, *counts):
-            assert self._kept
-            raise UserError(
-                f"{printable(self._kept.file)}: answer {printable(request.id)} states {few}, too "
-                f"few; {ASKED_AGAIN}"
-            )
+        """Raise UserError if what was kept of an answer cannot be the answer to its request."""
+        if fault := kept_faults.fault(self.spec, request, self.answers[request.id]):
+            raise self._refused(request, fault)
         self._unasked.remove(request.id)
+
+    def _refused(self, request: Request, fault: str) -> UserError:
+        """Return the error of a kept answer, of which a phrase says what is wrong with it."""
+        files = [each.file for each in (self._kept, self._earlier) if each]
+        file = next(file for file in files if request.id in read_kept(file))
+        where = f"{printable(file)}: answer {printable(request.id)}"
+        return UserError(f"{where} {fault}; {ASKED_AGAIN}")
 
     def _check_rules(self, kept: Sequence[Request]) -> None:
         """Raise UserError if an answer was kept that the rule which is here does not give."""
@@ -282,11 +214,7 @@ class Asker:
             kept_answer = self.answers[request.id]
             first_answer = kept_answer.first or kept_answer  # before a repair turn
             if (first_answer.raw, first_answer.slow_s) != (here.text, here.slow_s):
-                assert self._kept
-                raise UserError(
-                    f"{printable(self._kept.file)}: answer {printable(request.id)} is not what the "
-                    f"rule here gives; {ASKED_AGAIN}"
-                )
+                raise self._refused(request, "is not what the rule here gives")
 
     def _has(self, name: str) -> bool:
         """Return whether there is an answer to a question that was asked here."""
@@ -366,12 +294,10 @@ class Asker:
         completions = backend.complete(list(flips.values())) if flips else []
         for place, completion in zip(flips, completions, strict=True):
             answers[place] = flip.compared(answers[place], answer_of(flips[place], completion))
-        several = self.spec.several_decide and len(self.spec.helpers) > 0
-        # Where its place would not say whose it is.
-        if several or (len(self.spec.helpers) > 1 and not self.spec.asks_all):
-            for place, request in enumerate(chunk):
-                if request.agent or several:
-                    answers[place] = msgspec.structs.replace(answers[place], agent=request.agent)
+        for place, request in enumerate(chunk):
+            agent = self.spec.agent_of_answer(request.agent)
+            if agent is not UNSET:
+                answers[place] = msgspec.structs.replace(answers[place], agent=agent)
         return {request.id: answer for request, answer in zip(chunk, answers, strict=True)}
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:

@@ -6,6 +6,7 @@ import math
 import os
 import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -21,15 +22,16 @@ from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError, in_range, printable
-from harness.core.files import bytes_of, sha256_file, write_whole
-from harness.core.formats import CONFIG, WORK
+from harness.core.figures import amount
+from harness.core.files import write_whole
+from harness.core.formats import WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.progress import Progress
 from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
-from harness.dataset.select import drawn, spot_check
+from harness.dataset.select import drawn
 from harness.evaluate import costs, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
@@ -114,23 +116,19 @@ def evaluate(
     the others again.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
-        return finished(spec, out)
+        done = finished(spec, out)
+        _checked(out)
+        return done
     metrics_of(spec.source.kind)  # of packages, which must load before anything is asked
     refuse_finished(out)
     run_start = unfinished(spec, out)
     if not run_start and spec.settings.latency == latencies.MEASURED:
         timing.refuse_busy()
     if isinstance(spec.source, FrozenSource):
-        done = _frozen(
+        return _frozen(
             spec, spec.source, out, run_start, progress, cache, more, opens, given, workers
         )
-    else:
-        done = _driven(spec, out, run_start, progress, cache, workers)
-    if run_start:  # whose parts anybody may have written
-        resumed = folder.read(out)
-        refuse(resumed)
-        refuse_others(resumed)
-    return done
+    return _driven(spec, out, run_start, progress, cache, workers)
 
 
 def _driven(
@@ -142,8 +140,11 @@ def _driven(
     workers: Workers,
 ) -> Evaluated:
     made_of = sources(spec)
+    resumes = run_start is not None
     run_start, chunks = _begin_driving(spec, out, run_start, workers)
     with work.working(out, run_start, "run.json") as place:
+        if resumes:
+            _open_unsealed(out, place)
         seen, looked = _walked(
             spec,
             chunks,
@@ -167,12 +168,13 @@ def evaluate_shard(
     if spec.source.until:
         raise UserError(f"--shard {shard}: a run that stops when it has seen enough has no shards")
     made_of = sources(spec)
-    run_start, chunks = _begin_driving(
-        spec, out, unfinished(spec, out, str(shard)), workers, str(shard)
-    )
+    earlier = unfinished(spec, out, str(shard))
+    run_start, chunks = _begin_driving(spec, out, earlier, workers, str(shard))
     own_chunks = shard.part(chunks)
     progress.more(sum(map(len, own_chunks)))
     with work.working(out, run_start, "run.json") as place:
+        if earlier:
+            _open_unsealed(out, place)
         _drive(spec, run_start, own_chunks, place, progress, None, workers)
         kept_sources.write(place, made_of, place)
         parts = [place / _folder_name(chunk) for chunk in own_chunks]
@@ -276,16 +278,18 @@ def _frozen(
     run_start = begin(spec, out, run_start, identity, latency)
     with work.working(out, run_start, "run.json") as place:
         if resumes:
-            _check_parts(spec, chunks, place, latency)
+            _open_unsealed(out, place)
 
         def walk_here(chunk: Sequence[int]) -> dict[str, bytes]:
-            before = read_kept(_answered_file(place, chunk))
+            earlier = _answered_file(place, chunk)
 
             def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
                 # Each has a file of its own, so that a resumed run asks in the same chunks.
                 kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
-                there = {**given, **before, **so_far}
-                return Asker(spec, lambda: backend, latency, kept, there, progress, more, True)
+                there = {**given, **so_far}
+                return Asker(
+                    spec, lambda: backend, latency, kept, there, progress, more, True, earlier
+                )
 
             # A chunk fits into memory; what a language model's engine leaves behind in cycles might
             # not.
@@ -318,43 +322,31 @@ def _frozen(
         )
 
 
-def _check_parts(
-    spec: Spec, chunks: Sequence[Sequence[int]], place: Path, latency: Latency
-) -> None:
-    """Walk one of the parts again that a stopped run has finished, with its own answers.
+def _open_unsealed(out: Path, place: Path) -> None:
+    """Open the finished parts of a stopped run that were not finished by this user on this machine.
 
-    Raises UserError if its tables are others. A part that lacks answers is walked again later.
+    Anybody may have written them: their episodes are walked again with their answers, and a line on
+    stderr says so.
     """
-    finished_chunks = [chunk for chunk in chunks if (place / _folder_name(chunk)).is_dir()]
-    digest_of_start = sha256_file(place / CONFIG, "record")
-    for chunk in spot_check(finished_chunks, digest_of_start, 1):
-        part = place / _folder_name(chunk)
-        answers = read_kept(part / "answers.jsonl")
-        if len(answers) < run_parts.answers_in(part):
-            continue
-        here = _walked_again(spec, chunk, latency, answers)
-        for name in ("decisions.parquet", "episodes.csv"):
-            if here[name] != bytes_of(part / name, "rows"):
-                raise UserError(
-                    f"{printable(part / name)} is not what its answers make; delete that folder, "
-                    "and its episodes are walked again"
-                )
+    finished_parts = [part for part in sorted(place.glob("episodes-*")) if part.is_dir()]
+    unsealed = [part for part in finished_parts if not run_parts.is_sealed(part)]
+    for part in unsealed:
+        _open_again(part)
+    if unsealed:
+        print(
+            f"harness: {printable(out)} has {amount(len(unsealed), 'finished part')} that nobody "
+            "finished here with your key; these episodes are walked again with their answers",
+            file=sys.stderr,
+        )
 
 
-def _walked_again(
-    spec: Spec, chunk: Sequence[int], latency: Latency, answers: Mapping[str, Answer]
-) -> dict[str, bytes]:
-    """Return the files of a part whose answers are all there; raise UserError if one is not."""
-
-    def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
-        return Asker(spec, _nobody, latency, answers={**answers, **so_far})
-
-    return _walk(spec, chunk, asker_of)
-
-
-def _nobody() -> Backend:
-    """Raise UserError: a finished part has all the answers that it needs."""
-    raise UserError("a finished part of the stopped run lacks answers; delete it, or start again")
+def _open_again(part: Path) -> None:
+    """Replace a finished part by the answers that it has."""
+    answered = read_kept(part / "answers.jsonl")
+    write_whole(part.with_suffix(".jsonl"), writer.lines(list(answered.values())))
+    gone = part.with_name(f".{part.name}.{os.getpid()}.part")
+    os.replace(part, gone)  # so that no part is ever half there
+    shutil.rmtree(gone)
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
@@ -424,10 +416,7 @@ def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> N
     for part in parts:
         answered = read_kept(part / "answers.jsonl")
         if len(answered) < run_parts.answers_in(part):
-            write_whole(part.with_suffix(".jsonl"), writer.lines(list(answered.values())))
-            gone = part.with_name(f".{part.name}.{os.getpid()}.part")
-            os.replace(part, gone)  # so that no part is ever half there
-            shutil.rmtree(gone)
+            _open_again(part)
     raise Unanswered(str(tally))
 
 
@@ -716,7 +705,7 @@ def read_or_evaluate(
     """Return the run in a folder, which `evaluate` makes first unless it is finished.
 
     For studies of several runs; arguments are those of `evaluate`. Raises UserError if a finished
-    one is another evaluation, or states answers that its texts do not say; else as `evaluate`.
+    one is another evaluation or contradicts itself; else as `evaluate`.
     """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         finished(spec, out)
@@ -724,6 +713,15 @@ def read_or_evaluate(
         evaluate(spec, out, progress, cache, progress.more, opens=opens, given=given)
         work.tidy(out)
         return folder.read(out)
+    return _checked(out)
+
+
+def _checked(out: Path) -> folder.Run:
+    """Return a finished run, which anybody may have written.
+
+    Raises UserError if its tables contradict each other, or its answers their texts.
+    """
     run = folder.read(out)
+    refuse(run)
     refuse_others(run)
     return run

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
-from msgspec import structs
+from msgspec import UNSET, UnsetType, structs
 
 from harness.backends.base import BARE
 from harness.backends.card import Card
@@ -355,6 +355,17 @@ class Spec:
         Places are those of `Scene.place`. Helpers take the helpers' agents in turn.
         """
         return 1 + (place - 1) % len(self.helpers) if place and self.helpers else 0
+
+    def agent_of_answer(self, agent: int) -> int | UnsetType:
+        """Return what an answer of an agent says of it: its index, where its place would not say.
+
+        So it is unset with one helper model, or where every helper is asked in turn, and for the
+        ego unless other vehicles decide as well.
+        """
+        if self.several_decide and self.helpers:
+            return agent
+        chosen = len(self.helpers) > 1 and not self.asks_all
+        return agent if agent and chosen else UNSET
 
     @property
     def actions(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from harness.backends.base import Backend
 from harness.core.errors import Unanswered, UserError, printable
 from harness.dataset.load import Scene
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.latency import EXAMPLE, MEASURED, times
 from harness.evaluate.requests import fusion_request, requests
 from harness.evaluate.spec import Spec

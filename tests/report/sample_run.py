@@ -11,7 +11,8 @@ from run_on_disk import restated
 
 from harness.backends.base import Completion
 from harness.core.versions import FIGURES
-from harness.evaluate.asking import Asker, answer_of
+from harness.evaluate.answers import answer_of
+from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.latency import PAPER
 from harness.evaluate.requests import requests

@@ -27,7 +27,7 @@ from harness.backends.base import Completion
 from harness.cli.report import command
 from harness.core.errors import UserError
 from harness.core.files import digest
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.requests import requests
 from harness.prompts import readout
 from harness.prompts import versions as prompts

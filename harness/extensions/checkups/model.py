@@ -12,7 +12,7 @@ from harness.core.progress import Progress
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.requests import requests
 from harness.evaluate.spec import Spec

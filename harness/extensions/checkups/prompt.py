@@ -14,7 +14,7 @@ from harness.backends.registry import capabilities, open_backend
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.progress import Progress
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.extensions.checkups import questions
 from harness.extensions.checkups.read_outs import COUNT as READ_OUTS
 from harness.extensions.checkups.read_outs import Findings, Moved, examine, moved

@@ -20,7 +20,7 @@ from harness.core import kept
 from harness.core.errors import UserError, printable
 from harness.core.files import digest
 from harness.evaluate.agent import Agent
-from harness.evaluate.asking import answer_of
+from harness.evaluate.answers import answer_of
 from harness.extensions.checkups import questions
 from harness.extensions.checkups.questions import Fact, Pair
 from harness.prompts.readout import MOST_SHARE
