@@ -106,8 +106,8 @@ def command(
             "--save-video and --tracker out"
         )
     if save_video:
-        for drawer in VIDEOS.values():
-            drawer.ready()
+        for drawer in VIDEOS:
+            VIDEOS.ask(drawer, lambda videos: videos.ready())
     source = resolve.driven(world, name)
     driven = len(source.numbers)
     in_range("--save-video", save_video, 0, driven)
@@ -132,8 +132,10 @@ def command(
         videos: list[Path] = []
 
         def draw() -> None:
-            for drawer in VIDEOS.values() if save_video else ():
-                videos.extend(drawer.write(where, save_video, silent))
+            for drawer in VIDEOS if save_video else ():
+                videos.extend(
+                    VIDEOS.ask(drawer, lambda drawer: drawer.write(where, save_video, silent))
+                )
 
         done, page = evaluate(
             spec,

@@ -32,6 +32,19 @@ CONTROLS = "swarmdrive.controls"
 PLUG_INS = "swarmdrive.plugins"
 PYTHON = Plugins[Any]("swarmdrive.python", object, {})  # what extensions add to `import harness`
 INTERFACE = 1
+# The kinds of plug-ins that the core takes from packages; extensions may take others, which they
+# name (`Extension.kinds`).
+KINDS = frozenset(
+    {
+        *("audits", "backends", "caveats", "channels", "contents", "exports", "extras", "hooks"),
+        *("metrics", "notes", "parts", "python", "remarks", "rules", "scenarios", "schedules"),
+        *("sections", "videos"),
+    }
+)
+# The kinds that it takes from extensions that ship alone.
+SHIPPED_KINDS = frozenset(
+    {"channel_models", "encodings", "families", "panels", "readers", "sources", "timers"}
+)
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
 TYPED = ("commands", "groups", "studies", "spellings", "short")  # tables of what somebody types
 Texts = Mapping[str, str]
@@ -62,7 +75,8 @@ class Extension:
     `name` is that of its entry point, and `interface` the version of this class it was written for.
     All else are tables by name: `adds` has plug-ins by kind (such as `rules`) and name, `groups`
     the help of groups of commands, `panels` the panel of each command on the first screen, and
-    `spellings` what replaces older commands. A function or object is given as `module:name`,
+    `spellings` what replaces older commands; `kinds` has kinds of plug-ins that others may add to
+    this extension. A function or object is given as `module:name`,
     imported at first use.
     """
 
@@ -85,6 +99,8 @@ class Extension:
     settings: Mapping[str, Setting] = field(default_factory=dict)
     # plug-ins by kind, such as `rules` or `metrics`, and by name; the value is a place
     adds: Mapping[str, Texts] = field(default_factory=dict)
+    # kinds of plug-ins that it takes from others, and what each is
+    kinds: Texts = field(default_factory=dict)
 
 
 def extensions() -> Mapping[str, Extension]:
@@ -241,7 +257,20 @@ def _extensions(path: tuple[str, ...]) -> Mapping[str, Extension]:
                 working[name] = _checked(name, loaded[name])
         except UserError as error:
             print(f"harness: {error}; all else works", file=sys.stderr)
+    for name, extension in working.items():
+        if not is_ours(declared[name]):
+            _say_unknown_kinds(extension, working.values())
     return working
+
+
+def _say_unknown_kinds(extension: Extension, working: Iterable[Extension]) -> None:
+    """Say on stderr which plug-ins of a package's extension nothing takes."""
+    allowed = set(KINDS).union(*(each.kinds for each in working))
+    for kind in sorted(extension.adds.keys() - allowed):
+        ships = "only extensions that ship add" if kind in SHIPPED_KINDS else "nothing takes"
+        what = f"extension {printable(extension.name)} adds {printable(kind)}, which {ships}"
+        choices = ", ".join(sorted(allowed))
+        print(f"harness: {what}; allowed: {choices}, or what its kinds name", file=sys.stderr)
 
 
 def _is_here(entry: Any) -> bool:

@@ -67,7 +67,28 @@ def _declared(group: str) -> list[Any]:
 def _all_entries(path: tuple[str, ...]) -> Any:
     from importlib.metadata import entry_points
 
+    _say_if_hidden()
     return entry_points()
+
+
+def _say_if_hidden() -> None:
+    """Say on stderr if a package that has our name, earlier on the path, hides what ours adds."""
+    from importlib.metadata import distributions
+
+    named_as_ours = list(distributions(name=OURS))
+    declared = [_of_groups(distribution) for distribution in named_as_ours]
+    if not all(each <= declared[0] for each in declared):
+        where = printable(named_as_ours[0].locate_file(""))
+        say_once(
+            f"the package in {where} is called {OURS} as well, and hides what the harness has; "
+            "uninstall it"
+        )
+
+
+def _of_groups(distribution: Any) -> set[tuple[str, str]]:
+    """Return group and name of each entry point of a distribution that the harness reads."""
+    points = [(point.group, point.name) for point in distribution.entry_points]
+    return {point for point in points if point[0].startswith("swarmdrive.")}
 
 
 def is_ours(entry: Any) -> bool:

@@ -109,8 +109,8 @@ def build(
     # Of worlds that are played elsewhere no danger is known.
     audits = audits and episodes >= LEAST_AUDITED and not scenario.has_own_world and bool(AUDITS)
     if audits and not shard:
-        for plugin in AUDITS.values():
-            plugin.ready()
+        for name in AUDITS:
+            AUDITS.ask(name, lambda audit: audit.ready())
     config = _settings(scenario, episodes, seed)
     if not re.fullmatch(FILE_NAME, out.absolute().name):
         raise UserError(
@@ -240,9 +240,11 @@ def _write_dataset(
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters)
     findings = list[str]()
-    for plugin in AUDITS.values() if audits else ():
+    for name in AUDITS if audits else ():
         more(episodes)
-        findings.append(plugin.found(scenario, episodes, seed, progress, workers))
+        findings.append(
+            AUDITS.ask(name, lambda audit: audit.found(scenario, episodes, seed, progress, workers))
+        )
     command = _command(scenario, episodes, seed, audits)
     files = {
         "README.md": _readme(name, command, config, forest, findings).encode(),

@@ -258,7 +258,7 @@ class Details:
         if scene and answer.viewer not in scene.viewers:
             raise UserError(
                 f"{printable(run.path / 'answers.jsonl')} has an answer of "
-                f"{printable(answer.viewer)} in scene {printable(name)}, "
+                f"{printable(answer.viewer)!r} in scene {printable(name)}, "
                 "where nobody of that name answers; make the run again"
             )
         fields = _fields(answer)

@@ -9,7 +9,7 @@ import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
-from harness.core.plugins import Plugins
+from harness.core.plugins import Shipped
 from harness.core.statistics import Estimate, known_mean, seed_interval
 from harness.evaluate.table import columns
 from harness.evaluate.walk import Ask, Decided, World, walk
@@ -106,7 +106,7 @@ class Source(Protocol):
         ...
 
 
-SOURCES = Plugins[Source]("swarmdrive.sources", Source, {})  # those that extensions add
+SOURCES = Shipped[Source]("swarmdrive.sources", Source, {})  # of none but extensions that ship
 
 
 def metric_columns(part: Decided[Any]) -> dict[str, Floats]:

@@ -27,6 +27,7 @@ from harness.coordination.encodings import ENCODINGS
 from harness.coordination.operating_point import more_parts
 from harness.coordination.schedules import READERS
 from harness.core import extensions as known
+from harness.core import plugins
 from harness.core.errors import UserError, printable
 from harness.core.extensions import Extension
 from harness.core.plugins import Plugins
@@ -333,13 +334,18 @@ def test_a_package_adds_a_name_for_python_and_replaces_none(
     assert "answer" in dir(package)
 
 
-def test_an_extension_takes_plug_ins_of_a_kind_of_its_own(installed: Installed) -> None:
+def test_an_extension_takes_plug_ins_of_a_kind_of_its_own(
+    installed: Installed, capsys: pytest.CaptureFixture[str]
+) -> None:
     installed(
-        odd='Extension(name="odd", adds={"tastes": {"sweet": "of_others:SWEET"}})',
+        odd='Extension(name="odd", kinds={"tastes": "what is tasted"}, adds={"tastes": '
+        '{"sweet": "of_others:SWEET"}})',
         other='Extension(name="other", adds={"tastes": {"sour": "of_others:ODD"}})',
         sweet="'sugar'",
     )
     tastes = Plugins("swarmdrive.tastes", str, {})
+    known.extensions()
+    assert "tastes" not in capsys.readouterr().err
     assert sorted(tastes) == ["sour", "sweet"]
     assert tastes["sweet"] == "sugar"
     with pytest.raises(UserError, match="is of type Extension and no str"):
@@ -686,14 +692,83 @@ def test_metadata_that_cannot_be_read_are_one_line(
 
 @pytest.mark.parametrize("registry", [MODELS, ENCODINGS, READERS])
 def test_no_package_adds_what_only_extensions_that_ship_add(
-    installed: Installed, registry: Plugins
+    installed: Installed, registry: Plugins, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kind = registry.group.rpartition(".")[2]
     before = list(registry)
     installed(odd=f'Extension(name="odd", adds={{"{kind}": {{"mine": "of_others:ODD"}}}})')
     assert "odd" in known.extensions()
+    assert f"odd adds {kind}, which only extensions that ship add; al" in capsys.readouterr().err
     assert list(registry) == before
     assert "mine" not in registry
+
+
+def test_plug_ins_that_nothing_takes_are_one_line(
+    installed: Installed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    installed(odd='Extension(name="odd", adds={"colours": {"mine": "of_others:ODD"}})')
+    assert "odd" in known.extensions()
+    assert "extension odd adds colours, which nothing takes; allowed: " in capsys.readouterr().err
+
+
+def test_every_registry_is_of_a_kind_that_extensions_may_add() -> None:
+    called = re.compile(r"\b\w+(?:\[.*\])?\(\s*\"swarmdrive\.(\w+)\"")
+    groups = set[str]()
+    for file in Path(package.__file__).parent.rglob("*.py"):
+        if "extensions" not in file.parts:
+            groups |= set(called.findall(file.read_text()))
+    assert groups | {"parts"} == known.KINDS | known.SHIPPED_KINDS
+
+
+@pytest.mark.parametrize("name", [plugins.OURS, "Swarmdrive_Harness"])
+def test_a_package_with_our_name_that_hides_what_ships_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    about = tmp_path / "swarmdrive_harness-9.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 9.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    known.extensions()
+    assert (
+        f"harness: the package in {tmp_path} is called swarmdrive-harness as well, and hides what "
+        "the harness has; uninstall it\n"
+    ) in capsys.readouterr().err
+
+
+VIDEOS_THAT_FAIL = """
+class Videos:
+    def ready(self): return 1 / 0
+    def write(self, run, most, quiet): return []
+VIDEOS = Videos()
+class Audit:
+    def ready(self): return 1 / 0
+    def found(self, *given): return ""
+AUDIT = Audit()
+"""
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "drive --episodes 1 --save-video 1",
+        "dataset build occluded-intersection --episodes 100 --out built",
+    ],
+)
+def test_videos_and_audits_of_a_package_that_fail_are_one_line(
+    installed: Installed,
+    harness: Typed,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    typed: str,
+) -> None:
+    adds = {"videos": {"mine": "of_others:VIDEOS"}, "audits": {"mine": "of_others:AUDIT"}}
+    installed(odd=f'Extension(name="odd", adds={adds})')
+    source = Path(sys.path[0]) / "of_others.py"
+    source.write_text(source.read_text() + VIDEOS_THAT_FAIL)
+    monkeypatch.chdir(tmp_path)
+    code, _, err = harness(*typed.split())
+    assert code == 2
+    assert "mine: its package failed: division by zero" in err.splitlines()[-1]
 
 
 def test_a_plug_in_of_an_extension_with_the_name_of_a_built_in_one_is_left_out(

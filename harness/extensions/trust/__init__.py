@@ -9,6 +9,7 @@ EXTENSION = Extension(
     commands={"study trust": f"{_HERE}.command:command"},
     spellings={"trust": "study trust"},
     studies={"trust": "trust"},
+    kinds={"attacks": "what liars say"},
     adds={
         "parts": {"trust": f"{_HERE}.part:Guard"},
         "python": {"Attack": f"{_HERE}.attacks:Attack", "Turn": f"{_HERE}.attacks:Turn"},

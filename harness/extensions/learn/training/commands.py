@@ -25,6 +25,7 @@ BATCH = 16
 RANK = 16
 RATES = {True: 1e-3, False: 1e-4}  # with an adapter, and without
 MOST = 512  # of a rank
+MOST_THREADS = 1024
 DTYPES = ("float32", "bfloat16")
 REPORT = 0.3
 OBJECTIVES = ("imitation", "values")
@@ -90,12 +91,10 @@ def distill(
     from harness.prompts import versions as prompts
 
     extras.need("harness model distill", "torch", "transformers", "highway_env")
-    for flag, value, least in (
-        ("--batch", batch, 1),
-        ("--threads", threads, 1),
-    ):
-        if value is not None and value < least:
-            raise UserError(f"{flag} {value}: give {least} or more")
+    if batch < 1:
+        raise UserError(f"--batch {batch}: give 1 or more")
+    if threads is not None:
+        in_range("--threads", threads, 1, MOST_THREADS)
     in_range("--seed", seed, 0, LAST_SEED)
     if objective not in OBJECTIVES:
         raise unknown("--objective", objective, OBJECTIVES)
