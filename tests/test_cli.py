@@ -18,7 +18,6 @@ from harness.cli.run import default_out
 from harness.core import work
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
-from harness.evaluate.resolve import points
 from harness.evaluate.run import evaluate
 from harness.prompts import versions
 from harness.runs.settings import parse_seeds
@@ -423,25 +422,3 @@ def test_help_and_lists_load_no_heavy_package(args: list[str]) -> None:
     # whether each prompt is a template at all
     needs = ["jinja2"] if args == ["prompt", "list"] else []
     assert done.stderr == f"{needs}\n"
-
-
-@pytest.mark.parametrize(
-    ("conditions", "control", "names"),
-    [
-        (["single-local", "6g"], [], "single-local 6g"),
-        (["single-local", "6g"], ["shuffled-messages"], "single-local 6g 6g:messages=shuffled"),
-        (["6g", "6g:tau=0"], ["no-messages"], "6g 6g:tau=0 6g:loss=1 6g:tau=0,loss=1"),
-        (["6g", "6g:loss=1"], ["no-messages"], "6g 6g:loss=1"),
-        (["v2x", "v2x"], ["no-messages", "shuffled-messages"], 
-            "v2x v2x:loss=1 v2x:messages=shuffled"),
-    ],
-)  # fmt: skip
-def test_a_control_stands_beside_every_condition_with_a_channel(
-    conditions: list[str], control: list[str], names: str
-) -> None:
-    assert sorted(point.name for point in points(conditions, control)) == sorted(names.split())
-
-
-def test_an_unknown_control_is_refused() -> None:
-    with pytest.raises(UserError, match="unknown --control 'deaf'"):
-        points(["6g"], ["deaf"])

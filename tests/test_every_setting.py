@@ -48,10 +48,10 @@ basis = "none"
 RUNS = {
     "rules": "eval --model proxy-faulty --prompt v4 --helper-model "
     "proxy,proxy-faulty --dataset {small} "
-    "--limit 3 --seeds 3,7 --condition 6g:tau=0.5 --control shuffled-messages --attack "
-    "liar:share=1/3 "
-    "--sums divide --batch-size 3 --latency ego=0.2,helper=0.1,fusion=0.3 --ask all --ties first "
+    "--limit 3 --seeds 3,7 --condition 6g:tau=0.5 --sums divide --batch-size 3 --latency ego=0.2,helper=0.1,fusion=0.3 --ask all --ties first "
     "--tag night",
+    "counterparts": "eval --dataset {two} --condition 6g:tau=0.5 --control shuffled-messages "
+    "--attack liar:share=1/3",
     "selected": "eval --dataset {small} --only 0:3 --danger left --sample 1 --sample-seed 3",
     "narrow": "eval --dataset {two} --condition single-local --until-width 99",
     "decided": "eval --dataset {two} --condition single-local "
@@ -76,13 +76,15 @@ RUNS = {
     "{two} --limit 1 --condition single-local "
     "--image blank",
 }
-if "devices" not in extensions():  # whose settings it has
-    del RUNS["device"]
+# whose settings they have
+for names, run in ({"devices"}, "device"), ({"controls", "trust"}, "counterparts"):
+    if not names <= extensions().keys():
+        del RUNS[run]
 NEEDS = {"engine": "torch", "picture": "llama_cpp"}
 SCENARIO = "occluded-intersection:limits=1,perception=1,witnesses=any,radio_share=0.0"
 # A run states its conditions by name, and its engine with its model.
 IN_OTHER_WORDS: dict[str, dict[str, Any]] = {
-    "rules": {
+    "counterparts": {
         "condition": [
             "6g:tau=0.5",
             "6g:tau=0.5,messages=shuffled",

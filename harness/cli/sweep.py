@@ -19,7 +19,7 @@ def command(
         None,
         help="Setting to vary: tau (nats), loss (0 to 1), size (vehicles), latency (ms), window "
         "(ms), "
-        "consensus, attack, or any other setting of an operating point by its name. Repeatable: "
+        "consensus, content, or any other setting of an operating point by its name. Repeatable: "
         "every "
         "combination of their values is played. Default: the paper's panels.",
     ),

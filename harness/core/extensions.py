@@ -36,9 +36,9 @@ INTERFACE = 1
 # name (`Extension.kinds`).
 KINDS = frozenset(
     {
-        *("audits", "backends", "caveats", "channels", "contents", "exports", "extras", "hooks"),
-        *("metrics", "notes", "parts", "python", "remarks", "rules", "scenarios", "schedules"),
-        *("sections", "videos"),
+        *("audits", "backends", "caveats", "channels", "contents", "counterparts", "exports"),
+        *("extras", "hooks", "metrics", "notes", "parts", "python", "remarks", "rules"),
+        *("scenarios", "schedules", "sections", "videos"),
     }
 )
 # The kinds that it takes from extensions that ship alone.
@@ -56,16 +56,24 @@ class Setting:
 
     It is an option of `harness eval` and `harness drive`.
 
+    A setting of the kind `tuple` holds texts: its option may be repeated, and its default is ().
     `help` is a sentence for people. `behind` names the setting of the core after which files and
-    help list this one; empty for a table of their own.
+    help list this one; empty for a table of their own. `only` names the world that alone has the
+    option, `frozen` or `closed-loop`; empty for both.
     """
 
-    kind: type  # str, int, float or bool
-    default: str | int | float | bool
+    kind: type  # str, int, float, bool or tuple, for texts
+    default: str | int | float | bool | tuple[()]
     help: str  # a sentence for people
     # of one that ships: the setting of the core behind which files and help have it, null where it
     # has its default. Empty for the table of all that extensions add
     behind: str = ""
+    only: str = ""  # the world that alone has its option: `frozen` or `closed-loop`; empty for both
+
+    @property
+    def unset(self) -> tuple[()] | None:
+        """Return what files have of one behind another where nobody sets it: None or no texts."""
+        return () if self.kind is tuple else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -335,9 +343,11 @@ def _is_setting(name: Any, setting: Any) -> bool:
         and not iskeyword(name)
         and name != "help"  # which every command has
         and isinstance(setting, Setting)
-        and setting.kind in (str, int, float, bool)
+        and setting.kind in (str, int, float, bool, tuple)
         and type(setting.default) is setting.kind
-        and (setting.kind is not float or isfinite(float(setting.default)))
+        and (setting.kind is not tuple or not setting.default)
+        and setting.only in ("", "frozen", "closed-loop")
+        and (not isinstance(setting.default, float) or isfinite(setting.default))
         and isinstance(setting.help, str)
     )
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
 from harness.backends.base import BARE
+from harness.coordination.counterparts import counterparts
 from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
-from harness.core.errors import UserError, in_range, unknown
-from harness.core.extensions import control_settings
+from harness.core.errors import UserError, in_range
 from harness.core.files import text_of
 from harness.core.resources import folder
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose
@@ -31,8 +31,6 @@ from harness.world.scenarios import DEFAULT
 if TYPE_CHECKING:
     from harness.evaluate.live_world import LiveSource
 
-NO_MESSAGES = {"no-messages": "loss=1"}
-
 
 def spec(settings: Settings, source: Source) -> Spec:
     """Return the evaluation of a source of scenes under a run's settings, with all files opened.
@@ -45,7 +43,7 @@ def spec(settings: Settings, source: Source) -> Spec:
         helpers=helpers,
         source=source,
         seeds=parse_seeds(settings.seeds),
-        points=points(settings.condition or tuple(POINTS), settings.control, settings.attack),
+        points=points(settings.condition or tuple(POINTS), settings.extensions),
         timer=timers.chosen(settings.extensions) or _of_replayed(ego, settings),
         settings=settings,
     )
@@ -175,25 +173,11 @@ def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
 
 
 def points(
-    conditions: Sequence[str], controls: Sequence[str] = (), attacks: Sequence[str] = ()
+    conditions: Sequence[str], settings: Mapping[str, Any] | None = None
 ) -> tuple[OperatingPoint, ...]:
-    """Return the operating points of conditions, each once, and their controls and attacks.
+    """Return the operating points of conditions, each once, and the counterparts of each.
 
-    Each control (which replaces what helpers say) and attack (by which some of them lie) is added
-    to every condition with a channel, as a condition of its own. Raises UserError for an unknown
-    name.
+    `settings` are a run's settings of extensions, by name. Raises UserError for an unknown name.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
-    settings_by_control = {**NO_MESSAGES, **control_settings()} if controls else {}
-    if wrong := [control for control in controls if control not in settings_by_control]:
-        raise unknown("--control", wrong[0], settings_by_control)
-    beside = dict.fromkeys(
-        (*(settings_by_control[control] for control in controls), *(f"attack={a}" for a in attacks))
-    )
-    derived = [
-        named_point(point.name + ("," if ":" in point.name else ":") + setting)
-        for setting in beside
-        for point in named
-        if point.radio.profile and setting.partition("=")[0] not in point.name
-    ]
-    return tuple(dict.fromkeys((*named, *derived)))
+    return tuple(dict.fromkeys((*named, *counterparts(named, settings or {}))))

@@ -15,6 +15,7 @@ from harness.backends.cards import argument
 from harness.backends.registry import ENGINES
 from harness.coordination import contents_of_packages, parts_of_packages
 from harness.coordination.coordinate import TIES
+from harness.coordination.counterparts import COUNTERPARTS
 from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.schedules import SCHEDULES
 from harness.core import extensions
@@ -450,8 +451,7 @@ class Spec:
         """Return the settings that open what is opened here;
         and those that depend on it if nothing is typed.
 
-        A condition with a control or an attack has a name of its own,
-        and so has a model on another engine.
+        A counterpart of a condition has a name of its own, and so has a model on another engine.
         """
         helpers = HelperSettings()
         if self.helpers:
@@ -472,8 +472,6 @@ class Spec:
             "helpers": helpers,
             "world": self.source.settings(),
             "condition": tuple(point.name for point in self.points),
-            "control": (),
-            "attack": (),
             "seeds": ",".join(map(str, self.seeds))
             if len(self.seeds) > 1
             else f"{first}:{first + 1}",
@@ -488,14 +486,20 @@ class Spec:
         }
 
     def _of_extensions(self) -> dict[str, Any]:
-        """Return the settings of extensions; those that choose a timer say which is open."""
+        """Return the settings of extensions; those that choose a timer say which is open.
+
+        Of those that make counterparts of conditions there is none, nor of others without texts.
+        """
         beside = extensions.beside()
-        usual = {
-            name: setting.default for name, setting in of_extensions().items() if name not in beside
-        }
-        others = timers.without(self.settings.extensions)
+        settings: dict[str, Any] = {}
+        for name, setting in of_extensions().items():
+            if name not in beside and setting.default not in formats.NO_TEXTS:
+                settings[name] = setting.default
+        for name, value in timers.without(self.settings.extensions).items():
+            if name not in COUNTERPARTS:
+                settings[name] = value
         by_timer = self.timer.settings() if self.timer else {}
-        return {**usual, **others, **by_timer}
+        return {**settings, **by_timer}
 
     @property
     def ties(self) -> str:

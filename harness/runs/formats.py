@@ -19,6 +19,7 @@ from harness.world.families import FAMILIES
 
 NUMBER = 2
 EXTENSIONS = "extensions"  # the table of settings that extensions add
+NO_TEXTS: tuple[Any, ...] = ([], ())  # of a setting of texts that nobody sets
 UNSET = "unset"  # stands for `msgspec.UNSET`: a folder is listed without loading msgspec
 FORMAT = f"swarmdrive-run/{NUMBER}"
 # Older formats, and the version of the harness that reads each.
@@ -232,19 +233,23 @@ def gathered(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return a table of settings as this version holds it: those of extensions in a table
     `extensions`.
 
-    In files some of them stand beside the settings of the core; of these, null ones are left out.
-    Raises UserError for one of an extension that is not installed.
+    In files some of them stand beside the settings of the core; of these, null ones are left out,
+    and of all of them lists without texts. Raises UserError for one of an extension that is not
+    installed.
     """
     beside = extensions.beside()
     entries = {name: settings[name] for name in beside if settings.get(name) is not None}
     others = {name: value for name, value in settings.items() if name not in beside}
     table = _without_gone(others)
     inner = table.get(EXTENSIONS, {})
-    return {**table, EXTENSIONS: {**inner, **entries} if isinstance(inner, Mapping) else inner}
+    if isinstance(inner, Mapping):
+        both = {**inner, **entries}
+        inner = {name: value for name, value in both.items() if value not in NO_TEXTS}
+    return {**table, EXTENSIONS: inner}
 
 
 def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table without the nulls of settings whose extension is not installed.
+    """Return a table without settings whose extension is not installed, where they are unset.
 
     Raises UserError for one that has a value.
     """
@@ -253,7 +258,7 @@ def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
         owner = owner_of_plugin("settings", name)
         if owner is None:
             kept[name] = value
-        elif value is not None:
+        elif value is not None and value not in NO_TEXTS:
             raise UserError(f"setting {name} is {part_of(owner)}")
     return kept
 
@@ -287,9 +292,12 @@ def settings_as_file(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _behind(name: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of extensions' settings that stand behind one of the core, null if not set."""
-    beside = extensions.beside().items()
-    return {each: values.get(each) for each, setting in beside if setting.behind == name}
+    """Return those of extensions' settings that stand behind one of the core, unset ones too."""
+    return {
+        each: values.get(each, setting.unset)
+        for each, setting in extensions.beside().items()
+        if setting.behind == name
+    }
 
 
 def _table(record: Mapping[str, Any]) -> Any:

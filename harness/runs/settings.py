@@ -227,29 +227,6 @@ class Settings(Struct, frozen=True, kw_only=True):
             compared=False,
         ),
     ] = ()
-    control: Annotated[
-        tuple[str, ...],
-        option(
-            "Beside each condition with a channel, also score a control. shuffled-messages: the "
-            "ego hears the helpers of another layout. no-messages: every message is lost. blind: "
-            "the helpers see nothing. Repeatable.",
-            CONDITIONS,
-            "frozen",
-            same=OPENED,
-            compared=False,
-        ),
-    ] = ()
-    attack: Annotated[
-        tuple[str, ...],
-        option(
-            "Beside each condition with a channel, also score it under attack: liar:share=1/3 "
-            "makes a third of the helpers lie; liar+spoof combines two attacks. `harness study "
-            "trust --help` lists them. Repeatable.",
-            CONDITIONS,
-            same=OPENED,
-            compared=False,
-        ),
-    ] = ()
     answer: Annotated[
         str,
         option(
@@ -372,7 +349,7 @@ class Settings(Struct, frozen=True, kw_only=True):
         tuple[str, ...], option("Label to find the run by later. Repeatable.", OUTPUT, same=NOTHING)
     ] = ()
     # what extensions add, by the name of the option
-    extensions: dict[str, str | int | float | bool] = {}
+    extensions: dict[str, str | int | float | bool | tuple[str, ...]] = {}
 
 
 class Option(NamedTuple):
@@ -426,14 +403,14 @@ def options(world: type[Struct]) -> list[Option]:
     Those of extensions that stand behind one of the core follow it.
     """
     declared, last = list[Option](), list[Option]()
-    beside = extensions.beside()
+    beside, kind = extensions.beside(), str(world.__struct_config__.tag)
     for each in core_options(world):
         declared.append(each)
         for name, setting in beside.items():
-            if setting.behind == each.name:
-                declared.append(_added(name, setting, (name,), None))
+            if setting.behind == each.name and setting.only in ("", kind):
+                declared.append(_added(name, setting, (name,), setting.unset))
     for name, setting in of_extensions().items():
-        if name not in beside:
+        if name not in beside and setting.only in ("", kind):
             last.append(_added(name, setting, (EXTENSIONS, name), setting.default))
     return [*declared, *last]
 
@@ -442,7 +419,8 @@ def _added(name: str, setting: Setting, path: tuple[str, ...], default: Any) -> 
     """Return the option of a setting that an extension adds, below the extension's name."""
     owners = extensions.extensions().values()
     panel = next(f"Extension {owner.name}" for owner in owners if name in owner.settings)
-    shape = (setting.kind, default, setting.help, panel)
+    kind = list[str] if setting.kind is tuple else setting.kind
+    shape = (kind, default, setting.help, panel)
     return Option(path, name, *shape, False, ITSELF, True, unset=setting.default)
 
 
@@ -715,7 +693,8 @@ def check_extensions(settings: Settings, where: str) -> None:
             )
         kind = known_settings[name].kind
         if type(value) is not kind and not (kind is float and type(value) is int):
-            raise UserError(f"{where}: {name} = {printable(repr(value))}; allowed: {kind.__name__}")
+            allowed = "a list of texts" if kind is tuple else kind.__name__
+            raise UserError(f"{where}: {name} = {printable(repr(value))}; allowed: {allowed}")
 
 
 def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str, Any]:

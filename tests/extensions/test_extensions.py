@@ -23,6 +23,7 @@ from reference import DOCS, blocks
 import harness as package
 from harness.cli.commands import COMMANDS
 from harness.coordination.added_parts import added_parts
+from harness.coordination.counterparts import COUNTERPARTS
 from harness.coordination.encodings import ENCODINGS
 from harness.coordination.operating_point import more_parts
 from harness.coordination.schedules import READERS
@@ -33,12 +34,15 @@ from harness.core.extensions import Extension
 from harness.core.plugins import Plugins
 from harness.core.work import working
 from harness.dataset.load import Dataset
+from harness.evaluate import resolve
+from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.lifecycle import begin, unfinished
 from harness.radio.profiles import MODELS
 from harness.report import sections
 from harness.runs import metrics
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, entry
+from harness.runs.settings import of_words, text_of, words
 
 ROOT = Path(__file__).parents[2]
 OURS, PACKAGES = ROOT / "harness" / "extensions", "harness.extensions."
@@ -175,6 +179,8 @@ ODD = {
     '"")})': "its settings are no table of Setting",
     'Extension(name="odd", settings={"a": '
     'Setting(float, float("nan"), "")})': "are no table of Setting",
+    'Extension(name="odd", settings={"a": Setting(tuple, ("x",), "")})': "are no table of Setting",
+    'Extension(name="odd", settings={"a": Setting(int, 1, "", only="b")})': "no table of Setting",
     'Extension(name="odd", settings={"A '
     'b": Setting(int, 1, "")})': "its settings are no table of Setting",
     "1 / 0": "plug-in 'odd' (swarmdrive.extensions): "
@@ -352,6 +358,35 @@ def test_an_extension_takes_plug_ins_of_a_kind_of_its_own(
         tastes["sour"]
 
 
+def test_a_setting_of_a_package_puts_counterparts_beside_conditions(
+    installed: Installed, monkeypatch: pytest.MonkeyPatch, small: Dataset
+) -> None:
+    """Runs state the conditions and not the setting, whoever has it; what is no setting is refused."""
+    monkeypatch.setattr(COUNTERPARTS, "_loaded", {})
+    setting = 'settings={"worse": Setting(tuple, (), "h")}'
+    adds = 'adds={"counterparts": {"worse": "of_others:LOSS"}}'
+    said = '{"0.5": "loss=0.5", "odd": "odd=1", "none": None}'
+    installed(odd=f'Extension(name="odd", {setting}, {adds})', loss=f"{said}.__getitem__")
+    typed = ("harness", "eval", "--condition", "single-local", "--condition", "6g")
+    settings = of_words((*typed, "--worse", "0.5"))
+    assert (settings.extensions, words(settings)) == (
+        {"worse": ("0.5",)},
+        (*typed, "--worse", "0.5"),
+    )
+    assert tomllib.loads(text_of(settings))["extensions"] == {"worse": ["0.5"]}
+    played = resolve.spec(settings, FrozenSource(small)).settings
+    assert played.condition == ("single-local", "6g", "6g:loss=0.5")
+    assert played.extensions == {}
+    assert "--worse" not in words(played)
+    for text, line in {
+        "odd": "unknown setting of operating point 6g 'odd'",
+        "none": "worse: its package failed: its answer holds what is no text",
+        "absent": "worse: its package failed: 'absent'",
+    }.items():
+        with pytest.raises(UserError, match=re.escape(line)):
+            resolve.points(["6g"], {"worse": [text]})
+
+
 @pytest.mark.parametrize("name", ENTRIES[known.GROUP])
 def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     """They say what a command or study was part of where its folder is gone."""
@@ -524,15 +559,17 @@ def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
 ) -> None:
     """Whether it is typed, in a file of settings, or in a run; a run without it is read."""
     (tmp_path / "run.toml").write_text('device_profile = "agx-orin"\n')
+    (tmp_path / "attacked.toml").write_text('control = []\nattack = ["liar"]\n')
     code = (
         "import sys\nfrom harness.core.errors import UserError\nfrom harness.runs import formats, "
         "timers\nfrom harness.__main__ import main\nidle = {'device_profile': None, "
-        "'device_model': None, 'ties': 'drawn'}\nprint(formats.gathered(idle))\n"
+        "'device_model': None, 'control': [], 'attack': [], 'ties': 'drawn'}\nprint(formats.gathered(idle))\n"
         "print('device_profile' in formats.upgraded({**idle, 'settings': idle}))\n"
         "for ask in (lambda: formats.upgraded({'device_profile': {'name': 'mine'}}), "
         "lambda: timers.timer('device')):\n    try:\n        ask()\n"
         "    except UserError as error:\n        print(error)\n"
-        "for typed in (['--device-profile', 'agx-orin'], ['run.toml']):\n"
+        "for typed in (['--device-profile', 'agx-orin'], ['run.toml'], ['--control', 'no-messages'], "
+        "['attacked.toml']):\n"
         "    sys.argv = ['harness', 'eval', *typed]\n"
         "    try:\n        main()\n    except SystemExit as end:\n        print(end.code)\n"
     )
@@ -543,11 +580,15 @@ def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
         "False",
         f"setting device_profile {gone}",
         f"what timed the answers of a run, device, {gone}",
-        *["2"] * 2,
+        *["2"] * 4,
     ]
-    typed, stated = done.stderr.splitlines()
+    typed, stated, control, attack = done.stderr.splitlines()
     assert typed.startswith(f"harness: --device-profile {gone} in `harness eval --device-profile ")
     assert stated == f"harness: setting device_profile {gone}"
+    assert control.startswith("harness: --control is part of the extension controls, which is not ")
+    assert (
+        attack == "harness: setting attack is part of the extension trust, which is not installed"
+    )
 
 
 PART = """

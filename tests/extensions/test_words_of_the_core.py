@@ -23,6 +23,7 @@ BETWEEN = re.compile(r"""["'`#\s]+|//""")  # marks of quotation, comments and en
 # Names of extensions that the core has for something of its own.
 ORDINARY = {
     "always": "at every time",
+    "attack": "what an attacker does",
     "attribute": "of a Python object",
     "benchmark": "what a published dataset is tagged as",
     "both": "two things",
@@ -30,6 +31,7 @@ ORDINARY = {
     "channel": "what carries messages, a kind of plug-ins",
     "closed-loop": "the world that is driven, beside the frozen one",
     "contents": "what messages hold, and suites and pages",
+    "control": "one of the controls, a variate, and of characters and tokens",
     "controls": "conditions beside which a gain is compared",
     "coverage": "of risk by confidence, and of intervals",
     "deadline": "until when a reply is of use",
@@ -87,7 +89,6 @@ LEADS_ON = {
     ("report/compare/pair.py", "study fidelity"),
     ("report/scripts/decision.js", "harness view"),
     ("report/scripts/decision.js", "run video"),
-    ("runs/settings.py", "study trust"),
 }
 # Old folders of a study had this file in place of its manifest, and are listed.
 OLD_FOLDERS = {("runs/listing.py", "fidelity")}
@@ -194,7 +195,6 @@ OTHER_THINGS = {
     ("coordination/operating_point.py", "messages"): "what is done to those of a fusion call",
     ("evaluate/asking.py", "messages"): "what a model is sent",
     ("evaluate/spec.py", "messages"): "what a prompt shows",
-    ("evaluate/spec.py", "attack"): "an option of a run, which its conditions take the place of",
 }
 
 

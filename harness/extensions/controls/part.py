@@ -10,6 +10,7 @@ from harness.coordination.contents import INTENTS, OBJECTS, TRUTH, WORDS
 from harness.coordination.parts import PLAIN, ActsOn, Part, Question, RunFacts, Text
 from harness.core.arrays import Ints
 from harness.core.errors import unknown
+from harness.core.extensions import control_settings
 
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 OWN, SHUFFLED, BLIND = "own", "shuffled", "blind"
 MESSAGES = (OWN, SHUFFLED, BLIND)
+NO_MESSAGES = {"no-messages": "loss=1"}
 
 
 @dataclass(frozen=True)
@@ -94,3 +96,14 @@ class Controlled(Part, frozen=True, kw_only=True):
         sources = np.empty_like(order)
         sources[order] = following
         return sources
+
+
+def setting_of(control: str) -> str:
+    """Return the setting of a condition that is a control, such as `messages=blind`, by its name.
+
+    Raises UserError if there is no such control.
+    """
+    settings = {**NO_MESSAGES, **control_settings()}
+    if control not in settings:
+        raise unknown("--control", control, settings)
+    return settings[control]

@@ -146,3 +146,8 @@ class Guard(Part, frozen=True, kw_only=True):
             return fused
         voices = np.insert(heard, 0, True, axis=-1)
         return outvoted(fused, intents, voices, np.sum(voices, axis=-1) // 2 + 1)
+
+
+def setting_of(attacks: str) -> str:
+    """Return the setting of a condition under attacks, such as `attack=liar:share=1/3`."""
+    return f"attack={attacks}"

@@ -44,7 +44,7 @@ from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
 
 BLIND = named_point("6g:messages=blind")
-CONDITIONS = points(["single-local", "6g:loss=0"], ["blind", "no-messages"])
+CONDITIONS = points(["single-local", "6g:loss=0"], {"control": ["blind", "no-messages"]})
 
 
 class Prior(Scripted):
@@ -84,10 +84,13 @@ def test_a_prior_keeps_its_gain_and_perception_loses_it(
     crash = {f"{n:05d}-0": {"IDLE": "collision", "FASTER": "collision"} for n in range(4)}
     data = course(small, 1, crash)
     told = walked(
-        spec_of(data, points=points(["single-local", "6g"], ["blind"]), seeds=(0,)), who({})
+        spec_of(data, points=points(["single-local", "6g"], {"control": ["blind"]}), seeds=(0,)),
+        who({}),
     )
     assert success(told) == {"single-local": 0.0, "6g": 1.0, "6g:messages=blind": kept}
-    silent = walked(spec_of(data, points=points(["6g"], ["no-messages"]), seeds=(0,)), who({}))
+    silent = walked(
+        spec_of(data, points=points(["6g"], {"control": ["no-messages"]}), seeds=(0,)), who({})
+    )
     assert success(silent) == {"6g": 1.0, "6g:loss=1": 0.0}
 
 
@@ -238,7 +241,7 @@ class Fusing(Prior):
 def test_a_fusion_call_has_the_blind_helpers_messages(
     small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    both = points(["6g:consensus=ego-prompt,loss=0"], ["blind"])
+    both = points(["6g:consensus=ego-prompt,loss=0"], {"control": ["blind"]})
     with monkeypatch.context() as patched:
         patched.setattr(evaluation, "open_backend", lambda *_, **__: Fusing({}))
         done = run(spec_of(small, "swarm-tiny", points=both, latency="paper"), tmp_path / "run")

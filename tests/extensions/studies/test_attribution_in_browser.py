@@ -23,7 +23,8 @@ pytestmark = pytest.mark.exhaustive
 @pytest.fixture(scope="module")
 def made(small, tmp_path_factory):
     path = run(
-        spec_of(small, points=points(["6g"], ["blind"])), tmp_path_factory.mktemp("moved") / "run"
+        spec_of(small, points=points(["6g"], {"control": ["blind"]})),
+        tmp_path_factory.mktemp("moved") / "run",
     ).out
     write(attribute(ReplayedRun(path), "6g", 12, 0), path)
     return write_report(gather([path]), path / "report.html", full=True)

@@ -200,7 +200,7 @@ def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "
         raise UserError(
             f"--budget {budget}: give the most questions that the search may ask, 1 or more"
         )
-    if len(points := resolve.points(settings.condition, settings.control, settings.attack)) != 1:
+    if len(points := resolve.points(settings.condition, settings.extensions)) != 1:
         names = " ".join(point.name for point in points)
         raise UserError(f"--condition {printable(names)}: a prompt is searched under one; give one")
     if settings.latency == MEASURED:
