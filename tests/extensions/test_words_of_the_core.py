@@ -193,7 +193,6 @@ OTHER_THINGS = {
     ("evaluate/walk.py", "text"): "of a reply, in bytes",
     ("coordination/exchange.py", "messages"): "how many were sent",
     ("coordination/operating_point.py", "messages"): "what is done to those of a fusion call",
-    ("evaluate/asking.py", "messages"): "what a model is sent",
     ("evaluate/spec.py", "messages"): "what a prompt shows",
 }
 

@@ -110,7 +110,6 @@ def test_an_attack_that_fails_is_one_line(
     two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(ATTACKS._loaded, "mine", Failing())
-    monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
     typed = ("eval", "--dataset", two_path, "--attack", "mine", "--limit", "1", "--quiet")
     code, out, said = harness(*typed, "--out", "run")
     assert (code, out, said.count("\n")) == (2, "", 1)
