@@ -443,6 +443,16 @@ def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
     assert harness("report", drive)[0] == 0
 
 
+@pytest.mark.slow
+def test_answers_of_a_driven_run_are_held_against_their_texts(
+    drive: Path, harness: Harness
+) -> None:
+    change(drive, answer=reworded)
+    code, out, _ = harness("run", "check", drive)
+    assert code == 1
+    assert "than its texts say" in " ".join(out.split())
+
+
 @pytest.mark.exhaustive
 def test_a_latency_of_a_driven_run_is_held_against_its_source(
     drive: Path, harness: Harness

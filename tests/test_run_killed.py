@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from evaluating import FILES, run, same_files, spec_of, walked, with_ego
 from killed_run import PLACES, TREES_AT_ONCE, WALKS_AT_ONCE, at, killed_at, spec_to_kill
-from run_on_disk import answers_of
+from run_on_disk import answers_of, change
 from tiers import some
 
 from harness.backends import cards
@@ -21,10 +21,11 @@ from harness.core.errors import UserError
 from harness.core.files import alone
 from harness.core.formats import CONFIG
 from harness.core.process import Stop
+from harness.core.progress import Progress
 from harness.dataset.load import Dataset, load
 from harness.evaluate.kept_answers import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
-from harness.evaluate.run import evaluate
+from harness.evaluate.run import evaluate, read_or_evaluate
 from harness.evaluate.spec import Spec
 from harness.runs.run_parts import write_part
 
@@ -144,6 +145,29 @@ def test_a_finished_part_that_was_not_finished_here_is_walked_again(
             seal.write_bytes(of_user)
     _becomes_whole(out, whole, to_kill)
     assert "has 1 finished part that nobody finished here with your key" in capsys.readouterr().err
+
+
+def sooner(row: dict[str, Any]) -> None:
+    row["latency_ms"] = 1.0
+
+
+@pytest.mark.parametrize("clears_away", [True, False])
+def test_a_finished_run_from_which_work_goes_on_is_what_its_answers_make(
+    clears_away: bool, proxy_run: Path, small: Dataset, tmp_path: Path
+) -> None:
+    """A run that was killed while its work was cleared away, and one of a study that goes on."""
+    out = Path(shutil.copytree(proxy_run, tmp_path / "run"))
+
+    def goes_on() -> object:
+        if clears_away:
+            (out / ".work").mkdir(exist_ok=True)
+            return run(spec_of(small), out)
+        return read_or_evaluate(spec_of(small), out, Progress(), None, open_backend)
+
+    goes_on()
+    change(out, decision=sooner)
+    with pytest.raises(UserError, match=r"another latency_ms in .* than its answers make; delete"):
+        goes_on()
 
 
 @pytest.mark.exhaustive

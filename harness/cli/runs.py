@@ -96,7 +96,13 @@ def _runs_in(folders: list[Path]) -> list[Path]:
 
 def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
     """Check a run, print the result, and return it."""
-    from harness.evaluate.recompute import AGAIN, differences, driven_otherwise, of_card
+    from harness.evaluate.recompute import (
+        AGAIN,
+        differences,
+        driven_otherwise,
+        of_card,
+        texts_otherwise,
+    )
     from harness.runs.contradictions import contradictions, unchecked
     from harness.runs.folder import read
     from harness.runs.run_dataset import dataset_of
@@ -116,6 +122,10 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
         wrong = list(contradictions(run))
         open_points.append("Whether its answers make its decisions is not checked.")
         how = "whose tables were held against each other, since it was driven"
+        try:
+            wrong += texts_otherwise(run)
+        except UserError as error:
+            open_points.append(f"No text was read again: {error}.")
         try:
             extras.need("to drive again", "highway_env")
             wrong += driven_otherwise(run)

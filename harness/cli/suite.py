@@ -68,6 +68,7 @@ def evaluate(
     them. Returns the suite's folder, `out` or a default one for None.
     """
     from harness.backends.registry import open_backend
+    from harness.evaluate.run import finished_run
     from harness.report import suite as report
     from harness.runs.folder import read
     from harness.runs.suite import SUMMARY, SuiteRun, write
@@ -81,6 +82,8 @@ def evaluate(
         run = folder / spec.source.name
         if not (run / "run.json").is_file() or (run / WORK).is_dir():
             evaluated(spec, run, opens)
+        else:
+            finished_run(spec, run)
     by_family = {spec.scenario.name: dataset for spec, dataset in zip(specs, datasets, strict=True)}
     runs = {family: read(folder / dataset.name) for family, dataset in by_family.items()}
     done = SuiteRun(folder, suite.name, suite.description, runs)

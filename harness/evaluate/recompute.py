@@ -1,8 +1,10 @@
 """Compute a run again from its answers alone; no model is asked, and rules, which are here, are."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from msgspec import structs, to_builtins
@@ -25,7 +27,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import DRIVER, card_here, check_prompts, points_of, spec_of
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
-from harness.evaluate.texts import OF_TEXTS, same
+from harness.evaluate.texts import OF_TEXTS, others, same
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
@@ -157,6 +159,27 @@ def differences(
     return wrong, list(_lacking(run, ours))
 
 
+def refuse_otherwise(run: Run, spec: Spec) -> None:
+    """Raise UserError if a finished run is not what its own answers make under its evaluation.
+
+    For a run that work goes on from, and that anybody may have written. No model is asked; of a
+    driven run a few episodes are driven again.
+    """
+    if not isinstance(spec.source, FrozenSource):
+        wrong = list(driven_otherwise(run))
+    else:
+        stays = replace(spec, source=replace(spec.source, until=None), budget=None)
+        with TemporaryDirectory(prefix="harness-") as folder:
+            try:
+                ours, otherwise = computed(run, stays, Path(folder) / "run", lambda done: None)
+            except LacksAnswer as lack:
+                wrong = [f"answers.jsonl has no answer to {lack.question}"]
+            else:
+                wrong = [*_of_episodes(run, ours), *_of_decisions(run, ours), *_of_rule(otherwise)]
+    if wrong:
+        raise UserError(f"{printable(run.path)}: {wrong[0]}; delete that folder, and type it again")
+
+
 def _of_rule(otherwise: int) -> Iterator[str]:
     if otherwise:
         yield f"answers.jsonl has {amount(otherwise, 'answer')} otherwise than the rule here"
@@ -190,6 +213,16 @@ def _empty(run: Run, name: str) -> bool:
 
 def _null(table: Any, name: str) -> bool:
     return name not in table.column_names or table[name].null_count == len(table)
+
+
+def texts_otherwise(run: Run) -> Iterator[str]:
+    """Yield sentences on what answers.jsonl says otherwise than its texts.
+
+    Raises UserError if a prompt of the run is neither here nor kept in it.
+    """
+    wrong_by_field = Counter(field for _, field in others(run))
+    for field, wrong in wrong_by_field.items():
+        yield f"answers.jsonl has another {field} in {amount(wrong, 'answer')} than its texts say"
 
 
 def driven_otherwise(run: Run) -> Iterator[str]:

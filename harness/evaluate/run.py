@@ -56,7 +56,7 @@ from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import walk
 from harness.runs import folder, run_parts, writer
 from harness.runs import sources as kept_sources
-from harness.runs.contradictions import refuse
+from harness.runs.contradictions import sound
 from harness.runs.decisions import Decisions
 from harness.runs.difficulty import Layout, adjusted_scores
 from harness.runs.formats import FORMAT
@@ -116,9 +116,8 @@ def evaluate(
     the others again.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
-        done = finished(spec, out)
-        _checked(out)
-        return done
+        run = finished_run(spec, out)
+        return Evaluated(out, run.manifest, run.scores)
     metrics_of(spec.source.kind)  # of packages, which must load before anything is asked
     refuse_finished(out)
     run_start = unfinished(spec, out)
@@ -708,20 +707,22 @@ def read_or_evaluate(
     one is another evaluation or contradicts itself; else as `evaluate`.
     """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
-        finished(spec, out)
-    else:
-        evaluate(spec, out, progress, cache, progress.more, opens=opens, given=given)
-        work.tidy(out)
-        return folder.read(out)
-    return _checked(out)
+        return finished_run(spec, out)
+    evaluate(spec, out, progress, cache, progress.more, opens=opens, given=given)
+    work.tidy(out)
+    return folder.read(out)
 
 
-def _checked(out: Path) -> folder.Run:
-    """Return a finished run, which anybody may have written.
+def finished_run(spec: Spec, out: Path) -> folder.Run:
+    """Return the finished run in a folder, from which work goes on: anybody may have written it.
 
-    Raises UserError if its tables contradict each other, or its answers their texts.
+    Raises UserError if it has other settings than `spec`, or its tables contradict each other, its
+    answers or the texts of these.
     """
-    run = folder.read(out)
-    refuse(run)
+    from harness.evaluate.recompute import refuse_otherwise  # which evaluates a run again
+
+    finished(spec, out)
+    run = sound(out)
     refuse_others(run)
+    refuse_otherwise(run, spec)
     return run

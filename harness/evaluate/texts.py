@@ -3,7 +3,7 @@
 A file can state any intent beside a text, so whoever makes something of intents reads the texts.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -29,6 +29,16 @@ def refuse_others(run: Run) -> None:
 
     Also if a prompt of the run is neither here nor kept in it, so that nothing can be parsed again.
     """
+    for answer, field in others(run):
+        raise _contradicts(run, answer, field)
+
+
+def others(run: Run) -> Iterator[tuple[Answer, str]]:
+    """Yield each answer of a run that states what its raw text does not say, and the first field
+    that it does so of.
+
+    Raises UserError if a prompt of the run is neither here nor kept in it.
+    """
     if gone := lacking(run):
         raise UserError(
             f"{printable(run.path)}: {gone}, so no answer can be read again; restore it, or run "
@@ -43,8 +53,8 @@ def refuse_others(run: Run) -> None:
         readers[msgspec.json.encode(agent)] = reader
     for answer in run.answers:
         reader = readers[msgspec.json.encode(run.agent(answer))]
-        if other := _other(answer, reader.read(answer)):
-            raise _contradicts(run, answer, other)
+        if field := _other(answer, reader.read(answer)):
+            yield answer, field
 
 
 def refuse_other_kept(

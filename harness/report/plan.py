@@ -15,7 +15,8 @@ from harness.core.figures import amount, number_or_none
 from harness.core.power import Spread
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.report.compare.pair import pair
-from harness.runs.folder import Run, read
+from harness.runs.contradictions import sound
+from harness.runs.folder import Run
 from harness.runs.headline import headline_of
 from harness.runs.metrics import BASELINE, METRICS, SUCCESS, of_ends
 from harness.runs.records import Answer
@@ -130,7 +131,7 @@ class _Sides:
 
 
 def _gains(path: Path) -> _Sides:
-    run = read(path)
+    run = sound(path)
     if BASELINE not in run.conditions or len(run.conditions) < 2:
         raise UserError(
             f"{printable(path)} has not both {BASELINE} and another condition, so that it shows no "

@@ -4,6 +4,7 @@ each follows from others, and a file can state any number.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from harness.core.formats import SUITE
 from harness.core.versions import FIGURES
 from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
-from harness.runs.folder import Run
+from harness.runs.folder import Run, read
 from harness.runs.headline import PAIRED
 from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
 from harness.runs.records import Episode, Score
@@ -52,6 +53,16 @@ def refuse(run: Run | SuiteRun) -> None:
             f"{name} contradicts itself: {sentences[0]}{more}; make the run again, or list all by "
             f"`harness run check {name}`"
         )
+
+
+def sound(folder: Path) -> Run:
+    """Read a run, for what is computed from its tables.
+
+    Raises UserError if it is broken, or a table contradicts those that it is computed from.
+    """
+    run = read(folder)
+    refuse(run)
+    return run
 
 
 def contradictions(run: Run) -> Iterator[str]:

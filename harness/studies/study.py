@@ -18,6 +18,7 @@ from harness.core.extensions import studies
 from harness.core.figures import PERCENT
 from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
 from harness.core.multiplicity import LEVEL, holm
+from harness.core.seals import seal
 from harness.core.statistics import Estimate
 from harness.report.document import Section, Table, document, strong
 from harness.report.library import on_dark_too, picture
@@ -194,14 +195,15 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
 class Cells:
     """Keep finished parts of a study in a file, one a line, so that a killed study can continue.
 
-    A part that was made of other settings than this study's is not taken.
+    A part that was made of other settings than this study's is not taken, nor is one that was not
+    computed by this user on this machine: anybody may have written the file.
     """
 
-    def __init__(self, path: Path, depends_on: str) -> None:
+    def __init__(self, path: Path, depends_on: str, computed: bool = True) -> None:
         """Read a file. Torn lines and those of another digest of all that decides a part do not
-        count.
+        count, and without a seal those that are `computed`, unlike a model's replies.
         """
-        self._path, self._of = path, depends_on
+        self._path, self._of, self._computed = path, depends_on, computed
         data = bytes_of(path, "rows") if path.is_file() else b""
         self._torn = bool(data) and not data.endswith(b"\n")
         self._cells = dict(self._read(data))
@@ -210,10 +212,17 @@ class Cells:
         for line in data.splitlines():
             try:
                 kept = json.loads(line)
-                if kept["of"] == self._of:
+                if kept["of"] == self._of and (not self._computed or self._is_sealed(kept)):
                     yield tuple(kept["key"]), {k: _array(v) for k, v in kept["cell"].items()}
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 continue
+
+    def _is_sealed(self, kept: dict[str, Any]) -> bool:
+        file_seal = kept.pop("seal", None)
+        return file_seal is not None and file_seal == self._seal(kept)
+
+    def _seal(self, kept: Mapping[str, Any]) -> str | None:
+        return seal({"cell": json.dumps(kept, default=np.ndarray.tolist).encode()}, "a study")
 
     def __contains__(self, key: Sequence[Any]) -> bool:
         return tuple(key) in self._cells
@@ -225,10 +234,14 @@ class Cells:
 
         Its values are plain, or arrays with two axes, which are restored exactly.
         """
-        if (kept := self._cells.get(tuple(key))) is not None:
-            return kept
+        there = self._cells.get(tuple(key))
+        if there is not None:
+            return there
         values = compute()
-        line = json.dumps({"of": self._of, "key": key, "cell": values}, default=np.ndarray.tolist)
+        kept: dict[str, Any] = {"of": self._of, "key": key, "cell": values}
+        if self._computed:
+            kept["seal"] = self._seal(kept)
+        line = json.dumps(kept, default=np.ndarray.tolist)
         self._path.parent.mkdir(parents=True, exist_ok=True)
         with appending(self._path) as file:
             file.write(b"\n" * self._torn + line.encode() + b"\n")

@@ -101,3 +101,23 @@ def test_parts_are_kept_to_the_last_bit_but_those_of_something_else_and_torn_one
     path.write_bytes(path.read_bytes()[:-5])
     assert [part("that", 2), part("this", 1), part("this", 2), part("that", 2)] == [2, 1, 2, 2]
     assert computed == ["this1", "this2", "that2", "this2"]
+
+
+@pytest.mark.parametrize("forged", ["its value", "another's key", "no seal"])
+def test_a_part_that_was_not_computed_here_is_computed_again(
+    forged: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "cells.jsonl"
+    with monkeypatch.context() as elsewhere:
+        if forged == "another's key":
+            elsewhere.setenv("SWARMDRIVE_CACHE", str(tmp_path / "another"))
+        assert Cells(path, "this").part(("a",), lambda: {"n": 0.5}) == {"n": 0.5}
+    line = json.loads(path.read_text())
+    if forged == "its value":
+        line["cell"]["n"] = 1.0
+    if forged == "no seal":
+        del line["seal"]
+    path.write_text(json.dumps(line) + "\n")
+    assert Cells(path, "this").part(("a",), lambda: {"n": 0.25}) == {"n": 0.25}
+    assert Cells(path, "this").part(("a",), lambda: {"n": 0.75}) == {"n": 0.25}
+    assert Cells(path, "this", computed=False).part(("a",), lambda: {"n": 0}) == {"n": 0.25}

@@ -63,7 +63,7 @@ def show(
     """
     from harness.extensions.devices import profiles
     from harness.extensions.devices.fit import answers_of, declared, fits
-    from harness.runs.folder import read
+    from harness.runs.contradictions import sound
 
     in_range("--prompt-tokens", prompt_tokens, 1, MOST_TOKENS)
     in_range("--answer-tokens", answer_tokens, 1, MOST_TOKENS)
@@ -73,7 +73,7 @@ def show(
         )
     device = profiles.load(name)
     rows = [profiles.find_row(device, model)] if model else device.rows
-    answers = answers_of(read(run)) if run else declared(prompt_tokens, answer_tokens)
+    answers = answers_of(sound(run)) if run else declared(prompt_tokens, answer_tokens)
     results = fits(device, rows, answers, window_ms / 1000)
     if as_json:
         result = {
@@ -152,10 +152,10 @@ def check(
     """
     from harness.extensions.devices import profiles
     from harness.extensions.devices.fit import held
-    from harness.runs.folder import read
+    from harness.runs.contradictions import sound
     from harness.runs.records import role_word
 
-    device, done = profiles.load(name), read(run)
+    device, done = profiles.load(name), sound(run)
     row = profiles.find_row(device, model or str(done.manifest.model["name"]).partition(":")[0])
     results = held(device, row, done)
     if as_json:

@@ -14,8 +14,8 @@ from harness.coordination.operating_point import POINTS, named_point
 from harness.core.figures import crossed
 from harness.core.parallel import Workers
 from harness.core.work import tidy
-from harness.evaluate.lifecycle import Evaluated, finished
-from harness.evaluate.run import evaluate
+from harness.evaluate.lifecycle import Evaluated
+from harness.evaluate.run import evaluate, finished_run
 from harness.evaluate.spec import Spec
 from harness.radio.constant import density_coupled_loss
 from harness.runs.records import ClosedLoop, Score
@@ -64,7 +64,8 @@ def run_closed_loop(
     with the number of layouts just driven under all conditions.
     """
     if (out / RUN / "run.json").is_file():
-        done = finished(spec, out / RUN)
+        stored = finished_run(spec, out / RUN)
+        done = Evaluated(stored.path, stored.manifest, stored.scores)
     else:
         done = evaluate(spec, out / RUN, progress, cache, workers=workers)
     tidy(out / RUN)

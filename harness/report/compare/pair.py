@@ -15,9 +15,9 @@ from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
 from harness.report.words import facts
-from harness.runs.contradictions import refuse
+from harness.runs.contradictions import sound
 from harness.runs.difficulty import Pool
-from harness.runs.folder import Run, read
+from harness.runs.folder import Run
 from harness.runs.metrics import by_episode, metrics_of
 from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
@@ -151,9 +151,7 @@ def pair(a: Path, b: Path) -> Pair:
         UserError: a folder is no finished run or contradicts itself, or the two runs differ in
             kind, scenes or seeds, or have no condition or episode in common.
     """
-    first, second = read(a), read(b)
-    for run in (first, second):
-        refuse(run)
+    first, second = sound(a), sound(b)
     both = f"{printable(a)} and {printable(b)}"
     if first.world != second.world:
         raise UserError(

@@ -88,7 +88,7 @@ class Reflecting:
         whose messages are rewritten.
         """
         self._asked, self._roles = rewriter, roles
-        self._cells = Cells(kept, sha256_bytes(canonical_json(settings).encode()))
+        self._cells = Cells(kept, sha256_bytes(canonical_json(settings).encode()), computed=False)
         self.replies = 0
 
     def __call__(self, tuning: Tuning) -> None:

@@ -16,7 +16,7 @@ from msgspec.structs import asdict
 from harness.core.errors import UserError
 from harness.core.versions import versions
 from harness.report.document import Table
-from harness.runs.folder import read
+from harness.runs.contradictions import sound
 from harness.runs.metrics import World
 from harness.runs.records import Variant
 from harness.studies.both_worlds import COMPARED, compared
@@ -112,7 +112,7 @@ def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
     """Return the world of a run, and the result of each of its episodes."""
     import pandas as pd
 
-    run = read(path)
+    run = sound(path)
     columns = ("condition", "seed", "layout_seed", "success", "failure")
     rows = [attrgetter(*columns)(episode) for episode in run.episodes]
     table = pd.DataFrame(rows, columns=list(columns))
