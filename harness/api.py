@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from markupsafe import Markup, escape
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.figures import crossed
 from harness.core.files import bytes_of
 from harness.runs.records import FrozenScenes, Score
@@ -223,7 +224,6 @@ def run(
     cache: bool = True,
     workers: int = 1,
     quiet: bool = False,
-    tracker: str | Sequence[str] = (),
     max_cost: float | None = None,
     **options: Any,
 ) -> Run:
@@ -237,18 +237,18 @@ def run(
         cache: whether answers that an earlier run stored are taken.
         workers: processes; for rules on frozen scenes, and in closed loop.
         quiet: whether progress is left out.
-        tracker: names of trackers that keep the run as well, as `--tracker` takes them.
         max_cost: what answers may cost before no more are asked for, as `--max-cost` says.
         options: settings of `harness eval`, or of `harness drive` if one of its own is among them,
             such as `scenario`: each by its name there, with `_` for `-`; a list where it is
-            repeatable.
+            repeatable. Options that extensions add there, as well.
 
     Raises:
         UserError: a setting is unknown or not allowed, or the folder holds something else.
     """
     from harness.backends.cache import default_file
     from harness.cli.run import default_out, evaluate
-    from harness.evaluate import costs, hooks, resolve
+    from harness.evaluate import costs, resolve
+    from harness.evaluate.command_options import OPTIONS, follows
     from harness.evaluate.spec import Source
     from harness.runs import settings
 
@@ -261,13 +261,18 @@ def run(
         if set(options) & (driven.keys() - frozen)
         else settings.FrozenSettings
     )
-    for name in options:
-        if name not in names[kind]:
-            raise unknown("setting", name, list(names[kind]))
-    given = {
-        name: _several(value) if names[kind][name].kind == list[str] else value
-        for name, value in options.items()
-    }
+    given, of_command = dict[str, Any](), dict[str, Any]()
+    for name, value in options.items():
+        if name in names[kind]:
+            listed = names[kind][name].kind == list[str]
+            given[name] = _several(value) if listed else value
+        elif name in OPTIONS:
+            listed = OPTIONS[name].kind == list[str]
+            of_command[name] = _several(value) if listed else value
+        elif owner := owner_of_plugin("options", name):
+            raise UserError(f"setting {name} is {part_of(owner)}")
+        else:
+            raise unknown("setting", name, [*names[kind], *OPTIONS])
     run_settings = settings.changed(settings.Settings(world=kind()), given)
     settings.check_extensions(run_settings, "settings")
     source: Source
@@ -277,10 +282,10 @@ def run(
         source = resolve.driven(run_settings.world)
     spec = resolve.spec(run_settings, source)
     folder = default_out(spec) if out is None else Path(out)
-    trackers, kept = hooks.chosen(_several(tracker)), default_file() if cache else None
+    run_follows, kept = follows(of_command), default_file() if cache else None
     with costs.budget(max_cost, [spec]) as limit:
         spec = replace(spec, budget=limit)
-        evaluate(spec, folder, cache=kept, quiet=quiet, workers=workers, hooks=trackers)
+        evaluate(spec, folder, cache=kept, quiet=quiet, workers=workers, follows=run_follows)
     return load(folder)
 
 

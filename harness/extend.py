@@ -18,7 +18,6 @@ from harness.core.errors import UserError
 from harness.core.extensions import from_python
 from harness.core.figures import PERCENT, Unit
 from harness.core.plugins import Plugins
-from harness.evaluate.hooks import Hook
 from harness.radio.channel import Broadcast, Channel, Delivery, Draws, Links, Physical
 from harness.radio.constant import link_up
 from harness.report.document import Section, Table
@@ -70,7 +69,6 @@ __all__ = [
     "Formula",
     "Fused",
     "Ground",
-    "Hook",
     "Intents",
     "Ints",
     "Kept",

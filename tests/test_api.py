@@ -117,7 +117,7 @@ def test_a_comparison_is_the_command_lines(folder: Path) -> None:
 def test_what_plug_ins_build_on_is_pinned() -> None:
     names = """
     ActsOn Backend Bools Broadcast Building Call Capabilities Card Channel Completion Content Delivery Draws Floats
-    Formula Fused Ground Hook Intents Ints Kept Lane Layout LayoutDraws Links Messages Metric PERCENT
+    Formula Fused Ground Intents Ints Kept Lane Layout LayoutDraws Links Messages Metric PERCENT
     Parameters Part Path PathKey Physical Plugins Pool Registration Request Road Rule Run RunFacts
     Scenario ScheduleInputs Section Spawn Study Table Unit UserError
     crossings finish_study ground linear_pool link_up read_run straights to_the_left
@@ -129,9 +129,15 @@ def test_what_plug_ins_build_on_is_pinned() -> None:
         _ = extend.Absent
 
 
-def test_what_an_extension_gives_to_plug_ins_is_there_as_before() -> None:
-    attacks = pytest.importorskip("harness.extensions.trust.attacks")
-    assert (extend.Attack, extend.Turn) == (attacks.Attack, attacks.Turn)
+@pytest.mark.parametrize(
+    ("module", "names"), [("trust.attacks", ("Attack", "Turn")), ("interop.hooks", ("Hook",))]
+)
+def test_what_an_extension_gives_to_plug_ins_is_there_as_before(
+    module: str, names: tuple[str, ...]
+) -> None:
+    there = pytest.importorskip(f"harness.extensions.{module}")
+    for name in names:
+        assert getattr(extend, name) is getattr(there, name)
 
 
 def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:

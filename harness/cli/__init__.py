@@ -141,8 +141,9 @@ def _typed() -> None:
 
 
 def _part_of_gone(option: str) -> str:
-    """Say what an option of a run is part of that is not installed; empty for any other."""
-    owner = owner_of_plugin("settings", option.lstrip("-").replace("-", "_"))
+    """Say what an option of a command is part of that is not installed; empty for any other."""
+    name = option.lstrip("-").replace("-", "_")
+    owner = owner_of_plugin("settings", name) or owner_of_plugin("options", name)
     return part_of(owner) if owner and owner not in extensions() else ""
 
 

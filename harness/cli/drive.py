@@ -58,9 +58,11 @@ VIDEOS = Plugins[Videos]("swarmdrive.videos", Videos, {})  # those that extensio
 
 @options.takes(DriveSettings)
 @options.of_families
+@options.of_extensions
 def command(
     settings: Settings,
     of_family: Mapping[str, str],
+    of_command: Mapping[str, Any],
     agents: options.Agents = None,
     workers: options.ModelWorkers = "2",
     out: Path | None = typer.Option(
@@ -74,7 +76,6 @@ def command(
     ),
     no_cache: options.NoCache = False,
     max_cost: options.MaxCost = None,
-    tracker: options.Tracker = None,
     full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
@@ -84,7 +85,7 @@ def command(
     If the run is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
-    from harness.evaluate import costs, hooks, resolve
+    from harness.evaluate import command_options, costs, resolve
     from harness.evaluate.run import evaluate_shard
     from harness.world.scenarios import DEFAULT
 
@@ -100,10 +101,10 @@ def command(
     )
     name = name if agents is None else deciding(name, agents)
     who, part = options.workers_of(workers), options.shard_of(shard)
-    if part and (out is None or save_video or tracker):
+    if part and (out is None or save_video):
         raise UserError(
             f"--shard {part}: give --out with a folder for this shard alone, and leave "
-            "--save-video and --tracker out"
+            "--save-video out"
         )
     if save_video:
         for drawer in VIDEOS:
@@ -119,7 +120,8 @@ def command(
             f"--max-cost {max_cost:g}: the processes of a cluster do not add up what they spend; "
             "leave it out"
         )
-    silent, trackers = as_json or quiet, hooks.chosen(tracker or ())
+    silent = as_json or quiet
+    follows = command_options.follows(of_command, "shards" if part else "")
     with costs.budget(max_cost, [spec]) as limit:
         spec = replace(spec, budget=limit)
         if part and out:
@@ -145,7 +147,7 @@ def command(
             workers=who,
             full=full,
             then=draw,
-            hooks=trackers,
+            follows=follows,
         )
     tell(done, as_json, quiet)
     if silent:

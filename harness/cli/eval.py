@@ -1,6 +1,6 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -38,8 +38,10 @@ COLUMNS = (
 
 
 @options.takes(FrozenSettings)
+@options.of_extensions
 def command(
     settings: Settings,
+    of_command: Mapping[str, Any],
     repeat: int | None = typer.Option(
         None,
         "--repeats",
@@ -61,7 +63,6 @@ def command(
         rich_help_panel=OUTPUT,
     ),
     tokenizer: options.Tokenizer = None,
-    tracker: options.Tracker = None,
     full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
@@ -72,7 +73,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.dataset import suites
-    from harness.evaluate import costs, hooks, resolve
+    from harness.evaluate import command_options, costs, resolve
     from harness.runs.folder import read
 
     world: Any = settings.world
@@ -96,7 +97,8 @@ def command(
                 f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of "
                 "its datasets"
             )
-        _refuse_with_repeats(full, tracker)
+        if full:
+            raise UserError("--full: repeats have a page without decisions; leave it out")
         repeats.check(specs[0], repeat)
         if workers is not None:
             raise UserError(
@@ -116,7 +118,8 @@ def command(
             for spec, counted in zip(specs, counts, strict=True):
                 show_counted(spec, counted)
         return
-    trackers = hooks.chosen(tracker or ())
+    instead = "" if repeat is None else "repeats"
+    follows = command_options.follows(of_command, instead)
     at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
     who = options.workers_of(workers or ("1" if at_servers else "2"))
     if workers is not None:
@@ -125,7 +128,7 @@ def command(
         specs = [replace(spec, budget=limit) for spec in specs]
         silent, cache = as_json or quiet, None if no_cache else default_file()
         evaluated = partial(
-            evaluate, cache=cache, quiet=silent, workers=who, full=full, hooks=trackers
+            evaluate, cache=cache, quiet=silent, workers=who, full=full, follows=follows
         )
         if repeat is not None:
             repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
@@ -164,15 +167,6 @@ def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool) -> 
     ]
     rows = {label(name, dataset.scenario): scores for name, scores in references.items()}
     show(done, dataset.name, columns, notes, rows)
-
-
-def _refuse_with_repeats(full: bool, tracker: Sequence[str] | None) -> None:
-    if full:
-        raise UserError("--full: repeats have a page without decisions; leave it out")
-    if tracker:
-        raise UserError(
-            f"--tracker {printable(tracker[0])}: repeats are no run of one; leave it out"
-        )
 
 
 def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: str) -> None:

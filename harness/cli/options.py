@@ -3,18 +3,19 @@ which its settings state.
 """
 
 import inspect
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Option, echo
 
 from harness.core.errors import UserError, printable
+from harness.core.extensions import owner_of_plugin
 from harness.runs import settings as stated
 from harness.runs.settings import HELP
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from harness.backends.base import AnswerMode
     from harness.backends.card import Card
@@ -147,15 +148,6 @@ NoCache = Annotated[
         "--no-cache",
         help="Ask the model again, even for answers that an earlier run stored.",
         rich_help_panel=stated.ENGINE,
-    ),
-]
-Tracker = Annotated[
-    list[str] | None,
-    Option(
-        metavar="NAME",
-        help="Tracker that keeps the run as well; a wrong name lists those that are installed. "
-        "Repeatable. Default: those in SWARMDRIVE_TRACKERS.",
-        rich_help_panel=stated.OUTPUT,
     ),
 ]
 MaxCost = Annotated[
@@ -302,18 +294,45 @@ def of_families(command: Any) -> Any:
     for family in FAMILIES.usable().values():
         for option, text in family.options.items():
             default = Option(None, help=text, rich_help_panel=family.heading)
-            kind = inspect.Parameter.KEYWORD_ONLY
-            parameter = inspect.Parameter(option, kind, default=default, annotation=str | None)
-            added.append(parameter)
+            added.append(_added(option, default, str))
+    return _gathering(command, "of_family", added)
+
+
+def of_extensions(command: Any) -> Any:
+    """Give a command the options of extensions that no run keeps.
+
+    The command gets what is typed for them as `of_command`: values by the option's name.
+    """
+    from harness.evaluate.command_options import OPTIONS
+
+    added = []
+    for name, option in OPTIONS.usable().items():
+        heading = f"Extension {owner_of_plugin('options', name)}"
+        default = Option(None, metavar=option.metavar, help=option.help, rich_help_panel=heading)
+        added.append(_added(name, default, option.kind))
+    return _gathering(command, "of_command", added)
+
+
+def _added(name: str, default: Any, kind: Any) -> inspect.Parameter:
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind | None
+    )
+
+
+def _gathering(command: Any, name: str, added: Sequence[inspect.Parameter]) -> Any:
+    """Return a command with these parameters in place of the one of this name.
+
+    That gets a mapping of what is typed for them.
+    """
 
     def typed(*settings: Any, **values: Any) -> Any:
-        given = {each.name: values.pop(each.name) for each in added}
-        of_family = {name: value for name, value in given.items() if value is not None}
-        return command(*settings, **values, of_family=of_family)
+        every_value = {each.name: values.pop(each.name) for each in added}
+        given = {key: value for key, value in every_value.items() if value is not None}
+        return command(*settings, **values, **{name: given})
 
     parameters = list(inspect.signature(command).parameters.values())
     parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
-    place = [each.name for each in parameters].index("of_family")
+    place = [each.name for each in parameters].index(name)
     return as_command(typed, command, [*parameters[:place], *added, *parameters[place + 1 :]])
 
 

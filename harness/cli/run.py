@@ -3,10 +3,10 @@ a run's folder, its table and its JSON.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from harness.core.parallel import Workers
     from harness.dataset.load import Dataset
     from harness.evaluate.agent import Agent
-    from harness.evaluate.hooks import Hook
+    from harness.evaluate.command_options import Follow
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.run import Opens
     from harness.evaluate.spec import Spec
@@ -85,7 +85,7 @@ def evaluate(
     workers: "Workers",
     full: bool = False,
     then: "Callable[[], object]" = lambda: None,
-    hooks: "Mapping[str, Hook]" = MappingProxyType({}),
+    follows: "Sequence[Follow]" = (),
 ) -> "tuple[Evaluated, Path]":
     """Evaluate with a progress bar, write the run and its report, and return both.
 
@@ -98,11 +98,10 @@ def evaluate(
         workers: worker processes.
         full: whether the report includes prompts of rules and all pictures.
         then: adds files to the run; if it is interrupted, the run can be resumed.
-        hooks: trackers that follow the run, by name.
+        follows: what follows the run.
     """
     from harness.cli.report import write
     from harness.evaluate.frozen_world import FrozenSource
-    from harness.evaluate.hooks import following
     from harness.evaluate.run import evaluate as evaluated
 
     name, dataset = printable(spec.ego.card.name, 30), None
@@ -111,11 +110,13 @@ def evaluate(
         progress = bar(f"asking {name}", quiet=quiet, grows=True)
     else:
         progress = bar(f"driving {name}", len(list(spec.source.layout_seeds)), quiet)
-    with following(hooks, folder, spec.record()) as followers:
+    with ExitStack() as stack:
+        followers = [stack.enter_context(follow(folder, spec.record())) for follow in follows]
         with progress as done:
-            run = evaluated(
-                spec, folder, followers.counting(done), cache, done.more, workers, opens
-            )
+            count_new: Callable[[int], None] = done
+            for follower in followers:
+                count_new = follower.counting(count_new)
+            run = evaluated(spec, folder, count_new, cache, done.more, workers, opens)
         dataset = dataset and walked(dataset, run)
         with work.going_on(folder):
             page = write(
@@ -123,7 +124,8 @@ def evaluate(
             )
             then()
         work.tidy(folder)
-        followers.end(run)
+        for follower in followers:
+            follower.end(run)
     return run, page
 
 

@@ -36,6 +36,7 @@ from harness.core.work import working
 from harness.dataset.load import Dataset
 from harness.evaluate import resolve
 from harness.evaluate.frozen_world import FrozenSource
+from harness.evaluate.command_options import OPTIONS
 from harness.evaluate.lifecycle import begin, unfinished
 from harness.radio.profiles import MODELS
 from harness.report import sections
@@ -54,6 +55,7 @@ NAMED = (
     "contents",
     "encodings",
     "families",
+    "options",
     "readers",
     "rules",
     "schedules",
@@ -554,6 +556,28 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
     ]
 
 
+@pytest.mark.parametrize(("name", "value"), [("tracker", "mlflow")])
+def test_an_option_of_a_command_that_is_gone_says_what_it_was_part_of(
+    core: Path, tmp_path: Path, name: str, value: str
+) -> None:
+    """From Python, too."""
+    code = (
+        "import sys\nimport harness\nfrom harness.__main__ import main\n"
+        f"try:\n    harness.run({name}={value!r})\n"
+        "except harness.UserError as error:\n    print(error)\n"
+        "for command in ('eval', 'drive'):\n"
+        f"    sys.argv = ['harness', command, '--{name.replace('_', '-')}', {value!r}]\n"
+        "    try:\n        main()\n    except SystemExit as end:\n        print(end.code)\n"
+    )
+    done = in_the_core(core, tmp_path, code)
+    owner = ENTRIES[known.PLUG_INS][f"options {name}"].rpartition(".")[2]
+    gone = f"is part of the extension {owner}, which is not installed"
+    assert done.stdout.splitlines() == [f"setting {name} {gone}", "2", "2"]
+    for line in done.stderr.splitlines():
+        assert line.startswith(f"harness: --{name.replace('_', '-')} {gone} in `harness ")
+    assert done.stderr.count("\n") == 2
+
+
 def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
     core: Path, tmp_path: Path
 ) -> None:
@@ -731,7 +755,7 @@ def test_metadata_that_cannot_be_read_are_one_line(
     assert known.extensions()
 
 
-@pytest.mark.parametrize("registry", [MODELS, ENCODINGS, READERS])
+@pytest.mark.parametrize("registry", [MODELS, ENCODINGS, READERS, OPTIONS])
 def test_no_package_adds_what_only_extensions_that_ship_add(
     installed: Installed, registry: Plugins, capsys: pytest.CaptureFixture[str]
 ) -> None:

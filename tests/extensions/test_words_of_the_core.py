@@ -70,6 +70,7 @@ ORDINARY = {
     "tells": "a verb",
     "text": "what is read and written",
     "trace": "of a matrix",
+    "tracker": "of a process's resources, and what may delete a folder",
     "trust": "how far a rule, or a loader of weights, trusts what it is given",
     "verify": "the check of a dataset",
     "view": "what a vehicle sees",
@@ -120,6 +121,8 @@ def phrases(extension: Extension) -> Iterator[str]:
         yield command if " " in command else f"harness {command}"
     for setting in extension.settings:
         yield from (setting, setting.replace("_", "-"), setting.replace("_", " "))
+    for option in extension.adds.get("options", {}):
+        yield from (option, option.replace("_", "-"))
     for kind in extension.studies:
         yield f"{kind}.json"
     for text in ("extension {}", "extensions.{}", "extensions/{}"):

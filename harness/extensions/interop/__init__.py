@@ -25,5 +25,7 @@ EXTENSION = Extension(
             "trackio": f"{_HERE}.trackers.trackio:TRACKER",
             "wandb": f"{_HERE}.trackers.wandb:TRACKER",
         },
+        "options": {"tracker": f"{_HERE}.option:TRACKER"},
+        "python": {"Hook": f"{_HERE}.hooks:Hook"},
     },
 )

@@ -22,8 +22,8 @@ from misbehaving import Asked, serving
 from served import answer
 
 from harness.core import plugins
-from harness.evaluate import hooks
-from harness.evaluate.hooks import HOOKS
+from harness.extensions.interop import hooks
+from harness.extensions.interop.hooks import HOOKS
 from harness.runs.folder import read
 
 pytestmark = pytest.mark.slow
@@ -245,7 +245,7 @@ def test_a_hook_that_hangs_is_left_behind(
 AWAY = """
 import atexit, socket, sys, time
 from harness.core import process
-from harness.evaluate import hooks
+from harness.extensions.interop import hooks
 
 port = int(sys.argv.pop())
 

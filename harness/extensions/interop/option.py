@@ -1,0 +1,30 @@
+"""`--tracker`: hooks that follow the runs of a command."""
+
+from collections.abc import Sequence
+from functools import partial
+
+from harness.core.errors import UserError, printable
+from harness.evaluate.command_options import CommandOption, Follow
+from harness.extensions.interop import hooks
+
+
+class Tracker(CommandOption):
+    """Choose hooks by name."""
+
+    kind = list[str]
+    metavar = "NAME"
+    help = (
+        "Tracker that keeps the run as well; a wrong name lists those that are installed. "
+        "Repeatable. Default: those in SWARMDRIVE_TRACKERS."
+    )
+
+    def follow(self, value: Sequence[str] | None, instead: str) -> Follow | None:
+        if value and instead:
+            raise UserError(
+                f"--tracker {printable(value[0])}: {instead} are no run of one; leave it out"
+            )
+        chosen = hooks.chosen(value or ())
+        return partial(hooks.following, chosen) if chosen else None
+
+
+TRACKER = Tracker()
