@@ -3,7 +3,7 @@ results show themselves in a notebook (docs/python.md).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
 from os import PathLike
@@ -224,7 +224,6 @@ def run(
     cache: bool = True,
     workers: int = 1,
     quiet: bool = False,
-    max_cost: float | None = None,
     **options: Any,
 ) -> Run:
     """Evaluate a model with a prompt, on frozen scenes or in closed loop, and return the run.
@@ -237,7 +236,6 @@ def run(
         cache: whether answers that an earlier run stored are taken.
         workers: processes; for rules on frozen scenes, and in closed loop.
         quiet: whether progress is left out.
-        max_cost: what answers may cost before no more are asked for, as `--max-cost` says.
         options: settings of `harness eval`, or of `harness drive` if one of its own is among them,
             such as `scenario`: each by its name there, with `_` for `-`; a list where it is
             repeatable. Options that extensions add there, as well.
@@ -247,8 +245,8 @@ def run(
     """
     from harness.backends.cache import default_file
     from harness.cli.run import default_out, evaluate
-    from harness.evaluate import costs, resolve
-    from harness.evaluate.command_options import OPTIONS, follows
+    from harness.evaluate import resolve
+    from harness.evaluate.command_options import OPTIONS, follows, guarded
     from harness.evaluate.spec import Source
     from harness.runs import settings
 
@@ -283,8 +281,7 @@ def run(
     spec = resolve.spec(run_settings, source)
     folder = default_out(spec) if out is None else Path(out)
     run_follows, kept = follows(of_command), default_file() if cache else None
-    with costs.budget(max_cost, [spec]) as limit:
-        spec = replace(spec, budget=limit)
+    with guarded(of_command, [spec], workers) as [spec]:
         evaluate(spec, folder, cache=kept, quiet=quiet, workers=workers, follows=run_follows)
     return load(folder)
 

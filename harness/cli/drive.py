@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
@@ -75,7 +74,6 @@ def command(
         rich_help_panel=OUTPUT,
     ),
     no_cache: options.NoCache = False,
-    max_cost: options.MaxCost = None,
     full: options.FullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
@@ -85,7 +83,7 @@ def command(
     If the run is stopped, the same command continues it.
     """
     from harness.backends.cache import default_file
-    from harness.evaluate import command_options, costs, resolve
+    from harness.evaluate import command_options, resolve
     from harness.evaluate.run import evaluate_shard
     from harness.world.scenarios import DEFAULT
 
@@ -115,15 +113,9 @@ def command(
     if save_video and not VIDEOS:
         raise UserError("--save-video: no extension that is installed draws videos; leave it out")
     spec = resolve.spec(settings, source)
-    if max_cost is not None and not isinstance(who, int):
-        raise UserError(
-            f"--max-cost {max_cost:g}: the processes of a cluster do not add up what they spend; "
-            "leave it out"
-        )
     silent = as_json or quiet
     follows = command_options.follows(of_command, "shards" if part else "")
-    with costs.budget(max_cost, [spec]) as limit:
-        spec = replace(spec, budget=limit)
+    with command_options.guarded(of_command, [spec], who) as [spec]:
         if part and out:
             with bar(f"driving {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
                 mine = evaluate_shard(spec, out, part, progress, who)

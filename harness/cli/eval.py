@@ -1,7 +1,6 @@
 """`harness eval`: a model with a prompt on a dataset."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,7 +54,6 @@ def command(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-<dataset>."
     ),
     no_cache: options.NoCache = False,
-    max_cost: options.MaxCost = None,
     dry_run: bool = typer.Option(
         False,
         "--dry-run",
@@ -73,7 +71,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.dataset import suites
-    from harness.evaluate import command_options, costs, resolve
+    from harness.evaluate import command_options, resolve
     from harness.runs.folder import read
 
     world: Any = settings.world
@@ -124,8 +122,7 @@ def command(
     who = options.workers_of(workers or ("1" if at_servers else "2"))
     if workers is not None:
         _refuse_language_models(specs, who, workers)
-    with costs.budget(max_cost, specs) as limit:
-        specs = [replace(spec, budget=limit) for spec in specs]
+    with command_options.guarded(of_command, specs, who) as specs:
         silent, cache = as_json or quiet, None if no_cache else default_file()
         evaluated = partial(
             evaluate, cache=cache, quiet=silent, workers=who, full=full, follows=follows

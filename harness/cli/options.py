@@ -150,16 +150,6 @@ NoCache = Annotated[
         rich_help_panel=stated.ENGINE,
     ),
 ]
-MaxCost = Annotated[
-    float | None,
-    Option(
-        metavar="AMOUNT",
-        help="Ask no more once the answers of this command have cost so much, in the currency of "
-        "the card's "
-        "[price]. The same command goes on.",
-        rich_help_panel=stated.ENGINE,
-    ),
-]
 Tokenizer = Annotated[
     Path | None,
     Option(

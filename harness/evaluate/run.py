@@ -312,7 +312,7 @@ def _frozen(
 
         if not in_workers:
             backend = together(
-                spec.cards, costs.metered(spec.cards, models, place, spec.budget), cache
+                spec.cards, costs.metered(spec.cards, models, place, spec.guards), cache
             )
         seen, looked = _walked(spec, chunks, place, walk_all)
         layouts = source.layouts(sum(map(len, seen)))
@@ -532,7 +532,7 @@ def _walk_chunk(
     kept = place and _answered_file(place, chunk)
 
     def backend() -> Backend:
-        models = costs.metered(spec.cards, _open_all(spec), place, spec.budget)
+        models = costs.metered(spec.cards, _open_all(spec), place, spec.guards)
         combined = together(spec.cards, models, cache)
         if not same_model(run_start.identity, combined.identity()):
             raise UserError(

@@ -23,7 +23,7 @@ from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import LAST_SEED
 from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
-from harness.evaluate.costs import Budget
+from harness.evaluate.command_options import Guard
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.evaluate.looks import Until
 from harness.prompts.versions import ROLES, Prompt, unfit
@@ -124,7 +124,7 @@ class Spec:
     # all settings as typed, of which `resolve.spec` makes this evaluation; those that fields above
     # hold opened are rewritten to agree with them
     settings: Settings = USUAL
-    budget: Budget | None = None  # what may be spent on answers; it changes nothing in the run
+    guards: tuple[Guard, ...] = ()  # what may refuse to ask; they change nothing in the run
 
     def __post_init__(self) -> None:
         if all(agent == self.ego for agent in self.helpers):

@@ -556,7 +556,7 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
     ]
 
 
-@pytest.mark.parametrize(("name", "value"), [("tracker", "mlflow")])
+@pytest.mark.parametrize(("name", "value"), [("max_cost", "2"), ("tracker", "mlflow")])
 def test_an_option_of_a_command_that_is_gone_says_what_it_was_part_of(
     core: Path, tmp_path: Path, name: str, value: str
 ) -> None:

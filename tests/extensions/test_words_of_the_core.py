@@ -27,6 +27,7 @@ ORDINARY = {
     "attribute": "of a Python object",
     "benchmark": "what a published dataset is tagged as",
     "both": "two things",
+    "budget": "of a prompt's tokens, of a template's steps, and of questions",
     "calibration": "how far probabilities are what they say, a metric",
     "channel": "what carries messages, a kind of plug-ins",
     "closed-loop": "the world that is driven, beside the frozen one",
