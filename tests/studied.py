@@ -34,7 +34,6 @@ from harness.core.files import sha256_file
 from harness.dataset import rebuilt
 from harness.evaluate import lifecycle
 from harness.evaluate import run as evaluation
-from harness.studies import repeats
 
 BOTH = "--condition single-local --condition 6g"
 PROMPT = "{% block system -%}\n"
@@ -118,29 +117,6 @@ TRIALS = {  # of the core; of an extension, `tests/extensions/NAME/trials.py` ha
             "--tune run": "and numbers are reported of that; build one of other seeds",
         },
         "it is a bound and no schedule", out="", folder="run/schedules", beside=ASKED,
-    ),
-    "repeats": Trial(
-        "eval --dataset data --model "
-        "swarm-tiny --no-cache", f"--repeats 3 --temperature 0.7 {BOTH}",
-        "--repeats 3 --temperature 0.8", 
-            "--out out already holds finished "
-            "repeats; choose another folder",
-        {
-            "--repeats 3": 
-                "--repeats 3: greedy answers are the same "
-                "every time; give a --temperature above",
-            "--repeats 1 --temperature 1": "--repeats 1 is out of range; give 2 to 100",
-            "--repeats 3 --temperature 3": 
-                "--temperature 3: give 0, which "
-                "takes the likeliest token",
-            "--repeats 3 --temperature "
-            "1 --latency measured": "--latency measured: it needs an idle",
-            "--repeats 3 --temperature 1 --answer readout": "a readout is a distribution already",
-            "--repeats 3 --temperature 1 --model proxy": "proxy has nothing to sample; leave it",
-            "--repeats 3 --temperature 1 --workers 2":
-                "--workers 2: repeats are asked from one process; leave it out",
-        },
-        "they differ only in the random draws", ends=False,
     ),
 }  # fmt: skip
 
@@ -261,7 +237,6 @@ def stands_still() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "EPISODES_AT_ONCE", 1)
         patch.setattr(lifecycle, "datetime", Then)
-        patch.setattr(repeats, "open_backend", opens)
         patch.setattr(registry, "open_backend", opens)
         # which takes seconds each time
         patch.setattr(rebuilt, "differences", lambda dataset: iter(()))

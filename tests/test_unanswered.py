@@ -171,7 +171,9 @@ def test_repeats_that_could_not_be_asked_are_errors_in_junit(
     ask: Typed, harness: Typed, play: Play, tmp_path: Path
 ) -> None:
     play.again(lambda asked: True)
-    code, _, err = ask("eval", *EVAL, "--repeats", "2", "--temperature", "1", "--out", "several")
+    code, _, err = ask(
+        "study repeats", *EVAL, "--repeats", "2", "--temperature", "1", "--out", "several"
+    )
     assert code == 3, err
     assert harness("run", "export", "several", "--junit", "several.xml")[0] == 0
     [error] = ElementTree.parse(tmp_path / "several.xml").getroot().iter("error")
@@ -356,7 +358,10 @@ def test_a_shard_is_not_done_while_too_many_of_its_questions_have_no_answer(
             "study grid",
             ("--prompt", "v1,v2", "--limit", "1", "--seeds", "0:1", "--condition", "6g"),
         ),
-        ("eval", ("--repeats", "2", "--temperature", "0.7", "--limit", "1", "--seeds", "0:1")),
+        (
+            "study repeats",
+            ("--repeats", "2", "--temperature", "0.7", "--limit", "1", "--seeds", "0:1"),
+        ),
         ("study twins", ("--limit", "1", "--workers", "1", "--twin", "order")),
     ],
 )

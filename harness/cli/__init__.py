@@ -19,7 +19,7 @@ from harness import __version__
 from harness.cli import shell
 from harness.core import extras
 from harness.core.errors import EXIT_CODES, UserError, printable
-from harness.core.extensions import extensions, owner_of_plugin, part_of
+from harness.core.extensions import extensions, owner, owner_of_plugin, part_of
 from harness.core.process import Stop
 
 app = typer.Typer(
@@ -133,18 +133,21 @@ def _typed() -> None:
         if message.startswith("Usage:"):  # a group without a command shows its help
             print(message)
             sys.exit(2)
-        if gone := _part_of_gone(getattr(error, "option_name", "")):
+        command = context.info_name if context else ""
+        if gone := _part_of_gone(command, getattr(error, "option_name", "")):
             message = f"{error.option_name} is {gone}"
         path = context.command_path if context else "harness"
         typed = printable(" ".join(["harness", *sys.argv[1:]]))
         _fail(f"{printable(message.removesuffix('.'), 300)} in `{typed}`; see `{path} --help`")
 
 
-def _part_of_gone(option: str) -> str:
+def _part_of_gone(command: str, option: str) -> str:
     """Say what an option of a command is part of that is not installed; empty for any other."""
     name = option.lstrip("-").replace("-", "_")
-    owner = owner_of_plugin("settings", name) or owner_of_plugin("options", name)
-    return part_of(owner) if owner and owner not in extensions() else ""
+    kinds = ("settings", "options")
+    owners = [owner(f"{command} {option}"), *(owner_of_plugin(kind, name) for kind in kinds)]
+    gone = next(filter(None, owners), None)
+    return part_of(gone) if gone and gone not in extensions() else ""
 
 
 def _is_text(word: str) -> bool:

@@ -57,7 +57,7 @@ VIDEOS = Plugins[Videos]("swarmdrive.videos", Videos, {})  # those that extensio
 
 @options.takes(DriveSettings)
 @options.of_families
-@options.of_extensions
+@options.of_extensions(followed=True)
 def command(
     settings: Settings,
     of_family: Mapping[str, str],

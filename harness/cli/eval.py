@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.cli import options, repeats, suite
+from harness.cli import options, suite
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show, walked
 from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
 from harness.core.figures import crossed
 from harness.core.seeds import seeds_text
 from harness.runs import headline
-from harness.runs.settings import ANSWERS, OUTPUT, FrozenSettings, Settings
+from harness.runs.settings import FrozenSettings, Settings
 
 if TYPE_CHECKING:
     from harness.core.parallel import Workers
@@ -37,29 +37,16 @@ COLUMNS = (
 
 
 @options.takes(FrozenSettings)
-@options.of_extensions
+@options.of_extensions(followed=True)
 def command(
     settings: Settings,
     of_command: Mapping[str, Any],
-    repeat: int | None = typer.Option(
-        None,
-        "--repeats",
-        help="Evaluate this many times, 2 to 100, each with the next sampling seed; needs a "
-        "--temperature "
-        "above 0.",
-        rich_help_panel=ANSWERS,
-    ),
     workers: options.RuleWorkers = None,
     out: Path | None = typer.Option(
         None, help="Folder to write the run to. Default: reports/<model>-<prompt>-<dataset>."
     ),
     no_cache: options.NoCache = False,
-    dry_run: bool = typer.Option(
-        False,
-        "--dry-run",
-        help="Only render the prompts and count requests and tokens; write nothing.",
-        rich_help_panel=OUTPUT,
-    ),
+    dry_run: options.DryRun = False,
     tokenizer: options.Tokenizer = None,
     full: options.FullPage = False,
     as_json: options.Json = False,
@@ -82,42 +69,23 @@ def command(
     specs = [resolve.spec(settings, source) for source in sources]
     if named_suite:
         suite.check(named_suite, specs)
-    several = f"suite {named_suite.name}" if named_suite else ""
-    if repeat is not None:
-        several = f"--repeats {repeat}"
-    if several and sources[0].until:
+    if named_suite and sources[0].until:
         raise UserError(
-            f"{several}: runs that stop early have other layouts each; leave --until-... out"
+            f"suite {named_suite.name}: runs that stop early have other layouts each; leave "
+            "--until-... out"
         )
-    if repeat is not None:
-        if named_suite:
-            raise UserError(
-                f"--repeats {repeat}: needs one dataset, and --dataset names a suite; give one of "
-                "its datasets"
-            )
-        if full:
-            raise UserError("--full: repeats have a page without decisions; leave it out")
-        repeats.check(specs[0], repeat)
-        if workers is not None:
-            raise UserError(
-                f"--workers {printable(workers)}: repeats are asked from one process; leave it "
-                "out, or type a command for each --sampling-seed"
-            )
     if dry_run:
         from harness.evaluate.dry_run import count
 
         pairs = zip(specs, datasets, strict=True)
         counts = [count(spec, dataset, tokenizer) for spec, dataset in pairs]
-        if repeat is not None:
-            counts[0] |= {"repeats": repeat}
         if as_json:
             echo_json(counts if named_suite else counts[0])
         elif not quiet:
             for spec, counted in zip(specs, counts, strict=True):
                 show_counted(spec, counted)
         return
-    instead = "" if repeat is None else "repeats"
-    follows = command_options.follows(of_command, instead)
+    follows = command_options.follows(of_command)
     at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
     who = options.workers_of(workers or ("1" if at_servers else "2"))
     if workers is not None:
@@ -127,9 +95,6 @@ def command(
         evaluated = partial(
             evaluate, cache=cache, quiet=silent, workers=who, full=full, follows=follows
         )
-        if repeat is not None:
-            repeats.evaluate(specs[0], repeat, out, cache, quiet, as_json)
-            return
         if named_suite:
             suite.evaluate(named_suite, specs, datasets, out, evaluated, quiet, as_json)
             return
@@ -185,9 +150,12 @@ def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: st
             )
 
 
-def show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
-    """Print a dry run's counts: requests, prompt tokens and cost of the evaluation `spec`."""
-    repeated = f" × {counted['repeats']} repeats" if "repeats" in counted else ""
+def show_counted(spec: "Spec", counted: dict[str, Any], times: int = 1) -> None:
+    """Print a dry run's counts: requests, prompt tokens and cost of the evaluation `spec`.
+
+    It is made so many `times`.
+    """
+    repeated = f" × {times} repeats" if times > 1 else ""
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"
     if "helper" in by_role and not spec.asks_all:
         requests = (
@@ -203,4 +171,4 @@ def show_counted(spec: "Spec", counted: dict[str, Any]) -> None:
         f"{len(spec.seeds)} channel seeds; no model was called"
     )
     echo_prompt_tokens(counted["prompt_tokens"])
-    echo_cost(counted.get("cost", {}), counted.get("repeats", 1))
+    echo_cost(counted.get("cost", {}), times)

@@ -150,6 +150,14 @@ NoCache = Annotated[
         rich_help_panel=stated.ENGINE,
     ),
 ]
+DryRun = Annotated[
+    bool,
+    Option(
+        "--dry-run",
+        help="Only render the prompts and count requests and tokens; write nothing.",
+        rich_help_panel=stated.OUTPUT,
+    ),
+]
 Tokenizer = Annotated[
     Path | None,
     Option(
@@ -288,10 +296,11 @@ def of_families(command: Any) -> Any:
     return _gathering(command, "of_family", added)
 
 
-def of_extensions(command: Any) -> Any:
-    """Give a command the options of extensions that no run keeps.
+def of_extensions(followed: bool) -> Callable[[Any], Any]:
+    """Return a decorator that gives a command the options of extensions that no run keeps.
 
-    The command gets what is typed for them as `of_command`: values by the option's name.
+    The command gets what is typed for them as `of_command`: values by the option's name. Those that
+    follow whole runs are given if the command's runs are `followed`.
     """
     from harness.evaluate.command_options import OPTIONS
 
@@ -299,8 +308,9 @@ def of_extensions(command: Any) -> Any:
     for name, option in OPTIONS.usable().items():
         heading = f"Extension {owner_of_plugin('options', name)}"
         default = Option(None, metavar=option.metavar, help=option.help, rich_help_panel=heading)
-        added.append(_added(name, default, option.kind))
-    return _gathering(command, "of_command", added)
+        if followed or not option.follows:
+            added.append(_added(name, default, option.kind))
+    return lambda command: _gathering(command, "of_command", added)
 
 
 def _added(name: str, default: Any, kind: Any) -> inspect.Parameter:

@@ -149,13 +149,17 @@ class Group(TyperGroup):
         An unknown command ends with suggestions of similar ones.
         """
         old, new = ("", "") if self.path else respelt(args)
+        rest = args[len(old.split()) :]
+        if not (old or self.path):
+            old, new = self._now_a_command(ctx, args)
+            rest = args[1:] if old else args
         if new and old not in short() and not ctx.resilient_parsing:
             echo(
                 f"harness: `harness {old}` is now `harness {new}`; the old spelling works until "
                 "0.4.0",
                 err=True,
             )
-        args = new.split() + args[len(old.split()) :]
+        args = [*new.split(), *rest]
         if (
             args[0] not in self.commands
             and not args[0].startswith("-")
@@ -184,6 +188,21 @@ class Group(TyperGroup):
                 )
             )
         return super().resolve_command(ctx, args)
+
+    def _now_a_command(self, ctx: Any, args: list[str]) -> tuple[str, str]:
+        """Return a command of the core with an option that was typed and has become a command of
+        an extension, and that command. Both are empty if there is none.
+        """
+        flags = [word.partition("=")[0] for word in args[1:] if word.startswith("--")]
+        if not flags or args[0] not in COMMANDS:
+            return "", ""
+        options = self.commands[args[0]].get_params(ctx)
+        there = {name for each in options for name in (*each.opts, *each.secondary_opts)}
+        for flag in flags:
+            old = f"{args[0]} {flag}"
+            if flag not in there and old in spellings():
+                return old, spellings()[old]
+        return "", ""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write each heading's commands to the help, each with the first sentence of its own."""

@@ -48,7 +48,7 @@ def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
 
 
 def echo_cost(counted: Mapping[str, Mapping[str, Any]], times: int) -> None:
-    """Print a dry run's estimate of cost by model, times the number of repeats."""
+    """Print a dry run's estimate of cost by model, of so many evaluations alike."""
     for model, each in counted.items():
         prompts = each["prompts"]
         read = "prompts not counted" if prompts is None else f"{times * prompts:.4g} for prompts"

@@ -46,6 +46,8 @@ SHIPPED_KINDS = frozenset(
     {"channel_models", "encodings", "families", "panels", "readers", "sources", "timers"}
 )
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
+# An older spelling may also be an option of a command that has become a command.
+SPELLINGS = re.compile(rf"{WORDS.pattern}( --\w[\w-]*)?")
 TYPED = ("commands", "groups", "studies", "spellings", "short")  # tables of what somebody types
 Texts = Mapping[str, str]
 
@@ -319,8 +321,9 @@ def _checked(name: str, extension: Extension) -> Extension:
     for kind in TYPED:
         names = copied[kind]
         replacements = names.values() if kind in ("spellings", "short") else ()
+        form = SPELLINGS if kind == "spellings" else WORDS
         for words in (*names, *replacements):
-            if not WORDS.fullmatch(words):
+            if not form.fullmatch(words):
                 raise UserError(
                     f"{what}: nobody can type {printable(words)!r} of its {kind}; repair its "
                     "package"

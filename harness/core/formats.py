@@ -7,7 +7,4 @@ SOURCES = "sources"  # folder in a run's folder, of the files that it was made o
 SUITE = "suite.json"  # marks a folder that holds a suite's runs
 # Every kind of study, and what lists call it; `<kind>.json` marks its folder. Who makes a kind adds
 # it here.
-STUDIES = {
-    "sweep": "sweep",
-    "repeats": "repeats",
-}
+STUDIES = {"sweep": "sweep"}

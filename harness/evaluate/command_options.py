@@ -49,6 +49,7 @@ class CommandOption(ABC):
     kind: ClassVar[Any]  # of its value: str, int, float, bool or list[str]
     help: ClassVar[str]  # a sentence for people
     metavar: ClassVar[str]  # what help calls the value
+    follows: ClassVar[bool] = False  # whether it follows whole runs
 
     def follow(self, value: Any, instead: str) -> Follow | None:
         """Return what follows each run of the command; None for nothing.

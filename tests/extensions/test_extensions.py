@@ -231,6 +231,12 @@ def test_no_command_of_a_package_hides_another_or_a_group(
     assert "  benchmark  " in out
 
 
+def test_no_spelling_of_a_package_hides_an_option(installed: Installed, harness: Typed) -> None:
+    usual = harness("eval", "--limit", "x")
+    installed(odd='Extension(name="odd", spellings={"eval --limit": "study sweep"})')
+    assert harness("eval", "--limit", "x") == usual
+
+
 @pytest.mark.parametrize("kind", ["spellings", "short"])
 @pytest.mark.parametrize("path", ["run", "eval", "serve", "benchmark"])
 def test_no_spelling_of_a_package_hides_a_command_or_a_group(
@@ -486,9 +492,11 @@ def test_whatever_is_typed_of_an_extension_that_is_gone_says_what_it_was_part_of
     assert done.stdout.split() == ["2"] * len(said)
     for (command, place), line in zip(ENTRIES[known.COMMANDS].items(), said, strict=True):
         groups_too = re.match("(benchmark|model device|radio|study schedule)(?= )", command)
-        typed = groups_too[0] if groups_too else command
+        typed = f"`harness {groups_too[0] if groups_too else command}`"
+        if " --" in command:  # an option that has become a command
+            typed = command.split()[1]
         part = f"is part of the extension {place.rpartition('.')[2]}, which is not installed in "
-        assert line.startswith(f"harness: `harness {typed}` {part}")
+        assert line.startswith(f"harness: {typed} {part}")
 
 
 @pytest.mark.parametrize("name", ENTRIES[known.NAMES])

@@ -63,6 +63,7 @@ ORDINARY = {
     "proxy": "the rule that stands for a model",
     "random": "of draws",
     "read-outs": "of a policy from a model's probabilities",
+    "repeats": "a verb, and evaluations alike",
     "risk": "an answer's level, and errors by confidence",
     "rounds": "of messages on a channel, and of numbers",
     "schedules": "a kind of plug-ins, and the folder of their files",

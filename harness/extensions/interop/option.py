@@ -13,6 +13,7 @@ class Tracker(CommandOption):
 
     kind = list[str]
     metavar = "NAME"
+    follows = True
     help = (
         "Tracker that keeps the run as well; a wrong name lists those that are installed. "
         "Repeatable. Default: those in SWARMDRIVE_TRACKERS."

@@ -1,4 +1,4 @@
-"""Ask beyond one run: every pair of agents, twins of questions, what moved answers,
+"""Ask beyond one run: repeats, every pair of agents, twins of questions, what moved answers,
 frozen against driven.
 """
 
@@ -10,6 +10,7 @@ EXTENSION = Extension(
     name="studies",
     commands={
         "study grid": f"{_HERE}.grid.command:command",
+        "study repeats": f"{_HERE}.repeats.command:command",
         "study twins": f"{_HERE}.twins.command:command",
         "study attribute": f"{_HERE}.attribution.command:command",
         "study fidelity": f"{_HERE}.fidelity.command:command",
@@ -19,7 +20,8 @@ EXTENSION = Extension(
         "twins": "study twins",
         "attribute": "study attribute",
         "fidelity": "study fidelity",
+        "eval --repeats": "study repeats",
     },
-    studies={"grid": "grid", "twins": "twins", "fidelity": "study"},
+    studies={"grid": "grid", "repeats": "repeats", "twins": "twins", "fidelity": "study"},
     adds={"remarks": {"attribution": f"{_HERE}.attribution.remarks:REMARKS"}},
 )

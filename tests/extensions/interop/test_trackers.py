@@ -18,7 +18,7 @@ def typed_eval(data: Path, *more: str) -> tuple[str | Path, ...]:
     return "eval", "--dataset", data, *fixed, *more
 
 
-def test_an_unknown_tracker_and_repeats_are_refused_before_anything(
+def test_an_unknown_tracker_and_a_shard_are_refused_before_anything(
     two_path: Path, harness: Typed
 ) -> None:
     code, _, said = harness(*typed_eval(two_path, "--tracker", "mlfow"))
@@ -26,20 +26,9 @@ def test_an_unknown_tracker_and_repeats_are_refused_before_anything(
         code,
         "unknown tracker 'mlfow'; did you mean 'mlflow'? known: mlflow, trackio, wandb" in said,
     ) == (2, True)
-    code, _, said = harness(
-        *typed_eval(
-            two_path,
-            "--tracker",
-            "mlflow",
-            "--repeats",
-            "2",
-            "--temperature",
-            "1",
-            "--model",
-            "swarm-tiny",
-        )
-    )
-    assert (code, "--tracker mlflow: repeats" in said) == (2, True)
+    shard = ("--shard", "1/2", "--out", "run")
+    code, _, said = harness("drive", "--episodes", "2", *shard, "--tracker", "mlflow")
+    assert (code, "--tracker mlflow: shards are no run of one; leave it out" in said) == (2, True)
     assert not Path("run").exists()
 
 

@@ -15,6 +15,27 @@ TRIALS = {
         },
         "the same for all combinations", ends=False,
     ),
+    "repeats": Trial(
+        "study repeats --dataset data --model "
+        "swarm-tiny --no-cache", f"--repeats 3 --temperature 0.7 {BOTH}",
+        "--repeats 3 --temperature 0.8", 
+            "--out out already holds finished "
+            "repeats; choose another folder",
+        {
+            "--repeats 3": 
+                "--repeats 3: greedy answers are the same "
+                "every time; give a --temperature above",
+            "--repeats 1 --temperature 1": "--repeats 1 is out of range; give 2 to 100",
+            "--repeats 3 --temperature 3": 
+                "--temperature 3: give 0, which "
+                "takes the likeliest token",
+            "--repeats 3 --temperature "
+            "1 --latency measured": "--latency measured: it needs an idle",
+            "--repeats 3 --temperature 1 --answer readout": "a readout is a distribution already",
+            "--repeats 3 --temperature 1 --model proxy": "proxy has nothing to sample; leave it",
+        },
+        "they differ only in the random draws", ends=False,
+    ),
     "twins": Trial(
         "study twins --dataset data", "--sample 3 --workers 1", "--sample 2 --workers 1",
         "--out out already holds finished twins; choose another folder",

@@ -14,15 +14,14 @@ import pytest
 from evaluating import Scripted, Watched, course, same_files, spec_of, sure
 from hypothesis import given
 from hypothesis import strategies as st
+from priced import priced, typed_eval
 
 from harness.backends.base import Completion, Request
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.spec import Spec
-from harness.runs.listing import runs
-from harness.runs.metrics import ALL, SUCCESS
-from harness.studies.repeats import (
+from harness.extensions.studies.repeats.study import (
     DOUBT,
     FLIPS,
     MARKER,
@@ -40,6 +39,8 @@ from harness.studies.repeats import (
     run_repeats,
     stable,
 )
+from harness.runs.listing import runs
+from harness.runs.metrics import ALL, SUCCESS
 from harness.studies.study import write_study
 
 pytestmark = pytest.mark.usefixtures("svg_alone")
@@ -76,7 +77,7 @@ class Wanderer(Scripted):
 def wanderer(monkeypatch: pytest.MonkeyPatch) -> Wanderer:
     """In the place of every model's engine."""
     backend = Wanderer()
-    monkeypatch.setattr("harness.studies.repeats.open_backend", lambda card, **options: backend)
+    monkeypatch.setattr("harness.backends.registry.open_backend", lambda card, **options: backend)
     return backend
 
 
@@ -290,10 +291,28 @@ def test_the_folder_has_a_page_and_all_figures(
     assert "repeats.svg" in names <= {*WRITTEN, *(run.path.name for run in of.runs)}
 
 
+def test_a_dry_run_counts_every_repeat_and_the_old_spelling_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, two_path: Path, harness: Callable[..., Said]
+) -> None:
+    with priced(tmp_path, monkeypatch) as there:
+        _, *options = typed_eval(two_path, "--limit", "1", "--dry-run", "--temperature", "1")
+        once = json.loads(harness("eval", *options, "--json")[1])["cost"]["mine"]["answers"]
+        now = harness("study", "repeats", *options, "--repeats", "2")
+        before = harness("eval", *options, "--repeats=2")
+    assert "requests × 2 repeats for the " in now[1]
+    assert f"mine, EUR: prompts not counted, {2 * once:.4g} for answers of the greatest" in now[1]
+    assert before[:2] == now[:2]
+    assert before[2] == (
+        "harness: `harness eval --repeats` is now `harness study repeats`; the old spelling works "
+        "until 0.4.0\n"
+    )
+    assert there.asked == []
+
+
 @pytest.mark.slow
 def test_no_suite_is_repeated(harness: Callable[..., Said]) -> None:
-    asked = ("eval", "--model", "swarm-tiny", "--dataset", "suite:v2v-safety", "--repeats", "3")
-    code, out, err = harness(*asked, "--temperature", "1")
+    asked = ("study", "repeats", "--model", "swarm-tiny", "--dataset", "suite:v2v-safety")
+    code, out, err = harness(*asked, "--repeats", "3", "--temperature", "1")
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert (
         "--repeats 3: needs one dataset, and --dataset names a suite; give one of its datasets"

@@ -1,5 +1,4 @@
-"""`harness eval --repeats`: the same evaluation several times,
-with other draws of its model's answers.
+"""Repeats: the same evaluation several times, with other draws of its model's answers.
 
 A repeat is a whole run with a sampling seed of its own; channel and layouts are the same. What
 differs between repeats is the model's chance alone. All intervals are over episodes.
@@ -16,7 +15,7 @@ import msgspec
 import numpy as np
 from markupsafe import Markup
 
-from harness.backends.registry import open_backend
+from harness.backends import registry
 from harness.coordination.trigger import entropy_nats
 from harness.core import noise
 from harness.core.arrays import Floats, Ints
@@ -68,7 +67,7 @@ def run_repeats(
     Raises:
         UserError: the folder holds something else, or a model is not available.
     """
-    opens = cache(open_backend)
+    opens = cache(registry.open_backend)
     runs = [
         read_or_evaluate(of, out / name, progress, cache_file, opens)
         for name, of in each(spec, repeats).items()
