@@ -178,6 +178,24 @@ def test_the_command_in_the_manifest_runs_it_again(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("command", ["eval", "drive"])
+def test_the_old_spelling_of_a_full_page_writes_that_page(
+    command: str, harness: Callable[..., Said], two_path: Path
+) -> None:
+    few = ("--dataset", two_path, "--limit", "1") if command == "eval" else ("--episodes", "1")
+    asked = (command, *few, "--condition", "6g", "--seeds", "0:1", "--quiet", "--out", "run")
+    code, out, err = harness(*asked, "--full")
+    assert (code, out) == (0, "")
+    assert err == (
+        f"harness: `harness {command} --full` is now `harness report RUN --full`; the old "
+        "spelling works until 0.4.0\n"
+    )
+    page = Path("run/report.html").read_bytes()
+    assert harness("report", "run", "--full")[0] == 0
+    assert Path("run/report.html").read_bytes() == page
+
+
+@pytest.mark.slow
 def test_a_limit_beyond_the_dataset_is_said(harness: Callable[..., Said], small_path: Path) -> None:
     code, out, err = harness("eval", "--dataset", small_path, "--limit", "9999", "--seeds", "0:1")
     assert (code, err) == (0, "--limit 9999: small has 4 episodes, all of which are used\n")

@@ -74,7 +74,7 @@ def command(
         rich_help_panel=OUTPUT,
     ),
     no_cache: options.NoCache = False,
-    full: options.FullPage = False,
+    full: options.OldFullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:

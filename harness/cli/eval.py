@@ -48,7 +48,7 @@ def command(
     no_cache: options.NoCache = False,
     dry_run: options.DryRun = False,
     tokenizer: options.Tokenizer = None,
-    full: options.FullPage = False,
+    full: options.OldFullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Argument, Option, echo
+from typer import Argument, Context, Option, echo
 
 from harness.core.errors import UserError, printable
 from harness.core.extensions import owner_of_plugin
@@ -123,15 +123,28 @@ PageWorkers = Annotated[
         metavar="WHO", help=f"Number of worker processes, {_RAY} Used on more than 5376 scenes."
     ),
 ]
+
+
+def _say_report(context: Context, is_typed: bool) -> bool:
+    if is_typed and not context.resilient_parsing:
+        echo(
+            f"harness: `harness {context.info_name} --full` is now `harness report RUN --full`; "
+            "the old spelling works until 0.4.0",
+            err=True,
+        )
+    return is_typed
+
+
 FullPage = Annotated[
     bool,
     Option(
         "--full",
         help="Write prompts that no model reads, and every decision's camera pictures, into the "
         "page too.",
-        rich_help_panel=stated.OUTPUT,
     ),
 ]
+# Of a command whose page `harness report` writes again, until 0.4.0.
+OldFullPage = Annotated[bool, Option("--full", hidden=True, callback=_say_report)]
 Shard = Annotated[
     str | None,
     Option(
