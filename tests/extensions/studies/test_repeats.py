@@ -67,7 +67,7 @@ class Wanderer(Scripted):
     def _say(self, request: Request) -> Completion:
         scene = request.id.partition("/")[0]
         action = DECIDED[scene][request.sample % 3] if scene in DECIDED else "IDLE"
-        return Completion(request.id, sure(action, request.role), 1, 1, "stop", None, 1)
+        return Completion(request.id, sure(action, request.role), 400, 40, "stop", None, 1)
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         return [json.dumps(request.messages) for request in requests]
