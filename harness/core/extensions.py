@@ -37,13 +37,13 @@ INTERFACE = 1
 KINDS = frozenset(
     {
         *("audits", "backends", "caveats", "channels", "contents", "counterparts", "exports"),
-        *("extras", "hooks", "metrics", "notes", "parts", "python", "remarks", "rules"),
+        *("extras", "metrics", "notes", "parts", "python", "remarks", "rules"),
         *("scenarios", "schedules", "sections", "videos"),
     }
 )
 # The kinds that it takes from extensions that ship alone.
 SHIPPED_KINDS = frozenset(
-    {"channel_models", "encodings", "families", "panels", "readers", "sources", "timers"}
+    {"channel_models", "encodings", "families", "options", "panels", "readers", "sources", "timers"}
 )
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
 # An older spelling may also be an option of a command that has become a command.

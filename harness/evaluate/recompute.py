@@ -168,7 +168,7 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
     if not isinstance(spec.source, FrozenSource):
         wrong = list(driven_otherwise(run))
     else:
-        stays = replace(spec, source=replace(spec.source, until=None), budget=None)
+        stays = replace(spec, source=replace(spec.source, until=None), guards=())
         with TemporaryDirectory(prefix="harness-") as folder:
             try:
                 ours, otherwise = computed(run, stays, Path(folder) / "run", lambda done: None)

@@ -35,8 +35,8 @@ from harness.core.plugins import Plugins
 from harness.core.work import working
 from harness.dataset.load import Dataset
 from harness.evaluate import resolve
-from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.command_options import OPTIONS
+from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.lifecycle import begin, unfinished
 from harness.radio.profiles import MODELS
 from harness.report import sections

@@ -12,6 +12,7 @@ WANDB = ("wandb", "wandb")
 
 EXTENSION = Extension(
     name="interop",
+    kinds={"hooks": "what is told of a run while it goes, such as a tracker"},
     adds={
         "extras": {
             "inspect_ai": f"{_HERE}:INSPECT",
