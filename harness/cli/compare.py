@@ -1,5 +1,6 @@
 """`harness compare`: two finished runs against each other."""
 
+from os.path import realpath
 from pathlib import Path
 
 import typer
@@ -7,6 +8,7 @@ import typer
 from harness.cli import options
 from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, in_range, printable
+from harness.core.formats import refuse_data
 
 
 def command(
@@ -57,6 +59,11 @@ def command(
     for option, file in (("--html", html), ("--junit", junit)):
         if file and file.is_dir():
             raise UserError(f"{option} {printable(file)} is a folder; name a file in it")
+    for option, file in (("--html", html), ("--junit", junit)):
+        if file:
+            refuse_data(option, file)
+    if html and junit and realpath(html) == realpath(junit):
+        raise UserError(f"--html and --junit name one file, {printable(html)}; name two")
     if junit and not fail_if:
         raise UserError("--junit writes gates; give one or more with --fail-if")
     gates = [gate(typed) for typed in fail_if or ()]

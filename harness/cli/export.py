@@ -124,6 +124,7 @@ def command(
     dataset: options.RunsDataset = None,
 ) -> None:
     """Write a run's data for spreadsheets and other programs. Give exactly one format."""
+    from harness.core.formats import refuse_data
     from harness.runs import export
     from harness.runs.contradictions import refuse
     from harness.runs.folder import read
@@ -160,6 +161,8 @@ def command(
     if junit:
         refuse(source)
     target = files.get(option)
+    if target:
+        refuse_data(option, target)
     try:
         if as_csv:
             # both are read before anything is written

@@ -275,11 +275,11 @@ def _extensions(path: tuple[str, ...]) -> Mapping[str, Extension]:
 
 def _say_unknown_kinds(extension: Extension, working: Iterable[Extension]) -> None:
     """Say on stderr which plug-ins of a package's extension nothing takes."""
-    allowed = set(KINDS).union(*(each.kinds for each in working))
+    allowed = set(KINDS).union(*(each.kinds for each in working)) - SHIPPED_KINDS
     for kind in sorted(extension.adds.keys() - allowed):
         ships = "only extensions that ship add" if kind in SHIPPED_KINDS else "nothing takes"
         what = f"extension {printable(extension.name)} adds {printable(kind)}, which {ships}"
-        choices = ", ".join(sorted(allowed))
+        choices = printable(", ".join(sorted(allowed)), 1000)
         print(f"harness: {what}; allowed: {choices}, or what its kinds name", file=sys.stderr)
 
 
@@ -313,9 +313,9 @@ def _checked(name: str, extension: Extension) -> Extension:
             if not (isinstance(value, Mapping) and all(map(_is_setting, value, value.values()))):
                 raise UserError(f"{what}: its settings are no table of Setting; repair its package")
             continue
-        tables = (
-            [*value.values()] if table.name == "adds" and isinstance(value, Mapping) else [value]
-        )
+        tables = [value]
+        if table.name == "adds" and isinstance(value, Mapping):
+            tables = [dict.fromkeys(value, ""), *value.values()]
         if not all(map(_is_texts, tables)):
             raise UserError(f"{what}: its {table.name} are no table of texts; repair its package")
     for kind in TYPED:

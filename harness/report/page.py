@@ -16,6 +16,7 @@ from markupsafe import Markup
 from harness.coordination.operating_point import question_under
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, replacing
+from harness.core.formats import refuse_data
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each
 from harness.parsing.parse import Repair, Status
@@ -79,7 +80,9 @@ def write_report(
 
 
 def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
-    """Raise UserError if a page that lacks prompts or pictures would replace one that has them.
+    """Raise UserError if a page would replace a run's data, or lacks what the old page has.
+
+    That is prompts or pictures.
 
     Args:
         out: the file to replace.
@@ -87,6 +90,7 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
             names the kinds it lacks in its head.
         option: the command-line option that names the file, for the error.
     """
+    refuse_data(option, out)
     if not lacks or not out.is_file():
         return
     with opened(out, "rows") as page:
@@ -103,8 +107,10 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
 def save(pieces: Iterable[str], out: Path, option: str) -> None:
     """Write a page's pieces to a file, which is replaced only once it is whole.
 
-    Raises UserError, with the name of the command-line option, if the file cannot be written.
+    Raises UserError, with the name of the command-line option, if the file cannot be written, or is
+    data of a run.
     """
+    refuse_data(option, out)
     try:
         with replacing(out) as part, part.open("w", encoding="utf-8", newline="") as file:
             file.writelines(pieces)

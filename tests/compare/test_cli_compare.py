@@ -166,6 +166,8 @@ def test_options_that_cannot_be_are_one_line(runs: tuple[Path, Path], harness: H
         (("--json", "--markdown"), "--markdown and --json: give one of them"),
         (("--show", "-1"), "--show -1 is out of range"),
         (("--html", "."), "--html . is a folder; name a file in it"),
+        (("--html", "a/run.json"), "--html a/run.json is a file of a run, suite or dataset, whi"),
+        (("--html", "x", "--junit", "./x", "--fail-if", "success_rate drops > 1"), "two"),
         (("--html", "a/run.json/page.html"), "--html a/run.json/page.html cannot be written"),
     ):
         code, out, err = harness("compare", *runs, *options)

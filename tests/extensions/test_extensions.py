@@ -159,6 +159,8 @@ ODD = {
     'Extension(name="other")': "extension odd calls itself other; give both the same name",
     'Extension(name="odd", commands=["study x"])': "extension odd: its commands "
     "are no table of texts",
+    'Extension(name="odd", adds={5: {"a": "x:y"}})': "extension odd: its adds are no table of t"
+    "exts",
     'Extension(name="odd", adds={"rules": 3})': "extension odd: its adds are no table of texts",
     'Extension(name="odd", commands={"": "x:y"})': "extension odd: nobody can "
     "type '' of its commands",
@@ -782,6 +784,17 @@ def test_plug_ins_that_nothing_takes_are_one_line(
     installed(odd='Extension(name="odd", adds={"colours": {"mine": "of_others:ODD"}})')
     assert "odd" in known.extensions()
     assert "extension odd adds colours, which nothing takes; allowed: " in capsys.readouterr().err
+
+
+def test_kinds_of_a_package_are_shown_as_text_and_hush_nothing(
+    installed: Installed, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kinds = '"a\\x1b[31m": "", "timers": ""'
+    adds = '"timers": {"mine": "of_others:ODD"}'
+    installed(odd=f'Extension(name="odd", kinds={{{kinds}}}, adds={{{adds}}})')
+    assert "odd" in known.extensions()
+    error = capsys.readouterr().err
+    assert "adds timers, which only extensions that ship add; allowed: a\\x1b[31m, au" in error
 
 
 def test_every_registry_is_of_a_kind_that_extensions_may_add() -> None:

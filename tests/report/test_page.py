@@ -667,6 +667,7 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
         ([tmp_path], r"is no finished run: it has no run.json"),
         ([run, "--out", tmp_path], "is a folder; name a file in it"),
         ([run, "--out", out / "page.html"], "cannot be written"),
+        ([run, "--out", run / "summary.csv"], "is a file of a run, suite or dataset, which would"),
         ([run, run.parent], "2 runs and no --out; name the file to write"),
     ):
         with pytest.raises(UserError, match=message):
@@ -696,6 +697,6 @@ def test_an_answer_of_somebody_who_is_not_in_the_scene_is_one_line(dataset, tmp_
         "\n".join([*answers[:-1], json.dumps(first | {"viewer": "v99"})]) + "\n"
     )
     with pytest.raises(
-        UserError, match=r"answers\.jsonl has an answer of v99 in scene .*; make the run again"
+        UserError, match=r"answers\.jsonl has an answer of 'v99' in scene .*; make the run again"
     ):
         render(gather([run]))

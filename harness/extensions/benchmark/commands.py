@@ -19,7 +19,7 @@ from harness.cli.run import evaluate
 from harness.cli.terminal import echo_json, echo_text, table
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount, interval_of
-from harness.core.formats import SUITE
+from harness.core.formats import SUITE, refuse_data
 
 if TYPE_CHECKING:
     from harness.extensions.benchmark.board import Line
@@ -154,6 +154,7 @@ def pack(
     except ValueError as error:
         raise UserError(f"--made-by: {error}; give a shorter text") from None
     file = out or runs[0].absolute().with_name(runs[0].absolute().name + ".zip")
+    refuse_data("--out", file)
     results.pack(contents, entry, of.figures, file)
     if not quiet:
         typer.echo(f"packed {printable(of.name)}, digest {of.digest}, into {printable(file)}")
