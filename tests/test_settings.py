@@ -51,8 +51,9 @@ def every_setting(draw: Callable[..., Any]) -> Settings:
     world = draw(st.sampled_from(list(WORLDS.values())))
     given: dict[str, Any] = {}
     for each in options(world):
-        if draw(st.booleans()):
-            given[each.name] = draw(VALUES[str(each.kind)])
+        value = draw(VALUES[str(each.kind)])
+        if value != each.unset and draw(st.booleans()):
+            given[each.name] = value
     return changed(Settings(world=world()), given)
 
 

@@ -69,10 +69,10 @@ def command(
     specs = [resolve.spec(settings, source) for source in sources]
     if named_suite:
         suite.check(named_suite, specs)
-    if named_suite and sources[0].until:
+    if named_suite and (rule := specs[0].stopping_rule):
         raise UserError(
             f"suite {named_suite.name}: runs that stop early have other layouts each; leave "
-            "--until-... out"
+            f"{rule.options} out"
         )
     if dry_run:
         from harness.evaluate.dry_run import count

@@ -43,7 +43,10 @@ KINDS = frozenset(
 )
 # The kinds that it takes from extensions that ship alone.
 SHIPPED_KINDS = frozenset(
-    {"channel_models", "encodings", "families", "options", "panels", "readers", "sources", "timers"}
+    {
+        *("channel_models", "encodings", "families", "options", "panels", "readers", "sources"),
+        *("stopping_rules", "timers"),
+    }
 )
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")
 # An older spelling may also be an option of a command that has become a command.
@@ -60,8 +63,8 @@ class Setting:
 
     A setting of the kind `tuple` holds texts: its option may be repeated, and its default is ().
     `help` is a sentence for people. `behind` names the setting of the core after which files and
-    help list this one; empty for a table of their own. `only` names the world that alone has the
-    option, `frozen` or `closed-loop`; empty for both.
+    help list this one, as `latency` or `world.limit`; empty for a table of their own. `only` names
+    the world that alone has the option, `frozen` or `closed-loop`; empty for both.
     """
 
     kind: type  # str, int, float, bool or tuple, for texts
@@ -76,6 +79,11 @@ class Setting:
     def unset(self) -> tuple[()] | None:
         """Return what files have of one behind another where nobody sets it: None or no texts."""
         return () if self.kind is tuple else None
+
+    @property
+    def table(self) -> str:
+        """Return the table of files that it stands in by `behind`; empty for the outer one."""
+        return self.behind.rpartition(".")[0]
 
 
 @dataclass(frozen=True, kw_only=True)

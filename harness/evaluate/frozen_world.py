@@ -14,13 +14,12 @@ from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.schema import Edge
 from harness.dataset.select import ALL, NONE, Selection
 from harness.evaluate.draws import channel_draws
-from harness.evaluate.looks import Until
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.difficulty import REFERENCES, Layout
 from harness.runs.metrics import World, by_danger
-from harness.runs.records import Episode, FrozenScenes, Looks
+from harness.runs.records import Episode, FrozenScenes
 from harness.runs.settings import FrozenSettings
 from harness.world.lookouts import radios
 from harness.world.outcome import rating
@@ -37,7 +36,6 @@ class FrozenSource:
 
     dataset: Dataset  # the dataset, cut to the selected episodes
     selection: Selection = ALL  # how they were selected
-    until: Until | None = None  # when they are enough; None if all are walked
     kind: ClassVar[World] = "frozen"
 
     @property
@@ -68,7 +66,6 @@ class FrozenSource:
             decision_lag_s=p.decision_lag_s,
             path=str(self.dataset.path),
             selection=self.selection.given,
-            looks=self.until.record(len(self.dataset.episodes)) if self.until else None,
         )
 
     @property
@@ -76,16 +73,12 @@ class FrozenSource:
         """Numbers of the episodes to evaluate; a run that stops early uses the first of them."""
         return self.dataset.episodes
 
-    def stopped(self, looks: Looks) -> "FrozenSource":
-        """Return this source of a run that stopped: with its episodes up to the last of `looks`."""
-        numbers, selection = self.dataset.episodes[: looks.at[-1]], self.selection
-        if len(numbers) < looks.layouts:
+    def first(self, count: int) -> "FrozenSource":
+        """Return this source with at most so many of its episodes, from the first."""
+        numbers, selection = self.dataset.episodes[:count], self.selection
+        if len(numbers) < len(self.dataset.episodes):
             selection = replace(selection, limit=len(numbers))
-        dataset, until = (
-            self.dataset.of_episodes(frozenset(numbers)),
-            self.until and self.until.after(looks),
-        )
-        return FrozenSource(dataset, selection, until)
+        return FrozenSource(self.dataset.of_episodes(frozenset(numbers)), selection)
 
     def layouts(self, n_asked: int) -> list[Layout]:
         """Return how hard each layout is, of those asked and of others that might have been asked.
@@ -120,12 +113,10 @@ class FrozenSource:
 
     def settings(self) -> FrozenSettings:
         given: dict[str, Any] = self.selection.given
-        until = self.until.settings() if self.until else {}
         return FrozenSettings(
             dataset=str(argument(self.dataset.path)),
             limit=self.selection.limit,
             **given,
-            **until,
         )
 
 

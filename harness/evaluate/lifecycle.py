@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -17,10 +17,11 @@ from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
-from harness.runs import folder, formats
+from harness.runs import folder, formats, stopping
 from harness.runs.formats import EXTENSIONS
-from harness.runs.records import Latency, Looks, Manifest, Score
+from harness.runs.records import Latency, Manifest, Score
 from harness.runs.settings import PLAIN, difference, of_words, words
+from harness.runs.stopping import InterimLooks
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
@@ -101,7 +102,7 @@ def another_model(spec: Spec) -> str:
     return f"another model behind {names} (its files, package versions or device differ)"
 
 
-def as_finished(spec: Spec, run_start: RunStart, looks: Looks | None = None) -> RunStart:
+def as_finished(spec: Spec, run_start: RunStart, looks: InterimLooks | None = None) -> RunStart:
     """Return the record of a run as it finishes, to write into its manifest.
 
     It has the tags of all commands, the dataset's present path, and measured times as declared
@@ -111,7 +112,8 @@ def as_finished(spec: Spec, run_start: RunStart, looks: Looks | None = None) -> 
     # A repeat must not measure: other times would make other rows.
     if spec.settings.latency == latencies.MEASURED:
         spec = spec.changed(latency=latencies.as_declared(run_start.latency))
-    record = {**_stopped(spec, looks).record(), "settings": msgspec.to_builtins(spec.settings)}
+    evaluated = spec.stopped(looks) if looks else spec
+    record = {**evaluated.record(), "settings": msgspec.to_builtins(spec.settings)}
     return msgspec.structs.replace(
         run_start,
         settings=record,
@@ -119,10 +121,6 @@ def as_finished(spec: Spec, run_start: RunStart, looks: Looks | None = None) -> 
         command=words(spec.settings),
         versions=versions(),
     )
-
-
-def _stopped(spec: Spec, looks: Looks | None) -> Spec:
-    return spec if looks is None else replace(spec, source=spec.source.stopped(looks))
 
 
 def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
@@ -182,8 +180,9 @@ def finished(spec: Spec, out: Path) -> Evaluated:
 
     Raises UserError if it has other settings than `spec`, or is damaged.
     """
-    looks = folder.read(out).manifest.world.looks if spec.source.until else None
-    return finished_with(_stopped(spec, looks).record(), out, partial(_options, spec))
+    looks = folder.read(out).manifest.interim_looks if spec.stopping_rule else None
+    evaluated = spec.stopped(looks) if looks else spec
+    return finished_with(evaluated.record(), out, partial(_options, spec))
 
 
 def finished_with(
@@ -206,8 +205,8 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return what must be the same when a run resumes, by the names that an error gives it.
 
     Of its settings these are those that open nothing. The dataset's path is left out, since its
-    folder may move between two commands. What is no table, as in a damaged record, is another
-    world.
+    folder may move between two commands, and what chooses a stopping rule, which the world states.
+    What is no table, as in a damaged record, is another world.
     """
     parts = ("world", "settings", "beside")
     world, plain, opened = (_named(settings.get(name)) for name in parts)
@@ -218,7 +217,7 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
             if key not in ("world", "settings", "beside", *formats.BESIDE)
         },
         **{key: value for key, value in plain.items() if key in PLAIN},
-        **_named(plain.get(EXTENSIONS)),
+        **stopping.without(_named(plain.get(EXTENSIONS))),
         **{f"content of {name}": value for name, value in opened.items()},
         **{f"{key} of the world": value for key, value in world.items() if key != "path"},
     }

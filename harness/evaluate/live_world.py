@@ -27,10 +27,9 @@ from harness.dataset.select import drawn
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
-from harness.evaluate.looks import Until
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metrics
-from harness.runs.records import ClosedLoop, Episode, Looks
+from harness.runs.records import ClosedLoop, Episode
 from harness.runs.settings import DriveSettings
 from harness.world import conflict_measures, reference, scenarios
 from harness.world.drivers import PRIVILEGED
@@ -56,7 +55,6 @@ class LiveSource:
     scenario_name: str = scenarios.DEFAULT
     sample: int | None = None
     sample_seed: int = 0
-    until: Until | None = None  # when they are enough; None if all are driven
     name: ClassVar[str] = "drive"
     kind: ClassVar[metrics.World] = "closed-loop"
 
@@ -66,7 +64,7 @@ class LiveSource:
 
     @cached_property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes to drive, fewer if the run stops early (`until`).
+        """Numbers of the episodes to drive; a run that stops early drives the first of them.
 
         Raises UserError if there are fewer episodes than the sample.
         """
@@ -95,22 +93,19 @@ class LiveSource:
             selection={}
             if self.sample is None
             else {"of": self.episodes, "sample": self.sample, "sample_seed": self.sample_seed},
-            looks=self.until.record(self.episodes) if self.until else None,
         )
 
-    def stopped(self, looks: Looks) -> "LiveSource":
-        """Return this source of a run that stopped: with its episodes up to the last of `looks`."""
-        return replace(self, episodes=looks.at[-1], until=self.until and self.until.after(looks))
+    def first(self, count: int) -> "LiveSource":
+        """Return this source with at most so many episodes, from the first; it has no `sample`."""
+        return replace(self, episodes=min(count, self.episodes))
 
     def settings(self) -> DriveSettings:
-        until = self.until.settings() if self.until else {}
         return DriveSettings(
             scenario=scenarios.argument(self.scenario),
             episodes=self.episodes,
             first_seed=self.first_seed,
             sample=self.sample,
             sample_seed=0 if self.sample is None else self.sample_seed,
-            **until,
         )
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:

@@ -168,7 +168,9 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
     if not isinstance(spec.source, FrozenSource):
         wrong = list(driven_otherwise(run))
     else:
-        stays = replace(spec, source=replace(spec.source, until=None), guards=())
+        looks = run.manifest.interim_looks
+        evaluated = spec.stopped(looks) if looks else spec
+        stays = replace(evaluated, stopping_rule=None, guards=())
         with TemporaryDirectory(prefix="harness-") as folder:
             try:
                 ours, otherwise = computed(run, stays, Path(folder) / "run", lambda done: None)
@@ -249,7 +251,7 @@ def _of_manifest(run: Run, ours: Run, card: Card) -> Iterator[str]:
     latency and model.
     """
     world, here = (to_builtins(each.manifest.world) for each in (run, ours))
-    for name in here.keys() - {"path", "looks"}:
+    for name in here.keys() - {"path"}:
         if world.get(name) != here[name]:
             yield f"run.json has another {name} of its scenes than the dataset"
     latency, card_s = run.manifest.latency, card.latency.inference_s

@@ -19,10 +19,9 @@ from harness.dataset import load
 from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.looks import until
 from harness.evaluate.spec import Source, Spec, replayed
 from harness.prompts import versions
-from harness.runs import timers
+from harness.runs import stopping, timers
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.runs.timers import Timer
 from harness.world.scenario import Scenario
@@ -45,6 +44,7 @@ def spec(settings: Settings, source: Source) -> Spec:
         seeds=parse_seeds(settings.seeds),
         points=points(settings.condition or tuple(POINTS), settings.extensions),
         timer=timers.chosen(settings.extensions) or _of_replayed(ego, settings),
+        stopping_rule=stopping.chosen(settings.extensions),
         settings=settings,
     )
 
@@ -62,9 +62,7 @@ def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
     """
     selection = Selection(world.limit, world.only, world.danger, world.sample, world.sample_seed)
     whole = load.load(load.find(dataset), None if selection.given else world.limit)
-    return FrozenSource(
-        selection.of(whole), selection, until(world.until_width, world.until_decided)
-    )
+    return FrozenSource(selection.of(whole), selection)
 
 
 def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
@@ -85,12 +83,7 @@ def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
     in_range("--first-seed", first_seed, 0, LAST_SEED)
     in_range("--sample-seed", world.sample_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
-    enough = until(world.until_width, world.until_decided)
-    if enough and world.sample is not None:
-        raise UserError(
-            f"--sample {world.sample}: a run that stops takes layouts in their order; leave it out"
-        )
-    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed, enough)
+    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed)
     if world_of_scenario := source.scenario.world:
         world_of_scenario.examine(source.scenario, first_seed)
     return source

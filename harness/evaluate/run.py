@@ -48,22 +48,21 @@ from harness.evaluate.lifecycle import (
     refuse_finished,
     unfinished,
 )
-from harness.evaluate.looks import looks
 from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
 from harness.evaluate.table import of_all_seeds, table
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import walk
-from harness.runs import folder, run_parts, writer
+from harness.runs import folder, run_parts, stopping, writer
 from harness.runs import sources as kept_sources
 from harness.runs.contradictions import sound
 from harness.runs.decisions import Decisions
 from harness.runs.difficulty import Layout, adjusted_scores
-from harness.runs.formats import FORMAT
+from harness.runs.formats import FORMAT, LOOKS
 from harness.runs.metrics import Grid, metrics_of
-from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Looks, Manifest
+from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
 from harness.runs.settings import FILE, of_words, text_of
-from harness.runs.success import any_time_scores
+from harness.runs.stopping import InterimLooks
 from harness.runs.summary import Figures, counted
 from harness.runs.unanswered import Tally
 
@@ -164,7 +163,7 @@ def evaluate_shard(
     """
     metrics_of(spec.source.kind)
     refuse_finished(out)
-    if spec.source.until:
+    if spec.stopping_rule:
         raise UserError(f"--shard {shard}: a run that stops when it has seen enough has no shards")
     made_of = sources(spec)
     earlier = unfinished(spec, out, str(shard))
@@ -262,7 +261,7 @@ def _frozen(
     workers: Workers,
 ) -> Evaluated:
     made_of, chunks = sources(spec), _split(source.dataset.episodes, TREES_AT_ONCE)
-    here = opens or given or source.until or len(chunks) == 1
+    here = opens or given or spec.stopping_rule or len(chunks) == 1
     spread_over = 1 if here else spreadable(spec, workers)
     if in_workers := spread_over != 1:
         models = list[Backend]()
@@ -431,13 +430,13 @@ def _walked(
     chunks: Sequence[Sequence[int]],
     place: Path,
     walk_all: Callable[[Sequence[Sequence[int]]], None],
-) -> tuple[Sequence[Sequence[int]], Looks | None]:
+) -> tuple[Sequence[Sequence[int]], InterimLooks | None]:
     """Walk the chunks, or as many layouts as are enough; return the chunks of these, and the looks.
 
     A resumed run looks at the same layouts again, and so stops where it would have.
     """
-    until = spec.source.until
-    if until is None:
+    rule = spec.stopping_rule
+    if rule is None:
         walk_all(chunks)
         return chunks, None
     numbers, most = spec.source.numbers, max(map(len, chunks))
@@ -446,8 +445,8 @@ def _walked(
         list[Sequence[int]](),
         list[Episode](),
     )
-    enough, at = False, list[int]()
-    for layouts in looks(len(numbers)):
+    is_enough, at = False, list[int]()
+    for layouts in rule.planned_looks(len(numbers)):
         new = _split(numbers[at[-1] if at else 0 : layouts], most)
         walk_all(new)
         parts = [place / _folder_name(chunk) for chunk in new]
@@ -455,9 +454,9 @@ def _walked(
         done, at = [*done, *new], [*at, layouts]
         ended += chain.from_iterable(map(run_parts.ends_of, parts))
         grid = Grid(names, spec.seeds, tuple(numbers[:layouts]))
-        if enough := until.enough(grid, grid.ordered(ended)):
+        if is_enough := rule.enough(grid, grid.ordered(ended)):
             break
-    return done, msgspec.structs.replace(until.record(len(numbers)), at=tuple(at), enough=enough)
+    return done, InterimLooks(len(numbers), tuple(at), is_enough)
 
 
 def _drive(
@@ -598,8 +597,8 @@ def _gather(
         for cell in range(len(names) * len(settings["seeds"])):
             for chunk, of_part in zip(chunks, by_part, strict=True):
                 episodes += of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
-        if settings["world"].get("looks"):
-            summary = [*summary, *any_time_scores(whole.grid, episodes)]
+        if rule := stopping.rule_of(settings["world"].get(LOOKS)):
+            summary = [*summary, *rule.scores(whole.grid, episodes)]
         if layouts:
             summary = [*summary, *adjusted_scores(whole.grid, episodes, layouts)]
         cost = costs.total(settings, works)

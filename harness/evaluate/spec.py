@@ -25,13 +25,12 @@ from harness.dataset.load import Scene
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.command_options import Guard
 from harness.evaluate.latency import MEASURED, NAMES, declared
-from harness.evaluate.looks import Until
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
-from harness.runs import formats, timers
+from harness.runs import formats, stopping, timers
 from harness.runs.folder import read
 from harness.runs.metrics import World
-from harness.runs.records import ClosedLoop, FrozenScenes, Looks, Manifest
+from harness.runs.records import ClosedLoop, FrozenScenes, Manifest
 from harness.runs.settings import (
     DriveSettings,
     FrozenSettings,
@@ -39,6 +38,7 @@ from harness.runs.settings import (
     Settings,
     of_extensions,
 )
+from harness.runs.stopping import InterimLooks, StoppingRule
 from harness.runs.timers import Timer
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
@@ -74,16 +74,11 @@ class Source(Protocol):
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes to evaluate, fewer if the run stops early (`until`)."""
+        """Numbers of the episodes to evaluate; a run that stops early has the first of them."""
         ...
 
-    @property
-    def until(self) -> Until | None:
-        """The rule by which the run stops early; None if all episodes are evaluated."""
-        ...
-
-    def stopped(self, looks: Looks) -> "Source":
-        """Return this source of a run that stopped: with its episodes up to the last of `looks`."""
+    def first(self, count: int) -> "Source":
+        """Return this source with at most so many of its episodes, from the first."""
         ...
 
     @property
@@ -121,6 +116,8 @@ class Spec:
     helpers: tuple[Agent, ...] = ()
     # what times each answer by itself, in place of `--latency`; None for the latter
     timer: Timer | None = None
+    stopping_rule: StoppingRule | None = None  # when episodes are enough; None if all are evaluated
+    interim_looks: InterimLooks | None = None  # at a run that has stopped by this rule
     # all settings as typed, of which `resolve.spec` makes this evaluation; those that fields above
     # hold opened are rewritten to agree with them
     settings: Settings = USUAL
@@ -174,9 +171,8 @@ class Spec:
             self.timer.check(self)
         for point in self.points:
             self._check_point(point)
-        if until := self.source.until:
-            names = [point.name for point in self.points]
-            until.check(self.source.record(), self.source.numbers, names, self.seeds)
+        if self.stopping_rule:
+            self.stopping_rule.check(self)
         for flag, value in {
             "--device": self.settings.device,
             "--dtype": self.settings.dtype,
@@ -417,6 +413,20 @@ class Spec:
             raise ValueError(f"{lost[0]} is what is opened here: replace that")
         return spec
 
+    def stopped(self, looks: InterimLooks) -> "Spec":
+        """Return this evaluation as its rule has stopped it, by these looks of a run."""
+        looks = replace(looks, layouts=len(self.source.numbers))
+        return replace(self, source=self.source.first(looks.at[-1]), interim_looks=looks)
+
+    @property
+    def world(self) -> FrozenScenes | ClosedLoop:
+        """The record of the scenes for a run's manifest, with what may stop the run."""
+        world = self.source.record()
+        if self.stopping_rule is None:
+            return world
+        looks = self.interim_looks or InterimLooks(len(self.source.numbers))
+        return structs.replace(world, interim_looks=self.stopping_rule.record(looks))
+
     def record(self) -> dict[str, Any]:
         """Return the settings and a record of all opened files, for a run's `run.json`."""
         settings = msgspec.to_builtins(self.settings)
@@ -430,7 +440,7 @@ class Spec:
         return {
             **self.ego.settings(),
             "helpers": [agent.settings() for agent in self.helpers],
-            "world": msgspec.to_builtins(self.source.record()),
+            "world": msgspec.to_builtins(self.world),
             "actions": list(self.actions),
             "conditions": [point.record() for point in self.points],
             "channels": {name: CHANNELS.record(name) for name in profiles if name},
@@ -486,7 +496,7 @@ class Spec:
         }
 
     def _of_extensions(self) -> dict[str, Any]:
-        """Return the settings of extensions; those that choose a timer say which is open.
+        """Return the settings of extensions; those that open something say what is open.
 
         Of those that make counterparts of conditions there is none, nor of others without texts.
         """
@@ -495,11 +505,13 @@ class Spec:
         for name, setting in of_extensions().items():
             if name not in beside and setting.default not in formats.NO_TEXTS:
                 settings[name] = setting.default
-        for name, value in timers.without(self.settings.extensions).items():
+        others = stopping.without(timers.without(self.settings.extensions))
+        for name, value in others.items():
             if name not in COUNTERPARTS:
                 settings[name] = value
         by_timer = self.timer.settings() if self.timer else {}
-        return {**settings, **by_timer}
+        by_rule = self.stopping_rule.settings() if self.stopping_rule else {}
+        return {**settings, **by_timer, **by_rule}
 
     @property
     def ties(self) -> str:

@@ -33,27 +33,11 @@ _FAILED = {
 }
 
 
-def looked_at(run: Run) -> Iterator[str]:
-    """Yield when a run with sequential stopping was inspected, and which of its intervals hold."""
-    looks = run.manifest.world.looks
-    if looks is None:
-        return
-    what = (
-        f"success is known within {100 * looks.width:g} points"
-        if looks.width is not None
-        else f"success differs from that of {printable(looks.against, 40)}"
-    )
-    every = f"all {looks.layouts} layouts" if looks.layouts > 1 else "the only layout"
-    how = (
-        f"It stopped after {looks.at[-1]} of {amount(looks.layouts, 'layout')}, when"
-        if looks.enough
-        else f"It took {every}, and still it is not so that"
-    )
-    yield (
-        f"{how} {what} in every condition. It was looked at {amount(len(looks.at), 'time')}: "
-        "intervals of success and of its gain hold at every look; all others are for a number of "
-        "layouts fixed before, and too narrow."
-    )
+def stopped(run: Run) -> Iterator[str]:
+    """Yield when a run that might stop was looked at, and which of its intervals hold."""
+    record = run.manifest.world.interim_looks
+    if record is not None and (rule := run.manifest.stopping_rule):
+        yield rule.sentence(record)
 
 
 def unread(run: Run) -> Iterator[str]:

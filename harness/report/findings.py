@@ -72,7 +72,7 @@ OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
         each(caveats.moved_system),
         each(caveats.by_letter),
         each(caveats.beyond_sources),
-        each(caveats.looked_at),
+        each(caveats.stopped),
         each(ignores_input),
         each(unchecked),
         each(caveats.lost_messages),

@@ -20,7 +20,6 @@ from harness.runs.headline import PAIRED
 from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
 from harness.runs.records import Episode, Score
 from harness.runs.reliability import SAME
-from harness.runs.success import any_time_scores
 from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
 
@@ -122,8 +121,8 @@ def _scores(run: Run) -> Iterator[Score]:
     with np.errstate(all="ignore"):  # a file can state any number
         figures = Figures.of(run.world, run.grid, run.decisions, run.episodes, answers)
         yield from figures.scores(older=not current(run))
-    if run.manifest.world.looks:
-        yield from any_time_scores(run.grid, run.episodes)
+    if rule := run.manifest.stopping_rule:
+        yield from rule.scores(run.grid, run.episodes)
     if run.layouts:
         yield from adjusted_scores(run.grid, run.episodes, run.layouts)
     for score in run.scores:

@@ -19,6 +19,7 @@ from harness.world.families import FAMILIES
 
 NUMBER = 2
 EXTENSIONS = "extensions"  # the table of settings that extensions add
+LOOKS = "looks"  # in `world`: what a rule that may stop the run states of its interim looks
 NO_TEXTS: tuple[Any, ...] = ([], ())  # of a setting of texts that nobody sets
 UNSET = "unset"  # stands for `msgspec.UNSET`: a folder is listed without loading msgspec
 FORMAT = f"swarmdrive-run/{NUMBER}"
@@ -237,15 +238,27 @@ def gathered(settings: Mapping[str, Any]) -> dict[str, Any]:
     and of all of them lists without texts. Raises UserError for one of an extension that is not
     installed.
     """
-    beside = extensions.beside()
-    entries = {name: settings[name] for name in beside if settings.get(name) is not None}
-    others = {name: value for name, value in settings.items() if name not in beside}
-    table = _without_gone(others)
+    entries, table = _parted(settings, "")
+    for name, value in table.items():
+        if isinstance(value, Mapping) and name != EXTENSIONS:
+            inner_entries, table[name] = _parted(value, name)
+            entries |= inner_entries
     inner = table.get(EXTENSIONS, {})
     if isinstance(inner, Mapping):
         both = {**inner, **entries}
         inner = {name: value for name, value in both.items() if value not in NO_TEXTS}
     return {**table, EXTENSIONS: inner}
+
+
+def _parted(table: Mapping[str, Any], name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the settings of extensions that have a value in a table of files, and all else of it.
+
+    `name` is that of the table; empty for the outer one, which has the others.
+    """
+    here = [key for key, setting in extensions.beside().items() if setting.table == name]
+    entries = {key: table[key] for key in here if table.get(key) is not None}
+    others = {key: value for key, value in table.items() if key not in here}
+    return entries, _without_gone(others)
 
 
 def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -256,7 +269,7 @@ def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
     kept = {}
     for name, value in table.items():
         owner = owner_of_plugin("settings", name)
-        if owner is None:
+        if owner is None or owner in extensions.extensions():
             kept[name] = value
         elif value is not None and value not in NO_TEXTS:
             raise UserError(f"setting {name} is {part_of(owner)}")
@@ -283,12 +296,19 @@ def settings_as_file(settings: Mapping[str, Any]) -> dict[str, Any]:
     There, settings of extensions stand behind those of the core, where their extension says so.
     """
     of_extensions, beside = settings[EXTENSIONS], extensions.beside()
-    table: dict[str, Any] = {}
-    for name, value in settings.items():
-        table[name] = value
-        table |= _behind(name, of_extensions)
+    table = _filled(settings, of_extensions)
     table[EXTENSIONS] = {name: value for name, value in of_extensions.items() if name not in beside}
     return table
+
+
+def _filled(table: Mapping[str, Any], values: Mapping[str, Any], outer: str = "") -> dict[str, Any]:
+    """Return a table of settings, and those in it, with extensions' settings behind the core's."""
+    filled: dict[str, Any] = {}
+    for name, value in table.items():
+        is_table = isinstance(value, Mapping) and name != EXTENSIONS
+        filled[name] = _filled(value, values, f"{name}.") if is_table else value
+        filled |= _behind(outer + name, values)
+    return filled
 
 
 def _behind(name: str | None, values: Mapping[str, Any]) -> dict[str, Any]:

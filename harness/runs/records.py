@@ -11,8 +11,9 @@ from harness.coordination.operating_point import OperatingPoint, questions
 from harness.core.config import Seconds, Whole, convert
 from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate
-from harness.runs import formats
+from harness.runs import formats, stopping
 from harness.runs.settings import Settings
+from harness.runs.stopping import InterimLooks, StoppingRule
 from harness.runs.timers import Timer, timer
 from harness.world import scenarios
 from harness.world.parameters import DIALS
@@ -20,6 +21,8 @@ from harness.world.scenario import Scenario
 
 Measured = Annotated[float, Meta(ge=0, description="seconds, 0 or more")]
 Share = Annotated[float, Meta(ge=0, le=1.001, description="a share, 0 to 1")]  # up to rounding
+# What a file states for an extension: by name, no table in it.
+Plain = dict[str, bool | int | float | str | tuple[int, ...] | None]
 PLAIN_ROLES = ("ego", "helper", "merge")  # `merge` is the ego's fusion call
 Role = Annotated[str, Meta(pattern=r"^[a-z-]{1,40}\Z", description="a word")]  # one of `roles`
 
@@ -444,21 +447,6 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
         return Estimate(value, low, high, self.n, self.n_excluded)
 
 
-class Looks(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Hold when a run with sequential stopping was inspected, and its stopping rule.
-
-    The rule is a width of intervals, or another run from which success is to differ. `layouts` is
-    how many layouts there were to evaluate, and `at` after how many of them the run was inspected.
-    """
-
-    layouts: int  # how many there were
-    width: float | None = None  # of each condition's interval of success, as a share
-    against: str | None = None  # the name of the run from which every condition is to differ
-    against_sha256: str | None = None  # digest of that run's episodes.csv
-    at: tuple[int, ...] = ()  # after how many layouts it was looked; empty while it runs
-    enough: bool = False  # whether the last look was enough
-
-
 class FrozenScenes(
     Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True
 ):
@@ -476,7 +464,9 @@ class FrozenScenes(
     decision_lag_s: float
     path: str
     selection: dict[str, int | str] = {}
-    looks: Looks | None = None  # None for a run of as many episodes as were asked for
+    # what a rule that may stop the run states of its looks; None for a run of as many episodes as
+    # were asked for
+    interim_looks: Plain | None = field(default=None, name=formats.LOOKS)
 
     @property
     def pinned(self) -> Any:
@@ -498,7 +488,9 @@ class ClosedLoop(
     episodes: int
     late_against: str
     selection: dict[str, int] = {}
-    looks: Looks | None = None  # None for a run of as many episodes as were asked for
+    # what a rule that may stop the run states of its looks; None for a run of as many episodes as
+    # were asked for
+    interim_looks: Plain | None = field(default=None, name=formats.LOOKS)
 
     def __post_init__(self) -> None:
         name, parameters = self.scenario.get("name"), self.scenario.get("parameters")
@@ -647,8 +639,26 @@ class Manifest(Struct, frozen=True, kw_only=True):
         """What timed each answer of the run; None for others, and for a replay of such a one."""
         return timer(self.latency.source).recorded(self) if self.latency.speeds else None
 
+    @property
+    def stopping_rule(self) -> StoppingRule | None:
+        """What may have stopped the run, without what its settings open; None for nothing."""
+        return stopping.rule_of(self.world.interim_looks)
+
+    @property
+    def interim_looks(self) -> InterimLooks | None:
+        """When the run was looked at; None if nothing was to stop it."""
+        rule, record = self.stopping_rule, self.world.interim_looks
+        if rule is None or record is None:
+            return None
+        looks = rule.looks(record)
+        if looks.at[-1] != self.world.episodes:
+            raise ValueError(
+                f"{formats.LOOKS}: the last is not at all {self.world.episodes} layouts"
+            )
+        return looks
+
     def __post_init__(self) -> None:
-        _ = self.timer  # of what a run states
+        _ = self.timer, self.interim_looks  # of what a run states
         of_model, of_prompt = ("name", "engine"), ("version", "sha256")
         tables: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
             ("model", self.model, of_model),

@@ -85,24 +85,6 @@ class HelperSettings(Struct, frozen=True, kw_only=True):
     ] = None
 
 
-UntilWidth = Annotated[
-    float | None,
-    option(
-        "Stop as soon as the 95 % interval of success is so narrow, in points, in every "
-        "condition; it is one that holds at every look.",
-        EPISODES,
-    ),
-]
-UntilDecided = Annotated[
-    str | None,
-    option(
-        "Stop as soon as success differs from that of the finished run in this folder in every "
-        "condition, by such an interval.",
-        EPISODES,
-    ),
-]
-
-
 class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="frozen"):
     """Hold the settings of a frozen run's episodes: the dataset, and which of it to use."""
 
@@ -134,8 +116,6 @@ class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="f
         ),
     ] = None
     sample_seed: Annotated[int, option("Seed of this draw.", EPISODES)] = 0
-    until_width: UntilWidth = None
-    until_decided: UntilDecided = None
 
 
 class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="closed-loop"):
@@ -171,8 +151,6 @@ class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="cl
             EPISODES,
         ),
     ] = 0
-    until_width: UntilWidth = None
-    until_decided: UntilDecided = None
 
 
 class Settings(Struct, frozen=True, kw_only=True):
@@ -407,8 +385,9 @@ def options(world: type[Struct]) -> list[Option]:
     for each in core_options(world):
         declared.append(each)
         for name, setting in beside.items():
-            if setting.behind == each.name and setting.only in ("", kind):
-                declared.append(_added(name, setting, (name,), setting.unset))
+            if setting.behind == ".".join(each.path) and setting.only in ("", kind):
+                path = (*each.path[:-1], name)
+                declared.append(_added(name, setting, path, setting.unset))
     for name, setting in of_extensions().items():
         if name not in beside and setting.only in ("", kind):
             last.append(_added(name, setting, (EXTENSIONS, name), setting.default))

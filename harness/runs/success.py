@@ -3,7 +3,7 @@
 All that picks, orders or tests by success of single episodes does so here.
 """
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from math import comb
 from typing import Generic, TypeVar
@@ -13,7 +13,6 @@ import numpy as np
 from harness.core import multiplicity
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.power import Spread, variance
-from harness.core.sequences import any_time, any_time_difference
 from harness.core.statistics import (
     LEVEL,
     Estimate,
@@ -22,7 +21,7 @@ from harness.core.statistics import (
     paired_difference,
     resampled,
 )
-from harness.runs.headline import ANY_TIME, BALANCED, IN_WORDS, PAIRED, SUCCESS
+from harness.runs.headline import BALANCED, IN_WORDS, PAIRED, SUCCESS
 from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
 from harness.runs.records import Episode, Score
 
@@ -89,21 +88,6 @@ class Success:
         `level` is the confidence of the interval. The axes are S channel seeds and E episodes.
         """
         return mean_difference([(self, a, b)], level)
-
-    def any_time(self, success: Floats) -> Estimate:
-        """Return mean success of values (S, E) with an anytime-valid interval over episodes.
-
-        It holds at every inspection of a run that is stopped early. The axes are S channel seeds
-        and E episodes.
-        """
-        return any_time([known_mean(success, 0)[part] for part in self.parts])
-
-    def any_time_difference(self, a: Floats, b: Floats) -> Estimate:
-        """Return success a - b, both (S, E), paired by episode, with an anytime-valid interval.
-
-        The axes are S channel seeds and E episodes.
-        """
-        return any_time_difference([known_mean(a - b, 0)[part] for part in self.parts])
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no difference between a and b, (S, E); None without an interval.
@@ -181,20 +165,6 @@ def by_condition(
     """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
     return Success.of(episodes[: len(grid.episodes)], headline_metric), values
-
-
-def any_time_scores(grid: Grid, episodes: Sequence[Episode]) -> Iterator[Score]:
-    """Yield the scores of success and its gains that have anytime-valid intervals.
-
-    `episodes` are in the order of the grid: by condition, seed and episode.
-    """
-    success, values = by_condition(grid, episodes)
-    for by in success.ways:
-        for name, of_condition in values.items():
-            yield Score.of(name, by.metric, by.any_time(of_condition), ANY_TIME)
-            if BASELINE in values and name != BASELINE:
-                gain = by.any_time_difference(of_condition, values[BASELINE])
-                yield Score.of(name, GAINS[by.metric], gain, ANY_TIME)
 
 
 def is_gain(score: Score, conditions: Container[str]) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from harness.core.files import BROKEN, opened, text_of
 from harness.core.formats import CONFIG, WORK
 from harness.core.work import LOCK
+from harness.runs.formats import LOOKS
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ def _due(work: Path) -> tuple[int | None, bool]:
     try:
         config = json.loads(text_of(work / CONFIG, "record"))
         world = config["settings"]["world"]
-        return None if config.get("shard") else int(world["episodes"]), bool(world.get("looks"))
+        return None if config.get("shard") else int(world["episodes"]), bool(world.get(LOOKS))
     except (*BROKEN, AttributeError):
         return None, False
 

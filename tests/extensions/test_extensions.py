@@ -59,6 +59,7 @@ NAMED = (
     "readers",
     "rules",
     "schedules",
+    "stopping_rules",
     "timers",
 )
 Said = tuple[int, str, str]
@@ -594,35 +595,43 @@ def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
     """Whether it is typed, in a file of settings, or in a run; a run without it is read."""
     (tmp_path / "run.toml").write_text('device_profile = "agx-orin"\n')
     (tmp_path / "attacked.toml").write_text('control = []\nattack = ["liar"]\n')
+    (tmp_path / "until.toml").write_text("[world]\nuntil_width = 10\n")
     code = (
         "import sys\nfrom harness.core.errors import UserError\nfrom harness.runs import formats, "
-        "timers\nfrom harness.__main__ import main\nidle = {'device_profile': None, "
-        "'device_model': None, 'control': [], 'attack': [], 'ties': 'drawn'}\nprint(formats.gathered(idle))\n"
+        "stopping, timers\nfrom harness.__main__ import main\nidle = {'device_profile': None, "
+        "'device_model': None, 'control': [], 'attack': [], 'ties': 'drawn', 'world': {'until_width': None}}\n"
+        "print(formats.gathered(idle))\n"
         "print('device_profile' in formats.upgraded({**idle, 'settings': idle}))\n"
         "for ask in (lambda: formats.upgraded({'device_profile': {'name': 'mine'}}), "
-        "lambda: timers.timer('device')):\n    try:\n        ask()\n"
+        "lambda: formats.gathered({'world': {'until_width': 10.0}}), "
+        "lambda: timers.timer('device'), lambda: stopping.rule_of({'layouts': 4})):\n"
+        "    try:\n        ask()\n"
         "    except UserError as error:\n        print(error)\n"
         "for typed in (['--device-profile', 'agx-orin'], ['run.toml'], ['--control', 'no-messages'], "
-        "['attacked.toml']):\n"
+        "['attacked.toml'], ['until.toml']):\n"
         "    sys.argv = ['harness', 'eval', *typed]\n"
         "    try:\n        main()\n    except SystemExit as end:\n        print(end.code)\n"
     )
     done = in_the_core(core, tmp_path, code)
     gone = "is part of the extension devices, which is not installed"
+    early_stop = "is part of the extension early_stop, which is not installed"
     assert done.stdout.splitlines() == [
-        "{'ties': 'drawn', 'extensions': {}}",
+        "{'ties': 'drawn', 'world': {}, 'extensions': {}}",
         "False",
         f"setting device_profile {gone}",
+        f"setting until_width {early_stop}",
         f"what timed the answers of a run, device, {gone}",
-        *["2"] * 4,
+        f"what may stop a run, looks in its run.json, {early_stop}",
+        *["2"] * 5,
     ]
-    typed, stated, control, attack = done.stderr.splitlines()
+    typed, stated, control, attack, until = done.stderr.splitlines()
     assert typed.startswith(f"harness: --device-profile {gone} in `harness eval --device-profile ")
     assert stated == f"harness: setting device_profile {gone}"
     assert control.startswith("harness: --control is part of the extension controls, which is not ")
     assert (
         attack == "harness: setting attack is part of the extension trust, which is not installed"
     )
+    assert until == f"harness: setting until_width {early_stop}"
 
 
 PART = """

@@ -50,6 +50,7 @@ ORDINARY = {
     "history": "of a browser's tab",
     "inspect": "Python's module",
     "learn": "a verb",
+    "looks": "a verb, and what a run states of when a rule looked at it",
     "margin": "of pages, pictures and gaps",
     "measure": "a verb, and what is measured",
     "media": "a rule of style sheets",

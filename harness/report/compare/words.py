@@ -170,25 +170,23 @@ def paces(pair: Pair) -> list[str]:
 def caveats(pair: Pair) -> list[str]:
     """Return the warnings about both runs; one of a single run begins with its letter."""
     warnings = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
-    return [*(finding.sentence for finding in warnings), *_any_time(pair)]
+    return [*(finding.sentence for finding in warnings), *_by_stopping_rule(pair)]
 
 
-def _any_time(pair: Pair) -> Iterator[str]:
+def _by_stopping_rule(pair: Pair) -> Iterator[str]:
     """Yield each difference of success with an interval that holds at every look,
     if a run was looked at.
     """
-    if all(side.run.manifest.world.looks is None for side in (pair.a, pair.b)):
+    rule = pair.a.run.manifest.stopping_rule or pair.b.run.manifest.stopping_rule
+    if rule is None:
         return
     for condition in pair.conditions:
         ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
         success = Success.of(ends, headline_of(pair.a.run, pair.b.run))
         a = pair.values(pair.a, SUCCESS, condition).T
         b = pair.values(pair.b, SUCCESS, condition).T
-        change = interval_of(success.any_time_difference(b, a), POINTS, "+")
-        yield (
-            f"{printable(condition)}: {success.words} B - A {change} points, by an interval of "
-            "every look"
-        )
+        change = interval_of(rule.difference(success, b, a), POINTS, "+")
+        yield (f"{printable(condition)}: {success.words} B - A {change} points, by {rule.interval}")
 
 
 def paired(pair: Pair) -> str:

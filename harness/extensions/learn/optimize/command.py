@@ -22,6 +22,7 @@ from harness.core import extras, resources, work
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import WORK
 from harness.core.seeds import FIRST, LAST_EPISODE
+from harness.runs import stopping
 from harness.runs.formats import settings_as_file
 from harness.runs.settings import OUTPUT, FrozenSettings, Settings
 
@@ -100,6 +101,8 @@ def command(
         only_for("report", "--dataset", name, manifest.seed, manifest.episodes)
     base = _base(settings, scenarios, budget)
     settings = structs.replace(settings, prompt=base.version)
+    # What may stop a run is for those that certify: the search says how many tune layouts it asks.
+    tune_settings = structs.replace(settings, extensions=stopping.without(settings.extensions))
     sizes = {} if reflect else choices(base)
     given_layouts = given(tune, [manifest for manifest, _ in manifests]) if tune else []
     in_range("--layouts", layouts, 2, FIRST["train"])
@@ -116,7 +119,7 @@ def command(
             few = given_layouts or built(
                 scenarios, Path(place), min(SAMPLE, layouts), first_seed, who, progress
             )
-            specs = [resolve.spec(settings, source) for source in few]
+            specs = [resolve.spec(tune_settings, source) for source in few]
             episodes = [
                 min(manifest.episodes, settings.world.limit or manifest.episodes)  # type: ignore[union-attr]
                 for manifest, _ in manifests
@@ -150,7 +153,7 @@ def command(
         bar(label, quiet=silent, grows=True) as progress,
     ):
         sources = given_layouts or built(scenarios, place, layouts, first_seed, who, progress)
-        specs = [resolve.spec(settings, source) for source in sources]
+        specs = [resolve.spec(tune_settings, source) for source in sources]
         plan = Search(
             base,
             specs,

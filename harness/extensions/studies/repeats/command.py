@@ -97,10 +97,10 @@ def _check(spec: "Spec", repeats: int) -> None:
     from harness.evaluate.latency import MEASURED
 
     in_range("--repeats", repeats, 2, MOST)
-    if spec.source.until:
+    if rule := spec.stopping_rule:
         raise UserError(
             f"--repeats {repeats}: runs that stop early have other layouts each; leave "
-            "--until-... out"
+            f"{rule.options} out"
         )
     if not spec.settings.temperature:
         raise UserError(

@@ -17,21 +17,23 @@ from harness.backends.base import Backend
 from harness.backends.registry import open_backend
 from harness.coordination.operating_point import POINTS
 from harness.core.errors import UserError
-from harness.core.sequences import BETS, any_time, any_time_difference
 from harness.core.shards import Shard
 from harness.core.statistics import paired_difference
 from harness.dataset.load import Dataset
 from harness.dataset.select import Selection
-from harness.evaluate import looks
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.looks import Until
+from harness.evaluate.lifecycle import finished
 from harness.evaluate.run import evaluate, evaluate_shard
 from harness.evaluate.spec import Spec
-from harness.report.caveats import looked_at
+from harness.extensions.early_stop import rule
+from harness.extensions.early_stop.rule import Until, interim_looks
+from harness.extensions.early_stop.sequences import BETS, any_time, any_time_difference
+from harness.report.caveats import stopped
 from harness.report.compare.pair import pair
 from harness.report.compare.words import caveats as of_pair
 from harness.runs.folder import read
 from harness.runs.headline import ANY_TIME
+from harness.runs.stopping import InterimLooks
 
 pytestmark = pytest.mark.slow
 
@@ -42,12 +44,13 @@ Typed = Callable[..., tuple[int, str, str]]
 @pytest.fixture(autouse=True)
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs of four layouts are looked at after two, three and four."""
-    monkeypatch.setattr(looks, "FIRST", 2)
+    monkeypatch.setattr(rule, "FIRST", 2)
 
 
 def until(spec: Spec, until: Until, limit: int | None = None) -> Spec:
     assert isinstance(spec.source, FrozenSource)
-    return replace(spec, source=FrozenSource(spec.source.dataset, Selection(limit), until))
+    source = FrozenSource(spec.source.dataset, Selection(limit))
+    return replace(spec, source=source, stopping_rule=until)
 
 
 def capital(values: list[float], mean: float) -> float:
@@ -104,15 +107,15 @@ def test_the_truth_is_held_at_every_look_of_nearly_all_runs() -> None:
         values = (rng.random(150) < 0.8).astype(float)
         spans = [any_time([values[:n]]) for n in (20, 40, 60, 80, 110, 150)]
         held += all(span.low <= 0.8 <= span.high for span in spans)
-    assert held >= 55  # 57 at a coverage of 95 %; it is simulated by benchmarks/looks.py
+    assert held >= 55  # 57 at a coverage of 95 %; it is simulated by benchmarks/interim_looks.py
 
 
 def test_looks_are_a_quarter_more_each_and_end_with_all_layouts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.undo()
-    assert looks.looks(60) == [20, 25, 32, 40, 50, 60]
-    assert looks.looks(7) == [7]
+    assert interim_looks(60) == [20, 25, 32, 40, 50, 60]
+    assert interim_looks(7) == [7]
 
 
 def test_a_run_stops_when_its_interval_is_narrow_and_says_so(
@@ -120,17 +123,18 @@ def test_a_run_stops_when_its_interval_is_narrow_and_says_so(
 ) -> None:
     spec = until(spec_of(small, "constant", **ALONE), Until(width=0.999))
     done = run(spec, tmp_path / "run")
-    assert done.manifest.world.looks is not None
-    at = done.manifest.world.looks.at
+    looks = done.manifest.interim_looks
+    assert looks is not None
+    at = looks.at
     assert at == (2,)
-    assert done.manifest.world.looks.enough
+    assert looks.is_enough
     assert done.manifest.world.episodes == at[-1]
     row = figure(done, "single-local", "success_rate", ANY_TIME)
     assert row.low is not None
     assert row.high is not None
     assert row.high - row.low <= 0.999
     assert read(tmp_path / "run").score("single-local", "success_rate") == row
-    assert f"stopped after {at[-1]} of 4 layouts" in " ".join(looked_at(read(done.out)))
+    assert f"stopped after {at[-1]} of 4 layouts" in " ".join(stopped(read(done.out)))
     whole = run(
         spec_of(
             Dataset.of_episodes(small, frozenset(small.episodes[: at[-1]])), "constant", **ALONE
@@ -139,18 +143,17 @@ def test_a_run_stops_when_its_interval_is_narrow_and_says_so(
     )
     for name in ("episodes.csv", "answers.jsonl"):
         assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    assert whole.manifest.world.looks is None
+    assert whole.manifest.interim_looks is None
 
 
 def test_a_run_that_is_never_sure_takes_all_layouts(small: Dataset, tmp_path: Path) -> None:
     done = run(until(spec_of(small, "constant", **ALONE), Until(width=0.1)), tmp_path / "run")
-    world = done.manifest.world
-    assert world.looks is not None
-    assert (world.episodes, world.looks.at, world.looks.enough) == (4, (2, 3, 4), False)
-    assert "took all 4 layouts" in " ".join(looked_at(read(done.out)))
+    assert done.manifest.interim_looks == InterimLooks(4, (2, 3, 4))
+    assert done.manifest.world.episodes == 4
+    assert "took all 4 layouts" in " ".join(stopped(read(done.out)))
     one = small.of_episodes(frozenset(small.episodes[:1]))
     done = run(until(spec_of(one, "constant", **ALONE), Until(width=0.1)), tmp_path / "one")
-    [said] = looked_at(read(done.out))
+    [said] = stopped(read(done.out))
     assert said.startswith("It took the only layout, and still")
     assert "It was looked at 1 time: " in said
 
@@ -186,7 +189,7 @@ def test_a_run_stopped_by_force_goes_on_and_is_the_same(small: Dataset, tmp_path
 
 def test_a_driven_run_stops_as_well(tmp_path: Path) -> None:
     spec = live_spec_of("constant", 4, points=(POINTS["single-local"],), seeds=(0,))
-    spec = replace(spec, source=replace(spec.source, until=Until(width=0.999)))
+    spec = replace(spec, stopping_rule=Until(width=0.999))
     done = run(spec, tmp_path / "run")
     assert done.manifest.world.episodes == 2
     assert "--episodes 4" in done.manifest.command
@@ -200,8 +203,10 @@ def test_a_run_stops_when_it_differs_from_another(small: Dataset, tmp_path: Path
     against = Until(against=read(tmp_path / "base"), folder=tmp_path / "base")
     done = run(until(spec_of(small, "constant", **ALONE), against), tmp_path / "same")
     world = done.manifest.world
-    assert world.looks is not None
-    assert (world.looks.against, world.looks.enough, world.episodes) == ("base", False, 4)
+    assert world.interim_looks is not None
+    assert world.interim_looks["against"] == "base"
+    assert done.manifest.interim_looks == InterimLooks(4, (2, 3, 4))
+    assert world.episodes == 4
     said = " ".join(of_pair(pair(tmp_path / "base", tmp_path / "same")))
     assert "B: It took all 4 layouts" in said
     assert "by an interval of every look" in said
@@ -212,9 +217,9 @@ def test_a_driven_run_is_held_against_one_of_the_same_scenes(tmp_path: Path) -> 
     spec = live_spec_of("constant", 2, points=(POINTS["single-local"],), seeds=(0,))
     run(spec, tmp_path / "base")
     against = Until(against=read(tmp_path / "base"), folder=tmp_path / "base")
-    assert replace(spec, source=replace(spec.source, until=against))
+    spec = replace(spec, stopping_rule=against)
     with pytest.raises(UserError, match="base is not of the same scenes"):
-        replace(spec, source=replace(spec.source, first_seed=1, until=against))
+        replace(spec, source=replace(spec.source, first_seed=1))
 
 
 @pytest.mark.parametrize(
@@ -233,6 +238,43 @@ def test_what_another_run_lacks_is_one_line(
     against = Until(against=read(tmp_path / "base"), folder=tmp_path / "base")
     with pytest.raises(UserError, match=says):
         until(spec_of(small, "constant", **{**ALONE, **spec}), against)
+
+
+@pytest.mark.parametrize(
+    ("forged", "says"),
+    [
+        (None, "summary.csv has success_rate 1.0 in single-local (any time), which its other"),
+        ({"at": []}, "looks: at no layouts, at more than all, or not in their order"),
+        ({"at": [3, 2]}, "looks: at no layouts, at more than all, or not in their order"),
+        ({"at": [2, 5]}, "looks: at no layouts, at more than all, or not in their order"),
+        ({"at": [2, 3]}, "looks: the last is not at all 2 layouts"),
+        ({"width": None}, "looks: neither a width nor a run to differ from"),
+        ({"width": "x"}, "got `str`"),
+    ],
+)
+def test_a_forged_look_is_named(
+    forged: dict[str, object] | None, says: str, small: Dataset, tmp_path: Path, harness: Typed
+) -> None:
+    run(until(spec_of(small, "constant", **ALONE), Until(width=0.999)), tmp_path / "run")
+    stated = json.loads((tmp_path / "run/run.json").read_text())
+    looks = stated["world"].pop("looks")
+    if forged:
+        stated["world"]["looks"] = looks | forged
+    (tmp_path / "run/run.json").write_text(json.dumps(stated))
+    code, out, err = harness("run", "check", tmp_path / "run")
+    assert code == (2 if forged else 1)
+    assert says in " ".join((out + err).split())
+
+
+def test_a_finished_run_is_taken_for_no_run_by_another_rule(small: Dataset, tmp_path: Path) -> None:
+    spec = until(spec_of(small, "constant", **ALONE), Until(width=0.999))
+    run(spec, tmp_path / "run")
+    assert finished(spec, tmp_path / "run").manifest.interim_looks == InterimLooks(4, (2,), True)
+    three = small.of_episodes(frozenset(small.episodes[:3]))
+    of_three = until(spec_of(three, "constant", **ALONE), Until(width=0.999))
+    for other in (replace(spec, stopping_rule=Until(width=0.9)), of_three):
+        with pytest.raises(UserError, match="was begun with"):
+            finished(other, tmp_path / "run")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ look where it stops. *Fixed*: at all looks, by the interval for a number of layo
 *Layouts*: the median after which runs stop. *Planned*: what the same width, or a power of 80 %,
 needs without looking.
 
-    python benchmarks/looks.py [--runs 1000] [--layouts 1000] [--seed 0] [--only TEXT]
+    python benchmarks/interim_looks.py [--runs 1000] [--layouts 1000] [--seed 0] [--only TEXT]
 """
 
 import argparse
@@ -21,7 +21,7 @@ from plan import KNOWN, Outcomes, Study, balanced, plain, spread_of
 
 from harness.core.arrays import Bools
 from harness.core.statistics import Estimate, wilson
-from harness.evaluate.looks import looks
+from harness.extensions.early_stop.rule import RULE, any_time_mean, interim_looks
 from harness.runs.success import Success
 
 SMALLEST = "--runs 2 --layouts 40"
@@ -81,7 +81,7 @@ def rate(truth: str, rates: tuple[float, ...], seeds: int, alike: float) -> Case
         truth,
         float(np.mean(rates)),
         study,
-        lambda o: o[0].any_time(o[1]),
+        lambda o: any_time_mean(o[0], o[1]),
         lambda o: o[0].estimate(o[1]),
         planned,
         decided=False,
@@ -98,7 +98,7 @@ def gain(truth: str, value: float, study: Study) -> Case:
         truth,
         value,
         study,
-        lambda o: o[0].any_time_difference(o[2], o[1]),
+        lambda o: RULE.difference(o[0], o[2], o[1]),
         lambda o: o[0].difference(o[2], o[1]),
         planned,
         decided=True,
@@ -138,9 +138,10 @@ def measure(case: Case, layouts: int, runs: int, seed: int) -> Cell:
     rng = np.random.default_rng((seed, *case.truth.encode()))
     planned = case.planned(case.study(rng, KNOWN))
     every, stop, fixed, after = 0, 0, 0, []
+    planned_looks = interim_looks(layouts)
     for _ in range(runs):
         success, a, b = case.study(rng, layouts)
-        prefixes = [(Success(success.dangerous[:n]), a[:, :n], b[:, :n]) for n in looks(layouts)]
+        prefixes = [(Success(success.dangerous[:n]), a[:, :n], b[:, :n]) for n in planned_looks]
         spans = [case.any_time(prefix) for prefix in prefixes]
         holds = [_holds(span, case.value) for span in spans]
         ends = [n for n, span in enumerate(spans) if _enough(case, span)]
@@ -148,7 +149,7 @@ def measure(case: Case, layouts: int, runs: int, seed: int) -> Cell:
         every += all(holds)
         stop += holds[last]
         fixed += all(_holds(case.fixed(prefix), case.value) for prefix in prefixes)
-        after.append(looks(layouts)[last])
+        after.append(planned_looks[last])
     share_every, share_stop, share_fixed = (
         (k / runs, *wilson(k / runs, runs)) for k in (every, stop, fixed)
     )
@@ -176,8 +177,9 @@ def main() -> None:
     arguments.add_argument("--seed", type=int, default=0)
     arguments.add_argument("--only", default="", help="only truths whose name holds this text")
     given = arguments.parse_args()
+    looks = len(interim_looks(given.layouts))
     print(
-        f"{given.runs} runs of {given.layouts} layouts at most, {len(looks(given.layouts))} looks; "
+        f"{given.runs} runs of {given.layouts} layouts at most, {looks} looks; "
         f"they stop at a width of {100 * WIDTH:g} points, gains where they are decided"
     )
     heads = ("every look", "stop", "fixed", "layouts", "stopped", "planned")

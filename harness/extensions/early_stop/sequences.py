@@ -11,7 +11,7 @@ Of paired differences: the interval of `statistics.paired_difference`, as much w
 mixture of Robbins is (Waudby-Smith and others 2024, Time-uniform central limit theory and
 asymptotic confidence sequences, Ann. Stat. 52(6)). It is half as wide as by bets where parts are
 averaged, and holds for many episodes, not for any number. How often runs that stop hold the truth
-is simulated by `benchmarks/looks.py`.
+is simulated by `benchmarks/interim_looks.py`.
 """
 
 import math

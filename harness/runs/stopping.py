@@ -1,0 +1,128 @@
+"""What may stop a run before its last layout, after interim looks at what it has so far.
+
+An extension that ships adds a rule by `adds={"stopping_rules": {LOOKS: "module:RULE"}}`.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from harness.core.arrays import Floats
+from harness.core.errors import UserError
+from harness.core.extensions import owner_of_plugin, part_of
+from harness.core.plugins import Shipped
+from harness.runs.formats import LOOKS
+
+if TYPE_CHECKING:
+    from harness.core.statistics import Estimate
+    from harness.runs.metrics import Grid
+    from harness.runs.records import Episode, Score
+    from harness.runs.success import Success
+
+
+@dataclass(frozen=True)
+class InterimLooks:
+    """Hold after how many of its layouts a run was looked at, and whether it stopped by that."""
+
+    layouts: int  # how many there were to evaluate
+    at: tuple[int, ...] = ()  # ascending; empty while the run goes on
+    is_enough: bool = False  # whether the last look was enough
+
+
+class StoppingRule(ABC):
+    """Says when a run has enough layouts, which come in a fixed order; frozen.
+
+    The object that is registered has opened no files: it makes those that have (`opened`), and
+    reads what runs state.
+    """
+
+    chosen_by: ClassVar[tuple[str, ...]]  # the settings of its extension that choose it
+    interval: ClassVar[str]  # what the intervals of `difference` are, for people
+
+    @property
+    def options(self) -> str:
+        """Return what is typed to choose this rule, for people."""
+        return " and ".join(f"--{name.replace('_', '-')}" for name in self.settings())
+
+    @abstractmethod
+    def opened(self, settings: Mapping[str, Any]) -> "StoppingRule | None":
+        """Return the rule that a run's settings of extensions, by name, choose; None for none.
+
+        Raises UserError for a value that is not allowed.
+        """
+
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """Return the settings of `chosen_by` that choose this rule, values by name."""
+
+    @abstractmethod
+    def check(self, run: Any) -> None:
+        """Raise UserError if a run, a `Spec`, cannot be stopped by this rule."""
+
+    @abstractmethod
+    def planned_looks(self, layouts: int) -> Sequence[int]:
+        """Return after how many of a run's layouts it looks, ascending; the last is all."""
+
+    @abstractmethod
+    def enough(self, grid: "Grid", episodes: "Sequence[Episode]") -> bool:
+        """Return whether a run may stop, by the episodes so far, in the order of the grid."""
+
+    @abstractmethod
+    def record(self, looks: InterimLooks) -> dict[str, Any]:
+        """Return what a run states of this rule and of its looks, as plain values."""
+
+    @abstractmethod
+    def looks(self, record: Mapping[str, Any]) -> InterimLooks:
+        """Return the looks of a run that has ended, as it states them.
+
+        Raises ValueError if it states none that can be.
+        """
+
+    @abstractmethod
+    def sentence(self, record: Mapping[str, Any]) -> str:
+        """Return when a run that states this was looked at, and which of its intervals hold."""
+
+    @abstractmethod
+    def scores(self, grid: "Grid", episodes: "Sequence[Episode]") -> "Iterator[Score]":
+        """Yield the further scores of a run that may stop, by intervals that hold at every look.
+
+        `episodes` are in the order of the grid.
+        """
+
+    @abstractmethod
+    def difference(self, success: "Success", a: Floats, b: Floats) -> "Estimate":
+        """Return success a - b, both (S, E), by an interval that holds at every look.
+
+        The axes are S channel seeds and E episodes, by which it is paired.
+        """
+
+
+STOPPING_RULES = Shipped[StoppingRule]("swarmdrive.stopping_rules", StoppingRule, {})
+
+
+def chosen(settings: Mapping[str, Any]) -> StoppingRule | None:
+    """Return the rule that a run's settings of extensions choose; None for a run of all layouts."""
+    for each in STOPPING_RULES.values():
+        if opened := each.opened(settings):
+            return opened
+    return None
+
+
+def without(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of extensions without those that choose a rule."""
+    choosing = {name for each in STOPPING_RULES.values() for name in each.chosen_by}
+    return {name: value for name, value in settings.items() if name not in choosing}
+
+
+def rule_of(record: Any) -> StoppingRule | None:
+    """Return what reads the looks that a run states of its scenes; None for a run without looks.
+
+    Raises UserError if its extension is gone.
+    """
+    if record is None:
+        return None
+    if LOOKS in STOPPING_RULES:
+        return STOPPING_RULES[LOOKS]
+    owner = owner_of_plugin("stopping_rules", LOOKS) or LOOKS
+    raise UserError(f"what may stop a run, {LOOKS} in its run.json, is {part_of(owner)}")
