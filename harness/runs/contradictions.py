@@ -87,6 +87,9 @@ def contradictions(run: Run) -> Iterator[str]:
     delays = filter(None, map(run.undeclared_delay, answers))
     if (delay := next(delays, None)) is not None:
         yield f"answers.jsonl has {delay}"
+    record = run.manifest.world.interim_looks
+    if record is not None and current(run) and (rule := run.manifest.stopping_rule):
+        yield from rule.contradictions(record, run.grid, run.episodes)
     yield from _of_scores(run, _scores(run))
 
 

@@ -80,6 +80,15 @@ class StoppingRule(ABC):
         """
 
     @abstractmethod
+    def contradictions(
+        self, record: Mapping[str, Any], grid: "Grid", episodes: "Sequence[Episode]"
+    ) -> Iterator[str]:
+        """Yield what a run states of its last look, and its episodes contradict.
+
+        `episodes` are all of the run, in the order of the grid.
+        """
+
+    @abstractmethod
     def sentence(self, record: Mapping[str, Any]) -> str:
         """Return when a run that states this was looked at, and which of its intervals hold."""
 

@@ -154,6 +154,18 @@ class Until(StoppingRule):
             raise ValueError("looks: neither a width nor a run to differ from")
         return InterimLooks(looks.layouts, looks.at, looks.enough)
 
+    def contradictions(
+        self, record: Mapping[str, Any], grid: Grid, episodes: Sequence[Episode]
+    ) -> Iterator[str]:
+        looks = msgspec.convert(record, LooksRecord)
+        if looks.width is None:
+            return
+        if (is_enough := Until(looks.width).enough(grid, episodes)) != looks.enough:
+            yield (
+                f"run.json has looks.enough {looks.enough} at a width of {100 * looks.width:g} "
+                f"points, and by its episodes it is {is_enough}"
+            )
+
     def sentence(self, record: Mapping[str, Any]) -> str:
         looks = msgspec.convert(record, LooksRecord)
         what = f"success differs from that of {printable(looks.against, 40)}"

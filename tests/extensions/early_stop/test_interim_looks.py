@@ -244,6 +244,11 @@ def test_what_another_run_lacks_is_one_line(
     ("forged", "says"),
     [
         (None, "summary.csv has success_rate 1.0 in single-local (any time), which its other"),
+        (
+            {"width": 0.5},
+            "has looks.enough True at a width of 50 points, and by its episodes it is",
+        ),
+        ({"enough": False}, "run.json has looks.enough False at a width of 99.9 points"),
         ({"at": []}, "looks: at no layouts, at more than all, or not in their order"),
         ({"at": [3, 2]}, "looks: at no layouts, at more than all, or not in their order"),
         ({"at": [2, 5]}, "looks: at no layouts, at more than all, or not in their order"),
@@ -262,7 +267,7 @@ def test_a_forged_look_is_named(
         stated["world"]["looks"] = looks | forged
     (tmp_path / "run/run.json").write_text(json.dumps(stated))
     code, out, err = harness("run", "check", tmp_path / "run")
-    assert code == (2 if forged else 1)
+    assert code == (2 if err else 1)
     assert says in " ".join((out + err).split())
 
 
