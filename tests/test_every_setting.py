@@ -77,8 +77,16 @@ RUNS = {
     "--image blank",
 }
 # whose settings they have
-for names, run in ({"devices"}, "device"), ({"controls", "trust"}, "counterparts"):
-    if not names <= extensions().keys():
+OF_EXTENSIONS = {
+    "device": ("devices",),
+    "counterparts": ("controls", "trust"),
+    "narrow": ("early_stop",),
+    "decided": ("early_stop",),
+    "driven until narrow": ("early_stop",),
+    "driven until decided": ("early_stop",),
+}
+for run, names in OF_EXTENSIONS.items():
+    if not {*names} <= extensions().keys():
         del RUNS[run]
 NEEDS = {"engine": "torch", "picture": "llama_cpp"}
 SCENARIO = "occluded-intersection:limits=1,perception=1,witnesses=any,radio_share=0.0"
@@ -131,7 +139,7 @@ def test_each_setting_is_typed_in_some_run() -> None:
 
 # What is driven is until it is narrow or decided as what is frozen is.
 RARE = (*NEEDS, "driven until narrow", "driven until decided")
-MARKS = {**dict.fromkeys(RUNS, pytest.mark.slow), **dict.fromkeys(RARE, pytest.mark.exhaustive)}
+MARKS = {run: pytest.mark.exhaustive if run in RARE else pytest.mark.slow for run in RUNS}
 
 
 @pytest.mark.parametrize("run", [pytest.param(run, marks=mark) for run, mark in MARKS.items()])
