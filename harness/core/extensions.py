@@ -7,7 +7,7 @@ their commands: without the folder all else works, and says what a command was p
 
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
 from keyword import iskeyword
@@ -62,28 +62,25 @@ class Setting:
     It is an option of `harness eval` and `harness drive`.
 
     A setting of the kind `tuple` holds texts: its option may be repeated, and its default is ().
-    `help` is a sentence for people. `behind` names the setting of the core after which files and
-    help list this one, as `latency` or `world.limit`; empty for a table of their own. `only` names
-    the world that alone has the option, `frozen` or `closed-loop`; empty for both.
+    `help` is a sentence for people. `behind` names settings, each with its table, such as
+    `world.limit`: files and help list this one after the first of them that the world of a run has,
+    and in its table. It is empty for a table of their own. `only` names the world that alone has
+    the option, `frozen` or `closed-loop`; empty for both.
     """
 
     kind: type  # str, int, float, bool or tuple, for texts
-    default: str | int | float | bool | tuple[()]
+    # None, which nobody can type, only with `behind`
+    default: str | int | float | bool | tuple[()] | None
     help: str  # a sentence for people
-    # of one that ships: the setting of the core behind which files and help have it, null where it
-    # has its default. Empty for the table of all that extensions add
-    behind: str = ""
+    # of one that ships: settings of the core, and of extensions, behind the first of which files
+    # and help have it. Empty for the table of all that extensions add
+    behind: tuple[str, ...] = ()
     only: str = ""  # the world that alone has its option: `frozen` or `closed-loop`; empty for both
 
     @property
-    def unset(self) -> tuple[()] | None:
-        """Return what files have of one behind another where nobody sets it: None or no texts."""
-        return () if self.kind is tuple else None
-
-    @property
     def table(self) -> str:
-        """Return the table of files that it stands in by `behind`; empty for the outer one."""
-        return self.behind.rpartition(".")[0]
+        """The table of files in which it stands behind another; empty for none."""
+        return self.behind[0].rpartition(".")[0] if self.behind else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +150,7 @@ def from_python(name: str) -> Any:
 
 
 class OfExtension(NamedTuple):
-    """Name the extension to which a setting of a condition belongs, by package metadata."""
+    """Name the extension to which a setting belongs, by package metadata."""
 
     extension: str
     idle: str  # the value that does nothing, as text; empty for none
@@ -165,10 +162,7 @@ def setting_of_extension(name: str) -> OfExtension | None:
     `name` is the setting's; it is looked up in package metadata.
     """
     entry = entries(SETTINGS).get(name)
-    if entry is None:
-        return None
-    package, _, idle = str(entry.value).partition(" ")
-    return OfExtension(package.rpartition(".")[2], idle.strip("[]"))
+    return _of_entry(entry) if entry else None
 
 
 def beside() -> dict[str, Setting]:
@@ -184,13 +178,45 @@ def beside() -> dict[str, Setting]:
     return settings
 
 
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names of settings of the core with those that extensions add behind them.
+
+    A name has its table before it, such as `world.limit`. What stands behind none of them is left
+    out.
+    """
+    core, order, followers = list(names), list[str](), dict[str, list[str]]()
+    others = {f"{each.table}.{name}".lstrip("."): each for name, each in beside().items()}
+    for name, setting in others.items():
+        places = [place for place in setting.behind if place in {*core, *others}]
+        followers.setdefault(next(iter(places), ""), []).append(name)
+    for name in core:
+        order += _followed(name, followers)
+    return order
+
+
+def _followed(name: str, followers: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield a name, and all that follow it."""
+    yield name
+    for each in followers.get(name, ()):
+        yield from _followed(each, followers)
+
+
 def owner_of_plugin(kind: str, name: str) -> str | None:
     """Return the extension that adds the plug-in `name` of a kind such as `contents`, or None.
 
     It is read from package metadata, so it is known even if the extension is missing.
     """
     entry = entries(PLUG_INS).get(f"{kind} {name}")
-    return _extension_of(entry) if entry else None
+    return _of_entry(entry).extension if entry else None
+
+
+def setting_of_run(name: str) -> OfExtension | None:
+    """Return the extension that adds a setting of runs by a name without its table, or None.
+
+    It is read from package metadata, with the value that does nothing where that is not null.
+    """
+    entry = entries(PLUG_INS).get(f"settings {name}")
+    return _of_entry(entry) if entry else None
 
 
 def control_settings() -> dict[str, str]:
@@ -205,6 +231,12 @@ def control_settings() -> dict[str, str]:
 def part_of(extension: str) -> str:
     """Return the phrase, for messages, that something is part of an extension not installed."""
     return f"part of the extension {printable(extension)}, which is not installed"
+
+
+def _of_entry(entry: Any) -> OfExtension:
+    """Return what an entry of the metadata names by its package and, in brackets, a value."""
+    package, _, idle = str(entry.value).partition(" ")
+    return OfExtension(package.rpartition(".")[2], idle.strip("[]"))
 
 
 def _extension_of(entry: Any) -> str:
@@ -355,7 +387,11 @@ def _is_setting(name: Any, setting: Any) -> bool:
         and name != "help"  # which every command has
         and isinstance(setting, Setting)
         and setting.kind in (str, int, float, bool, tuple)
-        and type(setting.default) is setting.kind
+        and isinstance(setting.behind, tuple)
+        and (
+            type(setting.default) is setting.kind
+            or (setting.default is None and bool(setting.behind))
+        )
         and (setting.kind is not tuple or not setting.default)
         and setting.only in ("", "frozen", "closed-loop")
         and (not isinstance(setting.default, float) or isfinite(setting.default))

@@ -14,13 +14,14 @@ from typing import Any, NamedTuple
 
 from harness.core import extensions
 from harness.core.errors import UserError, printable
-from harness.core.extensions import owner_of_plugin, part_of
+from harness.core.extensions import part_of
 from harness.world.families import FAMILIES
 
 NUMBER = 2
 EXTENSIONS = "extensions"  # the table of settings that extensions add
 LOOKS = "looks"  # in `world`: what a rule that may stop the run states of its interim looks
 NO_TEXTS: tuple[Any, ...] = ([], ())  # of a setting of texts that nobody sets
+WORLD = "world"  # the table of settings that choose a run's scenes, which it states itself
 UNSET = "unset"  # stands for `msgspec.UNSET`: a folder is listed without loading msgspec
 FORMAT = f"swarmdrive-run/{NUMBER}"
 # Older formats, and the version of the harness that reads each.
@@ -204,12 +205,12 @@ def upgraded(record: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(calibrations := record.get("calibrations"), dict) and "kept" not in record:
         record = {**record, "kept": {"calibrations": calibrations} if calibrations else {}}
     if "beside" not in record:
-        names_beside = extensions.beside()
+        names_beside = [name for name, each in extensions.beside().items() if not each.table]
         opened = {name: record[name] for name in names_beside if record.get(name) is not None}
         others = {name: value for name, value in record.items() if name not in names_beside}
         record = {**_without_gone(others), "beside": opened}
     if isinstance(table := record.get("settings"), Mapping):
-        record = {**record, "settings": gathered(table)}
+        record = {**record, "settings": gathered(table, of_run=True)}
     older = {key: SETTINGS[name].absent for key, name in BESIDE.items() if name in SETTINGS}
     settings = _agent(_with(MANIFEST, {**older, **record}))
     if isinstance(model := settings.get("identity"), dict):
@@ -226,53 +227,64 @@ def upgraded(record: Mapping[str, Any]) -> dict[str, Any]:
             world = settings["world"]
             driven = {**world["scenario"], "name": scenarios.split(name)[0]}
             settings["world"] = {**world, "scenario": driven}
-    settings["settings"] = _table(settings)
+    settings["settings"] = _table(settings, table)
     return settings
 
 
-def gathered(settings: Mapping[str, Any]) -> dict[str, Any]:
+def gathered(settings: Mapping[str, Any], of_run: bool = False) -> dict[str, Any]:
     """Return a table of settings as this version holds it: those of extensions in a table
     `extensions`.
 
-    In files some of them stand beside the settings of the core; of these, null ones are left out,
-    and of all of them lists without texts. Raises UserError for one of an extension that is not
-    installed.
+    In files some of them stand among the settings of the core, or of one of its tables; of these,
+    such as nobody set are left out, and of all of them lists without texts. Raises UserError for
+    one of an extension that is not installed. Of a run's settings, `of_run`, those of its scenes
+    may be: the run states these itself.
     """
-    entries, table = _parted(settings, "")
-    for name, value in table.items():
-        if isinstance(value, Mapping) and name != EXTENSIONS:
-            inner_entries, table[name] = _parted(value, name)
-            entries |= inner_entries
-    inner = table.get(EXTENSIONS, {})
-    if isinstance(inner, Mapping):
-        both = {**inner, **entries}
-        inner = {name: value for name, value in both.items() if value not in NO_TEXTS}
-    return {**table, EXTENSIONS: inner}
+    beside, entries = extensions.beside(), {}
+    tables = {name: value for name, value in settings.items() if isinstance(value, Mapping)}
+    for name, setting in beside.items():
+        place = tables.get(setting.table, {}) if setting.table else settings
+        if place.get(name) is not None:
+            entries[name] = place[name]
+    table = _without_gone(_without(settings, ""))
+    for name, inner in tables.items():
+        if name != EXTENSIONS:
+            table[name] = _without_gone(_without(inner, name), of_run and name == WORLD)
+    by_name = table.get(EXTENSIONS, {})
+    if isinstance(by_name, Mapping):
+        unset = [(name, setting.default) for name, setting in beside.items()]
+        by_name = {
+            each: value
+            for each, value in {**by_name, **entries}.items()
+            if value not in NO_TEXTS and (each, value) not in unset
+        }
+    return {**table, EXTENSIONS: by_name}
 
 
-def _parted(table: Mapping[str, Any], name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the settings of extensions that have a value in a table of files, and all else of it.
-
-    `name` is that of the table; empty for the outer one, which has the others.
-    """
-    here = [key for key, setting in extensions.beside().items() if setting.table == name]
-    entries = {key: table[key] for key in here if table.get(key) is not None}
-    others = {key: value for key, value in table.items() if key not in here}
-    return entries, _without_gone(others)
+def _without(table: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the table of this name without the settings of extensions that stand in it."""
+    beside = extensions.beside()
+    others = {key for key, setting in beside.items() if setting.table == name}
+    return {key: value for key, value in table.items() if key not in others}
 
 
-def _without_gone(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table without settings whose extension is not installed, where they are unset.
+def _without_gone(table: Mapping[str, Any], of_scenes: bool = False) -> dict[str, Any]:
+    """Return a table without settings whose extension is not installed.
 
-    Raises UserError for one that has a value.
+    Raises UserError for one that does something, but not of those `of_scenes` of a run.
     """
     kept = {}
     for name, value in table.items():
-        owner = owner_of_plugin("settings", name)
-        if owner is None or owner in extensions.extensions():
+        owner = extensions.setting_of_run(name)
+        if owner is None or owner.extension in extensions.extensions():
             kept[name] = value
-        elif value is not None and value not in NO_TEXTS:
-            raise UserError(f"setting {name} is {part_of(owner)}")
+        elif (
+            not of_scenes
+            and value is not None
+            and value not in NO_TEXTS
+            and str(value) != owner.idle
+        ):
+            raise UserError(f"setting {name} is {part_of(owner.extension)}")
     return kept
 
 
@@ -296,44 +308,48 @@ def settings_as_file(settings: Mapping[str, Any]) -> dict[str, Any]:
     There, settings of extensions stand behind those of the core, where their extension says so.
     """
     of_extensions, beside = settings[EXTENSIONS], extensions.beside()
-    table = _filled(settings, of_extensions)
+    table = _in_order(settings, of_extensions, "")
+    for name, inner in settings.items():
+        if isinstance(inner, Mapping):
+            table[name] = _in_order(inner, of_extensions, f"{name}.")
     table[EXTENSIONS] = {name: value for name, value in of_extensions.items() if name not in beside}
     return table
 
 
-def _filled(table: Mapping[str, Any], values: Mapping[str, Any], outer: str = "") -> dict[str, Any]:
-    """Return a table of settings, and those in it, with extensions' settings behind the core's."""
-    filled: dict[str, Any] = {}
-    for name, value in table.items():
-        is_table = isinstance(value, Mapping) and name != EXTENSIONS
-        filled[name] = _filled(value, values, f"{name}.") if is_table else value
-        filled |= _behind(outer + name, values)
-    return filled
+def _in_order(
+    table: Mapping[str, Any], of_extensions: Mapping[str, Any], prefix: str
+) -> dict[str, Any]:
+    """Return a table with the settings of extensions that stand in it; `prefix` is its name."""
+    beside, full = extensions.beside(), {}
+    for path in extensions.in_order(f"{prefix}{name}" for name in table):
+        name = path.removeprefix(prefix)
+        is_added = name not in table
+        full[name] = of_extensions.get(name, beside[name].default) if is_added else table[name]
+    return full
 
 
 def _behind(name: str | None, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of extensions' settings that stand behind one of the core, unset ones too."""
-    return {
-        each: values.get(each, setting.unset)
-        for each, setting in extensions.beside().items()
-        if setting.behind == name
-    }
+    """Return those of extensions' settings that stand behind one of the core, null if not set."""
+    return {each: values.get(each) for each in extensions.in_order([name])[1:]} if name else {}
 
 
-def _table(record: Mapping[str, Any]) -> Any:
+def _table(record: Mapping[str, Any], in_file: Any) -> Any:
     """Return the table of settings; of an older run, which has none,
     it is made of what stands beside it.
 
-    Raises ValueError if it says otherwise than what stands beside it.
+    Raises ValueError if it, or the table as the file has it, `in_file`, says otherwise than what
+    stands beside it.
     """
     beside = {name: record[key] for key, name in BESIDE.items() if key in record}
     # which the reader finds, and names
     with suppress(KeyError, TypeError, AttributeError, IndexError):
         beside |= _opened(record)
-    table = record.get("settings", beside)
+    table = record["settings"] if "settings" in record else gathered(beside, of_run=True)
     if not isinstance(table, Mapping):
         return table  # for the reader to refuse
     flat = _flat(table)
+    if isinstance(in_file, Mapping):
+        flat = {**_flat(in_file), **flat}
     card = record.get("model")
     places = [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
     for name, there in _flat(beside).items():

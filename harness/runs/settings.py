@@ -348,7 +348,7 @@ class Option(NamedTuple):
     listed: bool  # whether it may be typed several times, which are joined by commas
     same: str  # what of it is the same when a stopped run resumes
     compared: bool  # whether a comparison of two runs tells it
-    unset: Any = None  # of one that an extension adds: its value where nobody sets it
+    is_added: bool = False  # whether an extension adds it
 
     @property
     def flag(self) -> str:
@@ -360,9 +360,8 @@ class Option(NamedTuple):
         return "--no-" + self.name.replace("_", "-")
 
     def of(self, settings: Any) -> Any:
-        if self.unset is not None:
-            value = settings.extensions.get(self.name, self.unset)
-            return self.default if value == self.unset else value
+        if self.is_added:
+            return settings.extensions.get(self.name, self.default)
         for name in self.path:
             settings = getattr(settings, name)
         return settings
@@ -380,27 +379,28 @@ def options(world: type[Struct]) -> list[Option]:
 
     Those of extensions that stand behind one of the core follow it.
     """
-    declared, last = list[Option](), list[Option]()
-    beside, kind = extensions.beside(), str(world.__struct_config__.tag)
-    for each in core_options(world):
-        declared.append(each)
-        for name, setting in beside.items():
-            if setting.behind == ".".join(each.path) and setting.only in ("", kind):
-                path = (*each.path[:-1], name)
-                declared.append(_added(name, setting, path, setting.unset))
+    by_path = {".".join(each.path): each for each in core_options(world)}
+    declared, last, kind = list[Option](), list[Option](), str(world.__struct_config__.tag)
+    beside = extensions.beside()
+    for path in extensions.in_order(by_path):
+        *table, name = path.split(".")
+        if path in by_path:
+            declared.append(by_path[path])
+        elif beside[name].only in ("", kind):
+            declared.append(_added(name, beside[name], (*table, name)))
     for name, setting in of_extensions().items():
         if name not in beside and setting.only in ("", kind):
-            last.append(_added(name, setting, (EXTENSIONS, name), setting.default))
+            last.append(_added(name, setting, (EXTENSIONS, name)))
     return [*declared, *last]
 
 
-def _added(name: str, setting: Setting, path: tuple[str, ...], default: Any) -> Option:
+def _added(name: str, setting: Setting, path: tuple[str, ...]) -> Option:
     """Return the option of a setting that an extension adds, below the extension's name."""
     owners = extensions.extensions().values()
     panel = next(f"Extension {owner.name}" for owner in owners if name in owner.settings)
     kind = list[str] if setting.kind is tuple else setting.kind
-    shape = (kind, default, setting.help, panel)
-    return Option(path, name, *shape, False, ITSELF, True, unset=setting.default)
+    shape = (kind, setting.default, setting.help, panel)
+    return Option(path, name, *shape, False, ITSELF, True, is_added=True)
 
 
 def core_options(world: type[Struct]) -> list[Option]:
@@ -662,14 +662,21 @@ def _say_otherwise(settings: Settings, file: Path, given: Mapping[str, Any]) -> 
 
 
 def check_extensions(settings: Settings, where: str) -> None:
-    """Raise UserError if a file sets what no extension has, or to another kind of value."""
+    """Raise UserError if a file sets what no extension has, or to another kind of value.
+
+    So does one that its command does not have.
+    """
     known_settings = of_extensions()
+    names = {each.name for each in options(type(settings.world)) if each.is_added}
     for name, value in settings.extensions.items():
         if name not in known_settings:
             raise UserError(
                 f"{where}: {printable(name)} is a setting of an extension that is not installed; "
                 "install that, or leave the setting out"
             )
+        if name not in names:
+            command = f"harness {COMMANDS[kind_of(settings)]}"
+            raise UserError(f"{where}: {name} is no setting of `{command}`; leave it out")
         kind = known_settings[name].kind
         if type(value) is not kind and not (kind is float and type(value) is int):
             allowed = "a list of texts" if kind is tuple else kind.__name__

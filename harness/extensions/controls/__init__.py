@@ -13,7 +13,7 @@ EXTENSION = Extension(
             "Beside each condition with a channel, also score a control. shuffled-messages: the "
             "ego hears the helpers of another layout. no-messages: every message is lost. blind: "
             "the helpers see nothing. Repeatable.",
-            behind="condition",
+            behind=("condition",),
             only="frozen",
         )
     },

@@ -17,17 +17,17 @@ EXTENSION = Extension(
     settings={
         "device_profile": Setting(
             str,
-            "",
+            None,
             "Computer in every vehicle, such as agx-orin (`harness model device list`). It times "
             "each answer by its tokens; use it instead of --latency.",
-            behind="latency",
+            behind=("latency",),
         ),
         "device_model": Setting(
             str,
-            "",
+            None,
             "With --device-profile: model whose row of the profile times all answers. Default: "
             "the model that gave the answer.",
-            behind="latency",
+            behind=("latency",),
         ),
     },
     adds={

@@ -17,7 +17,7 @@ EXTENSION = Extension(
             "Beside each condition with a channel, also score it under attack: liar:share=1/3 "
             "makes a third of the helpers lie; liar+spoof combines two attacks. `harness study "
             "trust --help` lists them. Repeatable.",
-            behind="condition",
+            behind=("condition",),
         )
     },
     adds={
