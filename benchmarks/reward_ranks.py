@@ -74,7 +74,7 @@ def of_model(model: str, data: Dataset) -> Policy:
     }
     stated = settings.changed(settings.Settings(world=settings.FrozenSettings()), how)
     assert isinstance(stated.world, settings.FrozenSettings)
-    spec = resolve.spec(stated, resolve.frozen(stated.world, stated.world.dataset))
+    spec = resolve.spec(stated, resolve.frozen(stated, stated.world.dataset))
     models = open_each(spec.cards, lambda card: open_backend(card, batch_size=32))
     backend = together(spec.cards, models)
     taken_as = latency.chosen_latency("paper", (spec.ego,), models)

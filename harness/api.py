@@ -275,9 +275,9 @@ def run(
     settings.check_extensions(run_settings, "settings")
     source: Source
     if isinstance(run_settings.world, settings.FrozenSettings):
-        source = resolve.frozen(run_settings.world, run_settings.world.dataset)
+        source = resolve.frozen(run_settings, run_settings.world.dataset)
     else:
-        source = resolve.driven(run_settings.world)
+        source = resolve.driven(run_settings)
     spec = resolve.spec(run_settings, source)
     folder = default_out(spec) if out is None else Path(out)
     run_follows, kept = follows(of_command), default_file() if cache else None

@@ -19,7 +19,6 @@ from harness.core.progress import Progress
 from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene, Trees
 from harness.dataset.schema import Branching, Edge, End
-from harness.dataset.select import Selection
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -56,7 +55,7 @@ def spec_of(
     options = {"points": tuple(POINTS.values()), "seeds": (0, 1), **options}
     asked = {name: options.pop(name) for name in ("answer", "thinking") if name in options}
     ego = Agent(cards.resolve(model), prompts.load(prompt), **asked)
-    return made(ego, FrozenSource(dataset, Selection(limit)), **options)
+    return made(ego, FrozenSource(dataset, limit), **options)
 
 
 def made(ego: Agent, source: Source, **options: Any) -> Spec:

@@ -17,7 +17,6 @@ from harness.backends.registry import open_backend
 from harness.coordination.operating_point import named_point
 from harness.core.errors import UserError
 from harness.dataset import load
-from harness.dataset.select import Selection
 from harness.evaluate import run
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
@@ -49,10 +48,7 @@ def spec(source: Source, ask: str, names: tuple[str, ...] = POINTS, model: str =
 
 
 def frozen(episodes: int = 8) -> FrozenSource:
-    selection = Selection(episodes, None, None, None, 0)
-    return FrozenSource(
-        selection.of(load.load(load.find("occluded-intersection-v2"), episodes)), selection
-    )
+    return FrozenSource(load.load(load.find("occluded-intersection-v2"), episodes), episodes)
 
 
 def tables(folder: Path) -> list[bytes]:

@@ -88,10 +88,6 @@ def one_line(said: Said) -> str:
         (["eval", "--seeds", "5"], 
             "--seeds 5: give 0:5 for seeds from 0 "
             "on, or 5:6 for seed 5 alone"),
-        (["eval", "--danger", "up"], "unknown --danger 'up'; known: left, none, oncoming, right"),
-        (["eval", "--only", "3:9999"], "--only 3:9999: give episodes from 0 to 3, such as 3,10:20"),
-        (["eval", "--sample", "201"], "--sample 201: give 1 to 4 episodes"),
-        (["eval", "--sample", "0"], "--sample 0: give 1 to 4 episodes"),
         (["eval", "--seeds", "1,1"], "--seeds [1, 1]: give one or more different whole numbers"),
         (["eval", "--seeds", "a,b"], "--seeds a,b: give a range"),
         (["eval", "--seeds", "0:99999999999999999999"], "of 1000 seeds at most"),

@@ -23,8 +23,9 @@ from harness.core.arrays import Floats
 from harness.core.covariate import LEAST, corrected, worth
 from harness.core.errors import UserError
 from harness.core.statistics import Estimate, rate_interval
+from harness.dataset import select
 from harness.dataset.load import find, load
-from harness.dataset.select import Selection
+from harness.dataset.select import Choice
 from harness.evaluate import frozen_world
 from harness.evaluate.frozen_world import FrozenSource
 from harness.report import words
@@ -260,8 +261,10 @@ def test_words_say_also_what_is_worse() -> None:
 def test_of_many_layouts_some_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those asked are among them, wherever they are drawn from."""
     monkeypatch.setattr(frozen_world, "MOST_KNOWN", 2)
-    selection = Selection(sample=ASKED)
-    source = FrozenSource(selection.of(load(find("occluded-intersection-v2"))), selection)
+    whole = load(find("occluded-intersection-v2"))
+    numbers = tuple(select.drawn(whole.episodes, ASKED, 0, len(whole.episodes)))
+    choice = Choice(numbers, whole.episodes, {"sample": ASKED, "sample_seed": 0})
+    source = FrozenSource(whole.of_episodes(numbers), None, choice)
     known = {layout.episode for layout in source.layouts(ASKED)}
     assert known == {*range(2 * ASKED), *source.dataset.episodes}
     assert not source.layouts(LEAST - 1)

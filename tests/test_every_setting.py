@@ -62,9 +62,9 @@ RUNS = {
     "device": "eval --model mine --dataset {two} --limit 1 --condition 6g --server {server} "
     "--device-profile agx-orin --device-model qwen3-4b",
     "driven": "drive --scenario {scenario} --condition single-local "
-    "--episodes 6 --first-seed 7 --sample "
-    "1 "
-    "--sample-seed 3 --seeds 3,7",
+    "--episodes 1 --first-seed 7 --seeds 3,7",
+    "driven selected": "drive --scenario {scenario} --condition single-local "
+    "--episodes 6 --sample 1 --sample-seed 3 --seeds 3,7",
     "driven until narrow": "drive --scenario {scenario} --episodes 1 --condition single-local "
     "--until-width 99",
     "driven until decided": "drive --scenario {scenario} --episodes 1 --condition single-local "
@@ -80,6 +80,8 @@ RUNS = {
 OF_EXTENSIONS = {
     "device": ("devices",),
     "counterparts": ("controls", "trust"),
+    "selected": ("selection",),
+    "driven selected": ("selection",),
     "narrow": ("early_stop",),
     "decided": ("early_stop",),
     "driven until narrow": ("early_stop",),

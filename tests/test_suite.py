@@ -198,7 +198,6 @@ def test_other_settings_do_not_go_on(evaluated: Harness) -> None:
         ),
         (("--prompt", "v2"), "--prompt v2 speaks of a crossing, which parking-exit is not; "),
         (("--latency", "measured"), "--latency measured: "),
-        (("--only", "3"), "--only 3: give episodes from 0 to 1, "),
     ],
 )
 def test_bad_input_is_one_line_before_anything_is_asked(

@@ -107,7 +107,7 @@ def command(
     if save_video:
         for drawer in VIDEOS:
             VIDEOS.ask(drawer, lambda videos: videos.ready())
-    source = resolve.driven(world, name)
+    source = resolve.driven(settings, name)
     driven = len(source.numbers)
     in_range("--save-video", save_video, 0, driven)
     if save_video and not VIDEOS:

@@ -63,7 +63,7 @@ def command(
 
     world: Any = settings.world
     named_suite = suites.named(world.dataset)
-    sources = [resolve.frozen(world, name) for name in suites.datasets(world.dataset)]
+    sources = [resolve.frozen(settings, name) for name in suites.datasets(world.dataset)]
     datasets = [source.dataset for source in sources]
     options.say_all(world.limit, datasets)
     specs = [resolve.spec(settings, source) for source in sources]
@@ -102,7 +102,7 @@ def command(
     if as_json:
         echo_json(as_mapping(read(done.out)))
     if not silent:
-        selected = bool(sources[0].selection.given)
+        selected = sources[0].choice is not None
         _show(done, walked(datasets[0], done), len(specs[0].seeds), selected)
         typer.echo(f"wrote {printable(page)}")
 

@@ -1,14 +1,19 @@
-"""Select the episodes of a dataset that are evaluated."""
+"""What chooses the episodes that a run uses, a kind, and draws of numbers.
+
+An extension that ships adds one by `adds={"selections": {NAME: "module:SELECTION"}}`.
+"""
 
 import platform
 import random
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import TypeVar
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
 
 from harness.core import noise
-from harness.core.errors import UserError, in_range, printable, unknown
-from harness.core.seeds import LAST_SEED
+from harness.core.errors import UserError, printable
+from harness.core.extensions import extensions, owner_of_plugin, part_of
+from harness.core.plugins import Shipped
 from harness.dataset.load import Dataset
 
 T = TypeVar("T")
@@ -16,61 +21,70 @@ NONE = "none"  # the `danger` of layouts without one
 
 
 @dataclass(frozen=True)
-class Selection:
-    """State which episodes of a dataset to evaluate; one must meet all conditions that are set.
+class Choice:
+    """State which episodes a run uses, where something chooses them."""
 
-    `limit` keeps the first so many of those left; `only` has numbers and ranges such as `3,10:20`,
-    without their ends; `danger` is a sector or `none`; `sample` draws so many by `sample_seed`.
-    None sets no condition.
-    """
+    numbers: tuple[int, ...]  # the episodes, ascending
+    pool: tuple[int, ...]  # those that they were drawn from, ascending
+    given: Mapping[str, Any]  # the settings that chose them, by name, as a run states them
 
-    limit: int | None = None  # keeps the first so many of those that the other conditions leave
-    only: str | None = None  # numbers and ranges such as `3,10:20`; a range leaves out its end
-    danger: str | None = None  # the sector that the hidden danger comes from, or `none`
-    # how many to draw; a larger sample with the same seed contains the smaller one
-    sample: int | None = None
-    sample_seed: int = 0  # seed of the draw
 
-    def __post_init__(self) -> None:
-        if self.limit is not None and self.limit < 1:
-            raise UserError(f"--limit {self.limit}: give 1 or more episodes")
-        in_range("--sample-seed", self.sample_seed, 0, LAST_SEED)
+class Selection(ABC):
+    """Chooses which episodes a run uses, by settings of its extension; frozen."""
 
-    @property
-    def given(self) -> dict[str, int | str]:
-        """The conditions that are set, except `limit`, by name."""
-        conditions = {key: value for key, value in asdict(self).items() if value is not None}
-        conditions.pop("limit", None)
-        if self.sample is None:
-            del conditions["sample_seed"]
-        return conditions
+    chosen_by: ClassVar[tuple[str, ...]]  # these settings
 
-    def of(self, dataset: Dataset) -> Dataset:
-        """Return the dataset restricted to the selected episodes.
+    @abstractmethod
+    def opened(self, settings: Mapping[str, Any]) -> "Selection | None":
+        """Return the selection that settings of extensions, by name, state; None for none.
 
-        Raises UserError if there are none, or the danger is unknown.
+        Others than `chosen_by` are ignored. Raises UserError for a value that is not allowed.
         """
-        numbers = list(dataset.episodes)
-        if self.only is not None:
-            chosen = _numbers(self.only, max(numbers) + 1)
-            numbers = [n for n in numbers if n in chosen]
-        if self.danger is not None:
-            sectors = tuple(dataset.scenario.road().sectors)
-            if self.danger not in (*sectors, NONE):
-                raise unknown("--danger", self.danger, (*sectors, NONE))
-            danger_of = {tree.episode: tree.danger.sector or NONE for tree in dataset.trees}
-            numbers = [n for n in numbers if danger_of[n] == self.danger]
-        if self.sample is not None:
-            numbers = drawn(numbers, self.sample, self.sample_seed, max(dataset.episodes) + 1)
-        if not numbers:
-            options = ", ".join(f"--{key} {printable(value)}" for key, value in self.given.items())
-            raise UserError(
-                f"{options}: no episode of {printable(dataset.name)} matches; give other values"
-            )
-        return dataset.of_episodes(frozenset(numbers[: self.limit]))
+
+    @abstractmethod
+    def choice(self, numbers: Sequence[int], dataset: Dataset | None) -> Choice:
+        """Return which of these episodes are used, ascending as they are.
+
+        They are those of a dataset, or layouts to drive where that is None. Raises UserError if
+        there are none, or too few.
+        """
 
 
-ALL = Selection()
+SELECTIONS = Shipped[Selection]("swarmdrive.selections", Selection, {})
+
+
+def opened(settings: Mapping[str, Any]) -> Selection | None:
+    """Return what chooses episodes by a run's settings of extensions; None if nothing does."""
+    for each in SELECTIONS.values():
+        if selection := each.opened(settings):
+            return selection
+    return None
+
+
+def without(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings of extensions without those that choose episodes."""
+    choosing = {name for each in SELECTIONS.values() for name in each.chosen_by}
+    return {name: value for name, value in settings.items() if name not in choosing}
+
+
+def recorded(record: Mapping[str, Any]) -> Selection | None:
+    """Return what chose a run's episodes, by the `selection` that it states; None for all.
+
+    Raises UserError if nothing chooses by what it states, or the extension that does is gone.
+    """
+    if owner := lacking(record):
+        raise UserError(f"what selected the episodes of a run is {part_of(owner)}")
+    selection = opened(record)
+    if record and selection is None:
+        name = printable(next(iter(record)))
+        raise UserError(f"a run says that its episodes were selected by {name}, as nothing does")
+    return selection
+
+
+def lacking(record: Mapping[str, Any]) -> str | None:
+    """Return the extension that chose a run's episodes, by what it states, if it is gone."""
+    owners = [owner_of_plugin("settings", name) for name in record]
+    return next((owner for owner in owners if owner and owner not in extensions()), None)
 
 
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:
@@ -83,26 +97,6 @@ def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]
         raise UserError(f"--sample {sample}: give 1 to {len(numbers)} episodes")
     order = noise.generator("sample of episodes", seed).random(end)
     return sorted(sorted(numbers, key=lambda n: order[n])[:sample])
-
-
-def _numbers(text: str, end: int) -> set[int]:
-    """Parse a text such as `3,10:20`. Raises UserError for any other text,
-    or for numbers from `end` on.
-    """
-    numbers: set[int] = set()
-    for part in text.split(","):
-        first, colon, last = part.partition(":")
-        try:
-            span = range(int(first), int(last)) if colon else range(int(first), int(first) + 1)
-        except ValueError:
-            span = range(0)
-        if not span or span.start < 0 or span.stop > end:
-            raise UserError(
-                f"--only {printable(text)}: give episodes from 0 to {end - 1}, such as 3,10:20, "
-                "which is 3 and 10 to 19"
-            )
-        numbers.update(span)
-    return numbers
 
 
 def spot_check(items: Sequence[T], sha256: str, most: int) -> list[T]:

@@ -1,7 +1,7 @@
 """Walk frozen scenes: an episode is a walk through the decision tree of its layout."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isfinite
 from typing import Any, ClassVar, NamedTuple
 
@@ -10,9 +10,10 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.covariate import LEAST
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.schema import Edge
-from harness.dataset.select import ALL, NONE, Selection
+from harness.dataset.select import NONE, Choice
 from harness.evaluate.draws import channel_draws
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
@@ -34,9 +35,14 @@ MOST_KNOWN = 20
 class FrozenSource:
     """Describe recorded scenes of a dataset to evaluate on, as `harness eval` does."""
 
-    dataset: Dataset  # the dataset, cut to the selected episodes
-    selection: Selection = ALL  # how they were selected
+    dataset: Dataset  # the dataset, cut to the episodes that are used
+    limit: int | None = None  # how many were asked for, from the first; None for all
+    choice: Choice | None = None  # what chose them before that; None for all
     kind: ClassVar[World] = "frozen"
+
+    def __post_init__(self) -> None:
+        if self.limit is not None and self.limit < 1:
+            raise UserError(f"--limit {self.limit}: give 1 or more episodes")
 
     @property
     def name(self) -> str:
@@ -61,11 +67,11 @@ class FrozenSource:
             sha256=self.dataset.sha256,
             nodes=self.dataset.nodes,
             episodes=len(self.dataset.episodes),
-            limit=self.selection.limit,
+            limit=self.limit,
             delay_allowance_s=p.delay_allowance_s,
             decision_lag_s=p.decision_lag_s,
             path=str(self.dataset.path),
-            selection=self.selection.given,
+            selection=dict(self.choice.given) if self.choice else {},
         )
 
     @property
@@ -75,10 +81,10 @@ class FrozenSource:
 
     def first(self, count: int) -> "FrozenSource":
         """Return this source with at most so many of its episodes, from the first."""
-        numbers, selection = self.dataset.episodes[:count], self.selection
+        numbers, limit = self.dataset.episodes[:count], self.limit
         if len(numbers) < len(self.dataset.episodes):
-            selection = replace(selection, limit=len(numbers))
-        return FrozenSource(self.dataset.of_episodes(frozenset(numbers)), selection)
+            limit = len(numbers)
+        return FrozenSource(self.dataset.of_episodes(frozenset(numbers)), limit, self.choice)
 
     def layouts(self, n_asked: int) -> list[Layout]:
         """Return how hard each layout is, of those asked and of others that might have been asked.
@@ -91,7 +97,8 @@ class FrozenSource:
         if n_asked < LEAST:
             return []
         own_episodes, pool = self.dataset.episodes[:n_asked], self.dataset.whole
-        pool = replace(self.selection, limit=None, sample=None).of(pool)
+        if self.choice:
+            pool = pool.of_episodes(frozenset(self.choice.pool))
         if len(pool.episodes) <= n_asked:
             return []
         pool = pool.of_episodes(frozenset((*own_episodes, *pool.episodes[: MOST_KNOWN * n_asked])))
@@ -112,12 +119,7 @@ class FrozenSource:
             yield from self.dataset.scenes([forest.ids[root]])
 
     def settings(self) -> FrozenSettings:
-        given: dict[str, Any] = self.selection.given
-        return FrozenSettings(
-            dataset=str(argument(self.dataset.path)),
-            limit=self.selection.limit,
-            **given,
-        )
+        return FrozenSettings(dataset=str(argument(self.dataset.path)), limit=self.limit)
 
 
 class _Walks:

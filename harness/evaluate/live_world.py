@@ -23,7 +23,7 @@ from harness.coordination.plans import STANDING_MPS, Plans
 from harness.core.arrays import Ints
 from harness.dataset.freeze import records_of
 from harness.dataset.load import Scene
-from harness.dataset.select import drawn
+from harness.dataset.select import Choice
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
@@ -46,15 +46,14 @@ from harness.world.world import World
 class LiveSource:
     """Describe the layouts of a scenario to drive in closed loop, as `harness drive` does.
 
-    Episode e has layout seed `first_seed` + e. With a `sample`, only that many of the episodes are
-    driven, drawn as `harness eval` draws from as many.
+    Episode e has layout seed `first_seed` + e. With a `choice`, only those of the episodes are
+    driven.
     """
 
     first_seed: int
     episodes: int
     scenario_name: str = scenarios.DEFAULT
-    sample: int | None = None
-    sample_seed: int = 0
+    choice: Choice | None = None  # what chose some of the episodes; None for all
     name: ClassVar[str] = "drive"
     kind: ClassVar[metrics.World] = "closed-loop"
 
@@ -62,16 +61,10 @@ class LiveSource:
     def scenario(self) -> Scenario:
         return scenarios.get(self.scenario_name)
 
-    @cached_property
+    @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes to drive; a run that stops early drives the first of them.
-
-        Raises UserError if there are fewer episodes than the sample.
-        """
-        numbers = range(self.episodes)
-        if self.sample is None:
-            return numbers
-        return drawn(numbers, self.sample, self.sample_seed, self.episodes)
+        """Numbers of the episodes to drive; a run that stops early drives the first of them."""
+        return self.choice.numbers if self.choice else range(self.episodes)
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -90,9 +83,7 @@ class LiveSource:
             first_seed=self.first_seed,
             episodes=len(self.numbers),
             late_against="full-view driver, whose decisions act after decision_lag_s",
-            selection={}
-            if self.sample is None
-            else {"of": self.episodes, "sample": self.sample, "sample_seed": self.sample_seed},
+            selection={"of": self.episodes, **self.choice.given} if self.choice else {},
         )
 
     def first(self, count: int) -> "LiveSource":
@@ -104,8 +95,6 @@ class LiveSource:
             scenario=scenarios.argument(self.scenario),
             episodes=self.episodes,
             first_seed=self.first_seed,
-            sample=self.sample,
-            sample_seed=0 if self.sample is None else self.sample_seed,
         )
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:

@@ -18,10 +18,12 @@ from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
+from harness.core.extensions import part_of
 from harness.core.figures import amount
 from harness.core.files import sha256_file
+from harness.dataset import select
 from harness.dataset.load import Dataset
-from harness.dataset.select import Selection, spot_check
+from harness.dataset.select import Choice, spot_check
 from harness.evaluate import latency as latencies
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import DRIVER, card_here, check_prompts, points_of, spec_of
@@ -126,10 +128,10 @@ def differences(
     """
     world = run.manifest.world
     assert isinstance(world, FrozenScenes)
-    selection = convert(
-        {"limit": world.limit, **world.selection}, Selection, f"{printable(run.path)}: world"
-    )
-    source = FrozenSource(selection.of(dataset), selection)
+    choice = _choice(run, world.selection, dataset)
+    numbers = choice.numbers if choice else dataset.episodes
+    part = dataset.of_episodes(frozenset(numbers[: world.limit]))
+    source = FrozenSource(part, world.limit, choice)
     if source.dataset.episodes != run.grid.episodes:
         return ["episodes.csv has other episodes than run.json says that were selected"], []
     stored_spec, manifest = spec_of(run, source), run.manifest
@@ -156,7 +158,24 @@ def differences(
     if list(map(astuple, run.layouts)) != list(map(astuple, ours.layouts)) and run.layouts:
         wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
     wrong += _of_rule(otherwise)
-    return wrong, list(_lacking(run, ours))
+    return wrong, [*_lacking(run, ours), *_unchecked_choice(world.selection)]
+
+
+def _choice(run: Run, record: Mapping[str, Any], dataset: Dataset) -> Choice | None:
+    """Return what chose a run's episodes, by what it states; None for all.
+
+    Where the extension that chooses is gone, the episodes are those that the run has.
+    """
+    if select.lacking(record):
+        pool = tuple(layout.episode for layout in run.layouts) or run.grid.episodes
+        return Choice(run.grid.episodes, pool, record)
+    selection = select.recorded(record)
+    return selection.choice(dataset.episodes, dataset) if selection else None
+
+
+def _unchecked_choice(record: Mapping[str, Any]) -> Iterator[str]:
+    if owner := select.lacking(record):
+        yield f"Whether these are the episodes to select is not checked: that is {part_of(owner)}."
 
 
 def refuse_otherwise(run: Run, spec: Spec) -> None:

@@ -15,8 +15,7 @@ from harness.core.errors import UserError, in_range
 from harness.core.files import text_of
 from harness.core.resources import folder
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose
-from harness.dataset import load
-from harness.dataset.select import Selection
+from harness.dataset import load, select
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Source, Spec, replayed
@@ -55,35 +54,41 @@ def _of_replayed(ego: Agent, settings: Settings) -> Timer | None:
     return manifest.timer if manifest else None
 
 
-def frozen(world: FrozenSettings, dataset: str) -> FrozenSource:
-    """Return the episodes of a dataset, given by name or folder, that `world` selects.
+def frozen(settings: Settings, dataset: str) -> FrozenSource:
+    """Return the episodes of a dataset, given by name or folder, that settings of a run select.
 
     Raises UserError if there is no such dataset, or the selection is not allowed.
     """
-    selection = Selection(world.limit, world.only, world.danger, world.sample, world.sample_seed)
-    whole = load.load(load.find(dataset), None if selection.given else world.limit)
-    return FrozenSource(selection.of(whole), selection)
+    world, selection = settings.world, select.opened(settings.extensions)
+    assert isinstance(world, FrozenSettings)
+    whole = load.load(load.find(dataset), None if selection else world.limit)
+    choice = selection.choice(whole.episodes, whole) if selection else None
+    numbers = choice.numbers if choice else whole.episodes
+    part = whole.of_episodes(frozenset(numbers[: world.limit]))
+    return FrozenSource(part, world.limit, choice)
 
 
-def driven(world: DriveSettings, scenario: str | None = None) -> "LiveSource":
+def driven(settings: Settings, scenario: str | None = None) -> "LiveSource":
     """Return the layouts to drive in closed loop, by default those of the shipped dataset.
 
-    `scenario` is a name, in place of that in `world`. Raises UserError if an episode or seed is out
-    of range or mixed with those of another purpose, or if the scenario is an environment that
-    cannot be driven.
+    `scenario` is a name, in place of that in the settings. Raises UserError if an episode or seed
+    is out of range or mixed with those of another purpose, or if the scenario is an environment
+    that cannot be driven.
     """
     # A base install evaluates without the simulator.
     from harness.evaluate.live_world import LiveSource
 
+    world, selection = settings.world, select.opened(settings.extensions)
+    assert isinstance(world, DriveSettings)
     name = scenario or world.scenario or DEFAULT
     shipped = _shipped(name.partition(":")[0])
     episodes = shipped["episodes"] if world.episodes is None else world.episodes
     first_seed = shipped["seed"] if world.first_seed is None else world.first_seed
     in_range("--episodes", episodes, 1, LAST_EPISODE + 1)
     in_range("--first-seed", first_seed, 0, LAST_SEED)
-    in_range("--sample-seed", world.sample_seed, 0, LAST_SEED)
     purpose(first_seed, episodes)
-    source = LiveSource(first_seed, episodes, name, world.sample, world.sample_seed)
+    choice = selection.choice(range(episodes), None) if selection else None
+    source = LiveSource(first_seed, episodes, name, choice)
     if world_of_scenario := source.scenario.world:
         world_of_scenario.examine(source.scenario, first_seed)
     return source

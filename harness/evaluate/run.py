@@ -31,7 +31,7 @@ from harness.core.progress import Progress
 from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
-from harness.dataset.select import drawn
+from harness.dataset.select import recorded
 from harness.evaluate import costs, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
@@ -388,8 +388,8 @@ def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
     most = world.selection.get("of", world.episodes)
     in_range("episodes of a shard's run", most, 1, LAST_EPISODE + 1)
     numbers: Sequence[int] = range(min(world.episodes, most))
-    if sample := world.selection:
-        numbers = drawn(range(sample["of"]), sample["sample"], sample["sample_seed"], sample["of"])
+    if selection := recorded(world.selection):
+        numbers = selection.choice(range(most), None).numbers
     return _split(numbers, max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS)))
 
 

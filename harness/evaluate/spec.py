@@ -21,7 +21,9 @@ from harness.coordination.schedules import SCHEDULES
 from harness.core import extensions
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import LAST_SEED
+from harness.dataset import select
 from harness.dataset.load import Scene
+from harness.dataset.select import Choice
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.command_options import Guard
 from harness.evaluate.latency import MEASURED, NAMES, declared
@@ -75,6 +77,11 @@ class Source(Protocol):
     @property
     def numbers(self) -> Sequence[int]:
         """Numbers of the episodes to evaluate; a run that stops early has the first of them."""
+        ...
+
+    @property
+    def choice(self) -> Choice | None:
+        """What chose some of the episodes; None if it is all of them, or the first."""
         ...
 
     def first(self, count: int) -> "Source":
@@ -505,9 +512,13 @@ class Spec:
         for name, setting in of_extensions().items():
             if name not in beside and setting.default not in formats.NO_TEXTS:
                 settings[name] = setting.default
-        others = stopping.without(timers.without(self.settings.extensions))
+        others = stopping.without(timers.without(select.without(self.settings.extensions)))
         for name, value in others.items():
             if name not in COUNTERPARTS:
+                settings[name] = value
+        given = self.source.choice.given if self.source.choice else {}
+        for name, value in given.items():
+            if name in beside and value != beside[name].default:
                 settings[name] = value
         by_timer = self.timer.settings() if self.timer else {}
         by_rule = self.stopping_rule.settings() if self.stopping_rule else {}

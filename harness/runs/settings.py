@@ -98,24 +98,6 @@ class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="f
     limit: Annotated[
         int | None, option("Use only this many episodes, from the first. Default: all.")
     ] = None
-    only: Annotated[
-        str | None, option("Use only these episodes: 3,10:20 means 3 and 10 to 19.", EPISODES)
-    ] = None
-    danger: Annotated[
-        str | None,
-        option(
-            "Use only episodes whose danger comes from this sector, such as left; none means "
-            "episodes without a danger.",
-            EPISODES,
-        ),
-    ] = None
-    sample: Annotated[
-        int | None,
-        option(
-            "Draw this many episodes at random from those that --only and --danger leave.", EPISODES
-        ),
-    ] = None
-    sample_seed: Annotated[int, option("Seed of this draw.", EPISODES)] = 0
 
 
 class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="closed-loop"):
@@ -141,16 +123,6 @@ class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="cl
             EPISODES,
         ),
     ] = None
-    sample: Annotated[
-        int | None, option("Draw this many of these episodes at random.", EPISODES)
-    ] = None
-    sample_seed: Annotated[
-        int,
-        option(
-            "Seed of this draw; with the same seed, eval draws the same episodes of as many.",
-            EPISODES,
-        ),
-    ] = 0
 
 
 class Settings(Struct, frozen=True, kw_only=True):
@@ -638,7 +610,7 @@ def otherwise(folder: Path, made_with: Settings) -> str | None:
     where = f"settings {printable(file)}"
     try:
         tables = _placed(toml(file, where), type(made_with.world), where)
-        file_settings = convert(formats.gathered(tables), Settings, where)
+        file_settings = convert(formats.gathered(tables, of_run=True), Settings, where)
         before, now = difference(made_with, file_settings)
     except UserError as error:
         return f"{error}."

@@ -4,8 +4,6 @@ import json
 
 import pytest
 
-from harness.runs import folder
-
 pytestmark = pytest.mark.usefixtures("svg_alone")
 
 
@@ -43,50 +41,9 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     assert success in (0.0, 0.5, 1.0)
 
 
-@pytest.mark.exhaustive
-def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(
-    harness, tmp_path, small_path
-):
-    draw = ("--sample", 2, "--sample-seed", 3, "--seeds", "0:1")
-    layouts = json.loads((small_path / "manifest.json").read_text())
-    of = ("--episodes", layouts["episodes"], "--first-seed", layouts["seed"])
-    run = tmp_path / "run"
-    code, out, err = harness("drive", *draw, *of, "--condition", "6g", "--workers", 1, "--out", run)
-    assert (code, err) == (0, "")
-    assert f"n = 2 episodes × 1 channel seed; of layout seeds {layouts['seed']} to" in out
-    assert (
-        harness(
-            "eval",
-            "--dataset",
-            small_path,
-            *draw,
-            "--condition",
-            "6g",
-            "--out",
-            tmp_path / "frozen",
-        )[0]
-        == 0
-    )
-    driven, frozen = (folder.read(path) for path in (run, tmp_path / "frozen"))
-    assert driven.grid.episodes == frozen.grid.episodes
-    assert [e.layout_seed for e in driven.episodes] == [e.layout_seed for e in frozen.episodes]
-    assert " --sample 2 --sample-seed 3 " in driven.manifest.command
-    assert (
-        harness("study", "fidelity", run, tmp_path / "frozen", "--out", tmp_path / "fidelity")[0]
-        == 0
-    )
-    code, _, err = harness(
-        "drive", *draw, *of, "--condition", "6g", "--sample-seed", 4, "--out", run
-    )
-    assert (code, "already holds a finished run" in err) == (2, True)
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ("--episodes 3 --sample 4", "--sample 4: give 1 to 3 episodes"),
-        ("--sample 0", "give 1 to 200 episodes"),
-        ("--scenario parking-exit --sample 0", "give 1 to 100 episodes"),
         ("--episodes 0", "--episodes 0 is out of range; give 1 to 100000"),
         ("--first-seed -1", "--first-seed -1 is out of range"),
         ("--workers 0", "--workers 0: give 1 to 256 processes, or ray"),

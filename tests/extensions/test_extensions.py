@@ -412,9 +412,14 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
         (known.PLUG_INS, plug_ins),
     ):
         named = {
-            key for key, package in ENTRIES.get(group, {}).items() if package == f"{PACKAGES}{name}"
+            key
+            for key, package in ENTRIES.get(group, {}).items()
+            if package.partition(" ")[0] == f"{PACKAGES}{name}"
         }
         assert named == set(names)
+    for setting, each in extension.settings.items():
+        idle = "" if each.default in (None, ()) else str(each.default)
+        assert known.setting_of_run(setting) == known.OfExtension(name, idle)
     for part in extension.adds.get("parts", {}):
         for setting, default in structs.asdict(more_parts()[part]()).items():
             idle = "" if default is None else str(default)
@@ -632,6 +637,33 @@ def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
         attack == "harness: setting attack is part of the extension trust, which is not installed"
     )
     assert until == f"harness: setting until_width {early_stop}"
+
+
+@pytest.mark.slow
+def test_a_run_of_selected_episodes_is_read_without_what_selected_them(
+    core: Path, small_path: Path, harness: Typed, tmp_path: Path
+) -> None:
+    """Its numbers stand in it; nobody selects others, and a file that does is refused."""
+    of = ("--dataset", str(small_path), "--condition", "6g", "--seeds", "0:1", "--quiet")
+    assert harness("eval", *of, "--only", "1:4", "--sample", "2", "--out", "run") == (0, "", "")
+    assert harness("eval", *of, "--out", "all") == (0, "", "")
+    code = (
+        "import sys\nfrom harness.__main__ import main\nfor typed in (['run', 'check', 'run'], "
+        "['compare', 'all', 'run'], ['report', 'run'], ['eval', 'all', '--limit', '1', '--out', "
+        "'b'], ['eval', 'run'], ['eval', '--sample', '2']):\n    sys.argv = ['harness', *typed]\n"
+        "    try:\n        main()\n    except SystemExit as end:\n        print('code', end.code)\n"
+    )
+    done = in_the_core(core, tmp_path, code)
+    gone = "is part of the extension selection, which is not installed"
+    unchecked = f"Whether these are the episodes to select is not checked: that {gone}."
+    assert "run: equal where it can be checked: " in done.stdout
+    assert unchecked in " ".join(done.stdout.split())
+    codes = re.findall(r"^code (.*)", done.stdout, re.MULTILINE)
+    assert {*codes[:4]} == {"None", "0"}
+    assert codes[4:] == ["2", "2"]
+    file, typed = done.stderr.splitlines()
+    assert file == f"harness: setting only {gone}"
+    assert typed.startswith(f"harness: --sample {gone} in `harness eval --sample 2`")
 
 
 PART = """

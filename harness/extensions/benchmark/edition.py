@@ -17,7 +17,6 @@ from harness.core.files import digest
 from harness.core.resources import find, names
 from harness.core.statistics import Estimate
 from harness.dataset import load
-from harness.dataset.select import Selection
 from harness.evaluate import resolve
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
@@ -117,7 +116,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         Raises UserError if the dataset of that name here has another digest.
         """
-        source = FrozenSource(load.load(load.find(dataset), limit), Selection(limit))
+        source = FrozenSource(load.load(load.find(dataset), limit), limit)
         if source.dataset.sha256 != self.datasets[dataset]:
             raise self._differs(
                 f"dataset {printable(dataset)}", source.dataset.sha256, self.datasets[dataset]

@@ -79,10 +79,12 @@ class Until(StoppingRule):
         return {DECIDED: str(self.folder)}
 
     def check(self, run: "Spec") -> None:
-        if isinstance(world := run.settings.world, DriveSettings) and world.sample is not None:
+        choice = run.source.choice
+        if choice and isinstance(run.settings.world, DriveSettings):
+            name, value = next(iter(choice.given.items()))
             raise UserError(
-                f"--sample {world.sample}: a run that stops takes layouts in their order; leave it "
-                "out"
+                f"--{name} {printable(value)}: a run that stops takes layouts in their order; "
+                "leave it out"
             )
         if self.against is not None:
             self._check_against(run, self.against)

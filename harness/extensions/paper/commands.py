@@ -87,7 +87,8 @@ def closed_loop(
     from harness.studies.study import refuse_taken
 
     named = scenario and options.typed_scenario(scenario)
-    source = resolve.driven(DriveSettings(episodes=episodes, first_seed=first_seed), named)
+    world = DriveSettings(episodes=episodes, first_seed=first_seed)
+    source = resolve.driven(Settings(world=world), named)
     who = options.workers_of(workers)
     points = {s.point.name: s.point for panel in panels().values() for s in panel}
     spec = Spec(

@@ -109,7 +109,7 @@ def command(
 def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":
     """Return the evaluation whose answers are walked."""
     from harness.evaluate import resolve
-    from harness.runs.settings import FrozenSettings, Settings
+    from harness.runs.settings import Settings
 
     settings = Settings(
         model=model,
@@ -118,4 +118,4 @@ def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> 
         seeds=seeds or "0:5",
         ask="all",  # attacks use what every helper intends
     )
-    return resolve.spec(settings, resolve.frozen(FrozenSettings(), resources.DATASET))
+    return resolve.spec(settings, resolve.frozen(settings, resources.DATASET))

@@ -20,7 +20,6 @@ from harness.core.errors import UserError
 from harness.core.shards import Shard
 from harness.core.statistics import paired_difference
 from harness.dataset.load import Dataset
-from harness.dataset.select import Selection
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.lifecycle import finished
 from harness.evaluate.run import evaluate, evaluate_shard
@@ -49,7 +48,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def until(spec: Spec, until: Until, limit: int | None = None) -> Spec:
     assert isinstance(spec.source, FrozenSource)
-    source = FrozenSource(spec.source.dataset, Selection(limit))
+    source = FrozenSource(spec.source.dataset, limit)
     return replace(spec, source=source, stopping_rule=until)
 
 
@@ -292,10 +291,6 @@ def test_a_finished_run_is_taken_for_no_run_by_another_rule(small: Dataset, tmp_
             ("eval", "--until-width", "4", "--dataset", "suite:v2v-safety-2"),
             "suite v2v-safety-2: runs that stop",
             marks=pytest.mark.exhaustive,
-        ),
-        (
-            ("drive", "--until-width", "4", "--sample", "3"),
-            "--sample 3: a run that stops takes layouts",
         ),
     ],
 )

@@ -185,7 +185,7 @@ def _report(
     from harness.dataset import rebuilt
     from harness.evaluate import resolve
 
-    sources = [resolve.frozen(settings.world, name) for name in names]  # type: ignore[arg-type]
+    sources = [resolve.frozen(settings, name) for name in names]
     for tuned, source in zip(tune, sources, strict=True):
         rebuilt.refuse_reported(tuned.dataset, [source.dataset])
     return [resolve.spec(settings, source) for source in sources]

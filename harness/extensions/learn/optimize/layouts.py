@@ -17,7 +17,7 @@ from harness.evaluate import resolve
 from harness.evaluate.dry_run import count
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Spec
-from harness.runs.settings import FrozenSettings
+from harness.runs.settings import Settings
 from harness.world.scenario import Scenario
 
 
@@ -45,7 +45,7 @@ def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSour
         raise UserError(
             f"--tune: {len(names)} given for {len(reported)} datasets; give one each, in order"
         )
-    sources = [resolve.frozen(FrozenSettings(), name) for name in names]
+    sources = [resolve.frozen(Settings(), name) for name in names]
     for name, source, other in zip(names, sources, reported, strict=True):
         scenario = scenario_of(other)
         manifest = source.dataset.manifest

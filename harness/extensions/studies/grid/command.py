@@ -49,7 +49,7 @@ def command(
     from harness.studies.study import refuse_taken
 
     world: Any = settings.world
-    source = resolve.frozen(world, world.dataset)
+    source = resolve.frozen(settings, world.dataset)
     frozen = source.dataset
     options.say_all(world.limit, [frozen])
     # Combinations share answers: whom one does not ask, another does.

@@ -64,7 +64,7 @@ def command(
             f"--repeats {repeats}: needs one dataset, and --dataset names a suite; give one of "
             "its datasets"
         )
-    source = resolve.frozen(world, world.dataset)
+    source = resolve.frozen(settings, world.dataset)
     options.say_all(world.limit, [source.dataset])
     spec = resolve.spec(settings, source)
     _check(spec, repeats)

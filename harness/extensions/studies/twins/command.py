@@ -9,7 +9,8 @@ from harness.cli.progress import bar
 from harness.cli.run import free_folder
 from harness.cli.show import finish
 from harness.core import resources, work
-from harness.core.errors import printable, unknown
+from harness.core.errors import in_range, printable, unknown
+from harness.core.seeds import LAST_SEED
 
 # that are drawn where nothing is said; with fewer, intervals near 90 % are too narrow
 EPISODES = 40
@@ -63,7 +64,7 @@ def command(
     from harness.backends import cards
     from harness.backends.cache import default_file
     from harness.dataset import load
-    from harness.dataset.select import Selection
+    from harness.dataset.select import Choice, drawn
     from harness.evaluate.agent import Agent
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.spec import Spec
@@ -84,8 +85,13 @@ def command(
     options.say_all(limit, [whole])
     if limit is None and sample is None:
         sample = min(EPISODES, len(whole.episodes))
-    selection = Selection(limit, sample=sample, sample_seed=sample_seed)
-    source = FrozenSource(selection.of(whole), selection)
+    choice, numbers = None, whole.episodes
+    in_range("--sample-seed", sample_seed, 0, LAST_SEED)
+    if sample is not None:
+        numbers = tuple(drawn(numbers, sample, sample_seed, max(numbers) + 1))
+        given = {"sample": sample, "sample_seed": sample_seed}
+        choice = Choice(numbers, whole.episodes, given)
+    source = FrozenSource(whole.of_episodes(frozenset(numbers[:limit])), limit, choice)
     version = versions.load(prompt or source.scenario.prompt)
     spec = Spec(
         Agent(cards.resolve(model, engine), version, answer, thinking),
