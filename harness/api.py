@@ -10,8 +10,10 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 from markupsafe import Markup, escape
 
+from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.figures import crossed
@@ -265,8 +267,7 @@ def run(
             listed = names[kind][name].kind == list[str]
             given[name] = _several(value) if listed else value
         elif name in OPTIONS:
-            listed = OPTIONS[name].kind == list[str]
-            of_command[name] = _several(value) if listed else value
+            of_command[name] = _of_option(name, value, OPTIONS[name].kind)
         elif owner := owner_of_plugin("options", name):
             raise UserError(f"setting {name} is {part_of(owner)}")
         else:
@@ -279,7 +280,7 @@ def run(
     else:
         source = resolve.driven(run_settings)
     spec = resolve.spec(run_settings, source)
-    folder = default_out(spec) if out is None else Path(out)
+    folder = default_out(spec) if out is None else _path("out", out)
     run_follows, kept = follows(of_command), default_file() if cache else None
     with guarded(of_command, [spec], workers) as [spec]:
         evaluate(spec, folder, cache=kept, quiet=quiet, workers=workers, follows=run_follows)
@@ -295,7 +296,7 @@ def load(run: str | PathLike[str]) -> Run:
     Raises:
         UserError: it is no finished run, or a file of it is broken.
     """
-    return tables_of(Path(run), Run)
+    return tables_of(_path("run", run), Run)
 
 
 def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
@@ -311,7 +312,7 @@ def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
 
     from harness.runs.listing import Listed, runs
 
-    return pd.DataFrame(runs(Path(folder)), columns=list(Listed.__dataclass_fields__))
+    return pd.DataFrame(runs(_path("folder", folder)), columns=list(Listed.__dataclass_fields__))
 
 
 def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Comparison:
@@ -331,9 +332,8 @@ def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Compa
     from harness.report.compare.text import mapping
     from harness.report.compare.words import outcomes
 
-    difference = compared(
-        pair(*(side.path if isinstance(side, Run) else Path(side) for side in (a, b)))
-    )
+    first, second = _folder_of("a", a), _folder_of("b", b)
+    difference = compared(pair(first, second))
     return Comparison(
         mapping(difference, (), most=10),
         tuple(sentence for sentence, _ in outcomes(difference)),
@@ -371,15 +371,35 @@ def sweep(
     from harness.studies.study import write_study
     from harness.studies.sweep import folder_of, panels_over, run_sweep
 
-    path = run.path if isinstance(run, Run) else Path(run)
+    path = _folder_of("run", run)
     with bar("grid points", quiet=quiet, grows=True) as progress:
         replayed = ReplayedRun(path, progress=progress)
         panels = panels_over([replayed], _several(over), _several(grid), _several(condition))
         progress.more(sum(map(len, panels.values())))
-        folder = folder_of(path, panels) if out is None else Path(out)
+        folder = folder_of(path, panels) if out is None else _path("out", out)
         draws = parse_seeds(seeds) if seeds else replayed.seeds
         study = run_sweep([replayed], panels, draws, folder, progress)
     return Study(write_study(study, folder).parent, study.headline, study.about, study.data)
+
+
+def _folder_of(name: str, run: Any) -> Path:
+    """Return the folder of a run, which an argument of this name is or names."""
+    return run.path if isinstance(run, Run) else _path(name, run)
+
+
+def _path(name: str, value: Any) -> Path:
+    """Return the path that an argument of this name gives. Raises UserError for what is none."""
+    if not isinstance(value, str | PathLike):
+        raise UserError(f"{name} = {printable(repr(value))}; allowed: a path, as text or a Path")
+    return Path(value)
+
+
+def _of_option(name: str, value: Any, kind: Any) -> Any:
+    """Return the value of an option that an extension adds to commands; None where it is None."""
+    if value is None:
+        return None
+    table = {name: _several(value) if kind == list[str] else value}
+    return getattr(convert(table, msgspec.defstruct("Options", [(name, kind)]), "options"), name)
 
 
 def _several(value: str | Sequence[str]) -> Sequence[str]:

@@ -14,6 +14,7 @@ from harness import extend
 from harness.coordination.operating_point import POINTS
 from harness.core.extensions import PYTHON
 from harness.dataset.load import Dataset
+from harness.evaluate.command_options import OPTIONS
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("svg_alone")]
 
@@ -199,3 +200,26 @@ def test_a_sweep_is_the_command_lines(folder: Path, tmp_path: Path) -> None:
     assert (study.path / "index.html").is_file()
     with pytest.raises(harness.UserError, match="--grid: 2 given for 1 of --over"):
         harness.sweep(folder / "proxy", "loss", ["0,1", "2"])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"temperature": "\ud800"}, r"temperature = '\\ud800'; allowed: "),
+        ({"temperature": 10**400}, r"temperature = 10{60,}.*; allowed: a finite number"),
+        ({"max_cost": "1"}, "max_cost = '1'; allowed: a number"),
+        ({"tracker": ["wandb", 5]}, r"options \[tracker\]: 1 = 5; allowed: a text"),
+        ({"out": 5}, "out = 5; allowed: a path, as text or a Path"),
+    ],
+)
+def test_a_value_of_another_type_is_one_line(options: dict[str, Any], said: str) -> None:
+    if not options.keys() <= {"temperature", "out", *OPTIONS}:
+        pytest.skip("of an extension that is gone")
+    with pytest.raises(harness.UserError, match=said):
+        harness.run(model="proxy", limit=1, **options)
+
+
+def test_what_is_no_path_is_one_line() -> None:
+    for call in (harness.load, harness.ls, lambda run: harness.compare(run, "x")):
+        with pytest.raises(harness.UserError, match="= 5; allowed: a path"):
+            call(5)  # type: ignore[arg-type]

@@ -221,7 +221,7 @@ BEGUN = (
     ],
 )
 def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
-    """The part that it had is taken as it is. Its bare name has come to mean other scenes, and its
+    """The part that it had has no seal, and is driven again. Its bare name has come to mean other scenes, and its
     parser read answers otherwise, so that it goes on only where it says that it has the present
     one.
     """
@@ -241,7 +241,8 @@ def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: 
     config = begun / ".work/config.json"
     config.write_text(json.dumps(json.loads(config.read_text()) | {"versions": versions()}))
     code, _, error = harness(*typed, "--scenario", NAME)
-    assert (code, error) == (0, "")
+    assert (code, error.count("\n")) == (0, 1)
+    assert "has 1 finished part that nobody finished here with your key; their ep" in error
     assert len(folder.read(begun).episodes) == 40
     assert (begun / "answers.jsonl").read_bytes().startswith(answers)
 

@@ -126,7 +126,7 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
     whole = {**table, **given}
     try:
         record = msgspec.convert(whole, kind)
-    except msgspec.ValidationError:
+    except (msgspec.ValidationError, UnicodeEncodeError, OverflowError):
         raise _mistake(whole, kind, where) from None
     for path, value in _beyond(table, ()):  # last, since a bound has better words
         *tables, key = path
@@ -272,8 +272,10 @@ def _problem(value: Any, hint: Any) -> str | None:
     """Return msgspec's words for why a value does not fit a type; None if it does."""
     try:
         msgspec.convert(value, hint)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, OverflowError) as error:
         return str(error)
+    except UnicodeEncodeError:  # of a lone surrogate
+        return "Expected `str` of characters that UTF-8 has, got `str`"
     return None
 
 

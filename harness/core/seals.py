@@ -7,11 +7,23 @@ RFC 2104). The key lies in the cache folder and never leaves it.
 import hmac
 import os
 import secrets
+import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 
 from harness.core import kept
-from harness.core.files import canonical_bytes, sha256_bytes
+from harness.core.errors import printable
+from harness.core.figures import amount
+from harness.core.files import (
+    bytes_of,
+    canonical_bytes,
+    sha256_bytes,
+    sha256_file,
+    text_of,
+    write_whole,
+)
+from harness.core.formats import CONFIG
 
 KEY, KEY_BYTES = "seal.key", 32
 
@@ -27,6 +39,47 @@ def seal(content: Mapping[str, bytes], place: str) -> str | None:
         return None
     digests = {name: sha256_bytes(data) for name, data in content.items()}
     return hmac.new(key, canonical_bytes([place, digests]), "sha256").hexdigest()
+
+
+def write_seal(part: Path, content: Mapping[str, bytes]) -> None:
+    """Write the seal of a part of unfinished work beside where the part will lie.
+
+    A part is a file or a folder of files in a working folder, `content` its files by name. Nothing
+    is written where there is no key.
+    """
+    if sealed := seal(content, _place(part)):
+        write_whole(_seal_file(part), sealed)
+
+
+def is_sealed(part: Path) -> bool:
+    """Return whether a part is as `write_seal` sealed it, for this user on this machine, and for
+    the work whose record lies beside it.
+    """
+    try:
+        file_seal = text_of(_seal_file(part), "record")
+        files = part.iterdir() if part.is_dir() else [part]
+        content = {file.name: bytes_of(file, "rows") for file in files}
+        return file_seal == seal(content, _place(part))
+    except (OSError, ValueError):
+        return False
+
+
+def say_unsealed(out: Path, count: int, what: str, therefore: str) -> None:
+    """Say on stderr that so many parts of an output folder bear no seal, and what comes of it.
+
+    `what` names one of them, such as `finished part`.
+    """
+    where = f"{printable(out)} has {amount(count, what)} that nobody finished here with your key"
+    print(f"harness: {where}; {therefore}", file=sys.stderr)
+
+
+def _seal_file(part: Path) -> Path:
+    return part.with_name(f"seal-{part.name}")
+
+
+def _place(part: Path) -> str:
+    """Return what no other part of any work has: its name, and what its work began with."""
+    return f"{part.name} {sha256_file(part.with_name(CONFIG), 'record')}"
 
 
 def _key() -> bytes | None:

@@ -21,6 +21,7 @@ from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, text_of
 from harness.core.formats import CONFIG, WORK
+from harness.core.seals import write_seal
 
 T = TypeVar("T")
 MOST = 100_000
@@ -187,13 +188,15 @@ def owners(
 def collect(parts: Mapping[str, Path], folder: Path) -> None:
     """Copy parts (files or folders, by name) to a working folder, each in one step.
 
-    Parts that the folder already holds are skipped.
+    Parts that the folder already holds are skipped; copied ones are sealed, since whoever typed the
+    command wants them as they are.
     """
     for name, part in parts.items():
         copy = folder / f".{name}.{os.getpid()}.part"
         if not (folder / name).exists():
             shutil.rmtree(copy, ignore_errors=True)
             content = _content(part)
+            write_seal(folder / name, content)
             if part.is_dir():
                 copy.mkdir()
                 for file, data in content.items():

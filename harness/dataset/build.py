@@ -9,6 +9,7 @@ number of episodes and the folder's name.
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
@@ -27,6 +28,7 @@ from harness.core.files import canonical_json, opened, replacing, sha256_bytes, 
 from harness.core.formats import WORK
 from harness.core.parallel import Workers, each
 from harness.core.plugins import Plugins
+from harness.core.seals import is_sealed, say_unsealed, write_seal
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose, seeds_text
 from harness.core.shards import Shard
 from harness.core.strangers import worded
@@ -203,7 +205,13 @@ def _freeze_missing(
     progress: Callable[[int], None],
 ) -> None:
     """Write the file of each layout that is not yet in the working folder `place`."""
-    missing = [episode for episode in episodes if not (place / part_of(episode)).is_file()]
+    parts = {episode: place / part_of(episode) for episode in episodes}
+    unsealed = [part for part in parts.values() if part.exists() and not is_sealed(part)]
+    for part in unsealed:
+        shutil.rmtree(part) if part.is_dir() else part.unlink()
+    if unsealed:
+        say_unsealed(place.parent, len(unsealed), "frozen layout", "they are frozen again")
+    missing = [episode for episode, part in parts.items() if not part.exists()]
     progress(len(episodes) - len(missing))
     size = TOGETHER
     if isinstance(workers, int):  # no process may have nothing to do
@@ -212,7 +220,8 @@ def _freeze_missing(
 
     def keep(index: int, layouts: list[bytes]) -> None:
         for episode, data in zip(chunks[index], layouts, strict=True):
-            write_whole(place / part_of(episode), data)
+            write_seal(parts[episode], {part_of(episode): data})
+            write_whole(parts[episode], data)
             progress(1)
 
     each(

@@ -6,7 +6,6 @@ import math
 import os
 import shlex
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
@@ -22,12 +21,12 @@ from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError, in_range, printable
-from harness.core.figures import amount
 from harness.core.files import write_whole
 from harness.core.formats import WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.progress import Progress
+from harness.core.seals import is_sealed, say_unsealed
 from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
@@ -327,15 +326,12 @@ def _open_unsealed(out: Path, place: Path) -> None:
     stderr says so.
     """
     finished_parts = [part for part in sorted(place.glob("episodes-*")) if part.is_dir()]
-    unsealed = [part for part in finished_parts if not run_parts.is_sealed(part)]
+    unsealed = [part for part in finished_parts if not is_sealed(part)]
     for part in unsealed:
         _open_again(part)
     if unsealed:
-        print(
-            f"harness: {printable(out)} has {amount(len(unsealed), 'finished part')} that nobody "
-            "finished here with your key; these episodes are walked again with their answers",
-            file=sys.stderr,
-        )
+        therefore = "their episodes are walked again with their answers"
+        say_unsealed(out, len(unsealed), "finished part", therefore)
 
 
 def _open_again(part: Path) -> None:

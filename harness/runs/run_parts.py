@@ -9,9 +9,8 @@ from pathlib import Path
 
 import msgspec
 
-from harness.core.files import bytes_of, sha256_file, text_of, write_whole
-from harness.core.formats import CONFIG
-from harness.core.seals import seal
+from harness.core.files import bytes_of, write_whole
+from harness.core.seals import write_seal
 from harness.runs.decisions import DecisionFiles, Decisions
 from harness.runs.folder import most_rows, records_of, whole
 from harness.runs.records import (
@@ -47,34 +46,12 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
 
     Its seal lies beside it, if this user can make one.
     """
-    if sealed := seal(files, _place(out)):
-        write_whole(_seal_file(out), sealed)
+    write_seal(out, files)
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
     shutil.rmtree(part, ignore_errors=True)
     for name, data in files.items():
         write_whole(part / name, data)
     os.replace(part, out)
-
-
-def is_sealed(part: Path) -> bool:
-    """Return whether `write_part` wrote a part as it is, for this user on this machine, and for the
-    work whose record lies beside it.
-    """
-    try:
-        file_seal = text_of(_seal_file(part), "record")
-        files = {file.name: bytes_of(file, "rows") for file in part.iterdir()}
-    except (OSError, ValueError):
-        return False
-    return file_seal == seal(files, _place(part))
-
-
-def _seal_file(part: Path) -> Path:
-    return part.with_name(f"seal-{part.name}")
-
-
-def _place(part: Path) -> str:
-    """Return what no other part of any work has: its name, and what its work began with."""
-    return f"{part.name} {sha256_file(part.with_name(CONFIG), 'record')}"
 
 
 def read_part(

@@ -47,10 +47,25 @@ def three_decisions(once):
 # Building.
 
 
+def _pipe(layout):
+    layout.unlink()
+    os.mkfifo(layout)
+
+
+SOME_PARTS = {
+    "as it was": lambda layout: None,
+    "garbage": lambda layout: layout.write_bytes(b"PK"),
+    "a pipe": _pipe,
+    "no seal": lambda layout: layout.with_name(f"seal-{layout.name}").unlink(),
+}
+
+
 @pytest.mark.slow
+@pytest.mark.parametrize("kept", SOME_PARTS)
 def test_a_build_that_was_stopped_and_is_continued_has_the_bytes_of_an_undisturbed_one(
-    three_decisions, tmp_path
+    three_decisions, tmp_path, kept, capsys
 ):
+    """Its layouts are frozen again where somebody else may have written them."""
     out, done = tmp_path / three_decisions.name, []
 
     def stopping(count):
@@ -61,9 +76,15 @@ def test_a_build_that_was_stopped_and_is_continued_has_the_bytes_of_an_undisturb
     with pytest.raises(KeyboardInterrupt):
         build(FEW, out, 2, 5, 1, stopping)
     assert not (out / "manifest.json").exists()
+    [layout] = out.glob(".work/0*.zip")
+    SOME_PARTS[kept](layout)
     again = []
     build(FEW, out, 2, 5, 1, again.append)
-    assert again == [1, 1], "the one that was there, and the other"
+    if kept == "as it was":
+        assert again == [1, 1], "the one that was there, and the other"
+    else:
+        assert again == [0, 1, 1]
+        assert "has 1 frozen layout that nobody finished here with" in capsys.readouterr().err
     assert contents(out) == contents(three_decisions)
 
 
