@@ -22,7 +22,7 @@ from harness.core.statistics import paired_difference
 from harness.dataset.load import Dataset
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.lifecycle import finished
-from harness.evaluate.run import evaluate, evaluate_shard
+from harness.evaluate.run import evaluate, evaluate_shard, finished_run
 from harness.evaluate.spec import Spec
 from harness.extensions.early_stop import rule
 from harness.extensions.early_stop.rule import Until, interim_looks
@@ -273,7 +273,8 @@ def test_a_forged_look_is_named(
 def test_a_finished_run_is_taken_for_no_run_by_another_rule(small: Dataset, tmp_path: Path) -> None:
     spec = until(spec_of(small, "constant", **ALONE), Until(width=0.999))
     run(spec, tmp_path / "run")
-    assert finished(spec, tmp_path / "run").manifest.interim_looks == InterimLooks(4, (2,), True)
+    done = finished_run(spec, tmp_path / "run")
+    assert done.manifest.interim_looks == InterimLooks(4, (2,), True)
     three = small.of_episodes(frozenset(small.episodes[:3]))
     of_three = until(spec_of(three, "constant", **ALONE), Until(width=0.999))
     for other in (replace(spec, stopping_rule=Until(width=0.9)), of_three):
