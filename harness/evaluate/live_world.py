@@ -87,7 +87,7 @@ class LiveSource:
         )
 
     def first(self, count: int) -> "LiveSource":
-        """Return this source with at most so many episodes, from the first; it has no `sample`."""
+        """Return this source with at most so many episodes, from the first; it has no `choice`."""
         return replace(self, episodes=min(count, self.episodes))
 
     def settings(self) -> DriveSettings:
