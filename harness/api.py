@@ -374,7 +374,10 @@ def sweep(
     path = _folder_of("run", run)
     with bar("grid points", quiet=quiet, grows=True) as progress:
         replayed = ReplayedRun(path, progress=progress)
-        panels = panels_over([replayed], _several(over), _several(grid), _several(condition))
+        typed = {"over": over, "grid": grid, "condition": condition}
+        for name, value in typed.items():
+            typed[name] = _of_option(name, value, list[str]) or ()
+        panels = panels_over([replayed], typed["over"], typed["grid"], typed["condition"])
         progress.more(sum(map(len, panels.values())))
         folder = folder_of(path, panels) if out is None else _path("out", out)
         draws = parse_seeds(seeds) if seeds else replayed.seeds

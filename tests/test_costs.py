@@ -11,6 +11,7 @@ from priced import CARD, EACH, cost_of, priced, typed_eval
 
 from harness.backends import cards
 from harness.core.errors import UserError
+from harness.evaluate import costs
 
 Typed = Callable[..., tuple[int, str, str]]
 
@@ -95,3 +96,13 @@ def test_a_suite_costs_what_its_runs_cost(there: Server, harness: Typed) -> None
         == asked
     )
     assert f"cost: {asked * EACH:.4g} EUR for {asked} questions to mine" in said
+
+
+@pytest.mark.parametrize("count", ["-1000000000", "9" * 400, "1.5"])
+def test_counts_that_cannot_be_cost_nothing(count: str, tmp_path: Path) -> None:
+    """Anybody may have written the file of a stopped run."""
+    line = '{"model":"m","asked":1,"uncounted":0,"read":%s,"written":0}\n'
+    (tmp_path / costs.FILE).write_text(line % "1000000" + line % count)
+    price = {"input": 2.0, "output": 3.0, "currency": "EUR"}
+    settings = {"model": {"name": "m", "price": price}, "helpers": []}
+    assert costs.total(settings, [tmp_path])["m"].amount == 2.0

@@ -18,11 +18,12 @@ from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
 import pyarrow as pa
 import pytest
 
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 from harness.core.files import (
     appending,
     canonical_json,
     digest,
+    folder_in,
     read_once,
     refuse_bomb,
     replacing,
@@ -147,12 +148,12 @@ def test_a_full_disk_names_the_file_that_is_written(tmp_path: Path) -> None:
     with full_at as full, replacing(tmp_path / "run.json"), open("/dev/full", "w") as file:
         file.write("x")
     assert full.value.filename == str(tmp_path / "run.json")
-    (tmp_path / "answers.jsonl").symlink_to("/dev/full")
     with (
         pytest.raises(OSError, match="No space left") as full,
-        appending(tmp_path / "answers.jsonl") as end,
+        appending(tmp_path / "answers.jsonl"),
+        open("/dev/full", "w") as file,
     ):
-        end.write(b"x")
+        file.write("x")
     assert full.value.filename == str(tmp_path / "answers.jsonl")
     assert {path.name for path in tmp_path.iterdir()} == {"answers.jsonl"}
 
@@ -186,3 +187,26 @@ def test_a_device_or_a_pipe_is_not_replaced_by_a_file(tmp_path: Path) -> None:
     with refused, replacing(tmp_path / "pipe"):
         pass
     assert (tmp_path / "pipe").is_fifo()
+
+
+@pytest.mark.parametrize("kind", ["link to a file", "link to nothing", "pipe"])
+def test_nothing_is_appended_to_what_is_no_file(kind: str, tmp_path: Path) -> None:
+    theirs, file = tmp_path / "theirs", tmp_path / "answers.jsonl"
+    if kind == "pipe":
+        os.mkfifo(file)
+    else:
+        file.symlink_to(theirs)
+    if kind == "link to a file":
+        theirs.write_text("theirs")
+    with pytest.raises(OSError), appending(file):  # noqa: PT011
+        pass
+    assert kind == "link to a file" or not theirs.exists()
+    assert not theirs.exists() or theirs.read_text() == "theirs"
+
+
+def test_a_folder_in_a_run_is_no_link(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "trust").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="trust is a link; delete it, or name another folder"):
+        folder_in(tmp_path, "trust")
+    assert folder_in(tmp_path, "schedules") == tmp_path / "schedules"

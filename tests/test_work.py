@@ -69,6 +69,17 @@ def test_work_with_a_link_in_it_is_refused(name: str, tmp_path: Path) -> None:
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
+def test_work_with_a_pipe_in_it_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "out" / ".work"
+    folder.mkdir(parents=True)
+    os.mkfifo(folder / "costs.jsonl")
+    with (
+        pytest.raises(UserError, match=r"costs\.jsonl is a pipe or device, which no command makes"),
+        work.working(tmp_path / "out", BEGUN),
+    ):
+        pass
+
+
 def fail(kept: Path | None) -> None:
     if kept:
         kept.write_text("128 answers")

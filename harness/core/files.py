@@ -196,9 +196,31 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[BinaryIO]:
-    """Open a file to append bytes, created if it is missing; an OSError names the file."""
-    with naming(path), path.open("ab") as file:
+    """Open a file to append bytes, created if it is missing; an OSError names the file.
+
+    Raises OSError for a link, a pipe or a device, which a stranger's folder may have in its place.
+    """
+    with naming(path), open(path, "ab", opener=_in_place) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise Refused(errno.EINVAL, "it is no file, but a pipe or a device", str(path))
         yield file
+
+
+def _in_place(path: str, flags: int) -> int:
+    if os.path.islink(path):
+        raise Refused(errno.ELOOP, "it is a link, and nothing is written through it", path)
+    return _at_once(path, flags | getattr(os, "O_NOFOLLOW", 0))
+
+
+def folder_in(run: Path, name: str) -> Path:
+    """Return the folder of this name in a run's folder, where something is to be written.
+
+    Raises UserError for a link, which may lead anywhere: somebody else may have made the run.
+    """
+    folder = run / name
+    if folder.is_symlink():
+        raise UserError(f"{printable(folder)} is a link; delete it, or name another folder: --out")
+    return folder
 
 
 @contextmanager

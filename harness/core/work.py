@@ -137,8 +137,9 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
     try:
         work.mkdir(parents=True, exist_ok=True)
         for path in (work, *work.iterdir()):
-            if path.is_symlink():
-                raise UserError(f"{printable(path)} is a link, which no command makes; delete it")
+            if path.is_symlink() or not (path.is_file() or path.is_dir()):
+                what = "a link" if path.is_symlink() else "a pipe or device"
+                raise UserError(f"{printable(path)} is {what}, which no command makes; delete it")
     except OSError as error:
         raise UserError(
             f"--out {printable(out)} cannot be made ({error.strerror}); choose another folder"

@@ -16,6 +16,7 @@ import msgspec
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.price import Price
+from harness.core.config import Whole
 from harness.core.files import appending, bytes_of
 from harness.evaluate.command_options import Guard
 from harness.runs.records import Cost
@@ -27,10 +28,10 @@ class Asked(msgspec.Struct, frozen=True):
     """Hold the token counts of completions that one model was asked for in one call."""
 
     model: str
-    asked: int  # number of completions
-    uncounted: int  # how many of them have no token counts: failed ones, as a rule
-    read: int  # tokens of the others' prompts
-    written: int  # tokens of their answers
+    asked: Whole  # number of completions
+    uncounted: Whole  # how many of them have no token counts: failed ones, as a rule
+    read: Whole  # tokens of the others' prompts
+    written: Whole  # tokens of their answers
 
     @classmethod
     def of(cls, model: str, completions: Sequence[Completion]) -> "Asked":

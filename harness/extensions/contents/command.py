@@ -11,6 +11,7 @@ from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.cli.terminal import echo_json
 from harness.core.errors import printable
+from harness.core.files import folder_in
 from harness.runs.settings import parse_seeds
 
 Runs = typer.Argument(
@@ -89,7 +90,7 @@ def command(
                 _show_counts(counts)
             return
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
-        where = out or runs[0] / "contents"
+        where = out or folder_in(runs[0], "contents")
         results = run_contents(swarms, panels, draws, where, progress)
     finish(contents_study(results, draws), where, as_json, quiet)
 

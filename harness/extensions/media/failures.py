@@ -4,6 +4,7 @@ from pathlib import Path
 
 from harness.cli.progress import bar
 from harness.core import extras
+from harness.core.files import folder_in
 
 
 class Failures:
@@ -31,7 +32,7 @@ class Failures:
         files = []
         with bar("drawing failed episodes", len(failed), quiet) as progress:
             for episode, seed in failed.items():
-                files.append(run / "videos" / f"{episode:05d}-seed{seed}{formats()[-1]}")
+                files.append(folder_in(run, "videos") / f"{episode:05d}-seed{seed}{formats()[-1]}")
                 write_video(played(driven, episode, last, seed), files[-1], lambda done: None)
                 progress(1)
         return files

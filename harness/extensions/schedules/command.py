@@ -10,6 +10,7 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.show import finish
 from harness.core.errors import UserError, printable, unknown
+from harness.core.files import folder_in
 from harness.runs.settings import parse_seeds
 
 TrainRuns = typer.Argument(
@@ -113,6 +114,6 @@ def compare(
         replayed = [ReplayedRun(run, latency, progress, models=cards) for run in runs]
         tuned = [ReplayedRun(run, latency, progress, models=cards) for run in tune]
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
-        where = out or runs[0] / "schedules"
+        where = out or folder_in(runs[0], "schedules")
         compared = run_schedules(replayed, tuned, condition, names, draws, budget, where, progress)
     finish(schedule_study(compared, [*replayed, *tuned], draws), where, as_json, quiet)

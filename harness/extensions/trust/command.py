@@ -11,6 +11,7 @@ from harness.cli.run import file_name
 from harness.cli.show import finish
 from harness.core import resources, work
 from harness.core.errors import UserError
+from harness.core.files import folder_in
 from harness.runs.settings import parse_seeds
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def command(
         cards = options.cards([model] if model else None)
         replayed = ReplayedRun(run, progress=progress, asks=not no_model, models=cards)
         draws = parse_seeds(seeds) if seeds else replayed.seeds
-        where = out or run / "trust"
+        where = out or folder_in(run, "trust")
         with work.going_on(where):
             bench = run_bench(
                 replayed, condition, rule_names, attack_names, shares, draws, where, progress
