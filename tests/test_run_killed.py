@@ -253,6 +253,8 @@ def test_a_torn_chunk_is_asked_again_as_a_whole(
         asked: list[int] = []
         walked(spec, Counting(open_backend(spec.ego.card), asked), PAPER, kept)
         assert kept.read_bytes() == answers
+        kept_again = asked.pop(0) if whole else 0  # which the rule is asked, to compare
+        assert kept_again == whole
         assert sum(asked) == len(lines) - whole
 
 

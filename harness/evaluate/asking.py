@@ -104,15 +104,14 @@ class Asker:
         answers: Mapping[str, Answer] | None = None,
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
-        checks_kept: bool = False,
         earlier: Path | None = None,
     ) -> None:
         """Create an asker. `backend` opens the backend, at the first request.
 
         `kept` is the file of the answers so far; `answers` need not be asked for. `progress` gets
         the number of new answers, those kept by a stopped run included; `more` that of requests
-        before they are made. With `checks_kept`, an answer of the file counts only once its
-        question is asked here, and UserError is raised if it answers another prompt. `earlier` is
+        before they are made. An answer of the file counts only once its question is asked here,
+        and UserError is raised if it cannot be the answer to that. `earlier` is
         another file of kept answers, to which none are added.
         """
         self.spec, self._backend, self.latency = spec, backend, latency
@@ -122,9 +121,8 @@ class Asker:
         self._given, self.served = frozenset(answers or {}), list[Served]()
         recalled = self._recalled()
         self.answers = {**recalled, **(answers or {})}
-        self._checks_kept = checks_kept
-        # Kept answers whose question was not asked here yet, if these are checked.
-        self._unasked = set(recalled.keys() - (answers or {}).keys()) if checks_kept else set()
+        # Kept answers whose question was not asked here yet.
+        self._unasked = set(recalled.keys() - (answers or {}).keys())
         self.tally, self._in_a_row = Tally(), 0
         # How many there are while none could be read; None once one could, or it was said.
         self._unread: int | None = None if self.answers else 0
@@ -138,8 +136,7 @@ class Asker:
         """
         if self._kept:  # another process may have asked, too
             recalled = self._recalled(cut=True)
-            if self._checks_kept:
-                self._unasked |= recalled.keys() - self.answers.keys()
+            self._unasked |= recalled.keys() - self.answers.keys()
             self.answers = recalled | self.answers
         kept = [request for request in requests if request.id in self._unasked]
         for request in kept:

@@ -284,9 +284,7 @@ def _frozen(
                 # Each has a file of its own, so that a resumed run asks in the same chunks.
                 kept = place / (f"answers-{n + 1}.jsonl" if n else "answers.jsonl")
                 there = {**given, **so_far}
-                return Asker(
-                    spec, lambda: backend, latency, kept, there, progress, more, True, earlier
-                )
+                return Asker(spec, lambda: backend, latency, kept, there, progress, more, earlier)
 
             # A chunk fits into memory; what a language model's engine leaves behind in cycles might
             # not.
@@ -536,7 +534,7 @@ def _walk_chunk(
         return combined
 
     def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
-        return Asker(spec, backend, run_start.latency, kept, so_far, checks_kept=True)
+        return Asker(spec, backend, run_start.latency, kept, so_far)
 
     return _walk(spec, chunk, asker_of)
 
