@@ -31,6 +31,7 @@ from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
 from harness.radio import profiles
+from harness.runs import formats, role_agents
 from harness.studies import axes
 
 pytest_plugins = ["browsing", "relabelling", "studied"]
@@ -235,7 +236,7 @@ def part_noted(extension: str) -> str:
 
 if not EXTENSIONS.is_dir():
     shell.__dict__["owner"] = owner_noted
-    for module in (axes, operating_point, parts, profiles, schedules):
+    for module in (axes, cli, formats, operating_point, parts, profiles, role_agents, schedules):
         module.__dict__["part_of"] = part_noted
 
 

@@ -46,8 +46,7 @@ source = "paper"
 basis = "none"
 """
 RUNS = {
-    "rules": "eval --model proxy-faulty --prompt v4 --helper-model "
-    "proxy,proxy-faulty --dataset {small} "
+    "rules": "eval --model proxy-faulty --prompt v4 --dataset {small} "
     "--limit 3 --seeds 3,7 --condition 6g:tau=0.5 --sums divide --batch-size 3 --latency ego=0.2,helper=0.1,fusion=0.3 --ask all --ties first "
     "--tag night",
     "counterparts": "eval --dataset {two} --condition 6g:tau=0.5 --control shuffled-messages "
@@ -57,8 +56,10 @@ RUNS = {
     "decided": "eval --dataset {two} --condition single-local "
     "--seeds 0,1 --until-decided {two_run}",
     "server": "eval --model mine --prompt v4 --dataset {two} --limit 1 --condition 6g --thinking "
-    "--helper-prompt v2 --helper-answer constrained --no-helper-thinking --temperature 0.5 "
-    "--sampling-seed 3 --server {server}",
+    "--temperature 0.5 --sampling-seed 3 --server {server}",
+    "helpers": "eval --model mine --prompt v4 --dataset {two} --limit 1 --condition 6g --thinking "
+    "--helper-model mine,mine --helper-prompt v2 --helper-answer constrained --no-helper-thinking "
+    "--server {server}",
     "device": "eval --model mine --dataset {two} --limit 1 --condition 6g --server {server} "
     "--device-profile agx-orin --device-model qwen3-4b",
     "driven": "drive --scenario {scenario} --condition single-local "
@@ -80,6 +81,7 @@ RUNS = {
 OF_EXTENSIONS = {
     "device": ("devices",),
     "counterparts": ("controls", "trust"),
+    "helpers": ("mixed_helpers",),
     "selected": ("selection",),
     "driven selected": ("selection",),
     "narrow": ("early_stop",),

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluating import all_scenes, run, same_decisions, spec_of, with_ego
-from former import SCENARIO
 from run_on_disk import answers_of
 from tiers import some
 
@@ -25,13 +24,11 @@ from harness.evaluate.asking import Asker
 from harness.evaluate.latency import PAPER
 from harness.evaluate.lifecycle import finished_with
 from harness.evaluate.requests import requests
-from harness.evaluate.resolve import agents
 from harness.evaluate.spec import Spec
 from harness.prompts import readout, versions
 from harness.report.caveats import flipped
 from harness.runs import folder
 from harness.runs.records import Answer
-from harness.runs.settings import HelperSettings, Settings
 
 Said = tuple[int, str, str]
 LETTERS = pytest.mark.parametrize("letters", ["raw", "cyclic"])
@@ -206,19 +203,6 @@ def test_what_is_no_read_out_of_a_language_model_is_refused(harness: Callable[..
     code, _, err = harness("eval", "--model", "proxy", "--flip", "--limit", "1")
     said = "proxy answers in json; leave it out, or give a language model and --answer readout"
     assert (code, err) == (2, f"harness: --flip: {said}\n")
-
-
-def test_helpers_are_flipped_where_they_read_out() -> None:
-    for mode, flips in (("json", False), ("readout", True)):
-        ego, helpers = agents(
-            Settings(
-                model="swarm-tiny", prompt="v4", answer="readout", flip=True,
-                helpers=HelperSettings(answer=mode),
-            ),
-            SCENARIO,
-        )  # fmt: skip
-        assert (ego.flip, helpers[0].flip) == (True, flips)
-        assert helpers[0].settings().get("flip", False) == flips
 
 
 @pytest.mark.parametrize(

@@ -157,8 +157,6 @@ HOSTILE = {
     "1, column 9); put a text in quotes",
     "limit = 2": "settings stated.toml: limit stands in a table; "
     "write limit below a line [world] instead",
-    'helper_model = "proxy"': "helper_model stands in a table; write "
-    "model below a line [helpers] instead",
     'condition = "6g"': "condition = '6g'; allowed: a list",
     "world = 2": "world = 2; allowed: a table",
 }

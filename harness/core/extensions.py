@@ -44,7 +44,7 @@ KINDS = frozenset(
 # The kinds that it takes from extensions that ship alone.
 SHIPPED_KINDS = frozenset(
     {
-        *("channel_models", "encodings", "families", "options", "panels", "readers"),
+        *("agents", "channel_models", "encodings", "families", "options", "panels", "readers"),
         *("selections", "sources", "stopping_rules", "timers"),
     }
 )
@@ -65,7 +65,7 @@ class Setting:
     `help` is a sentence for people. `behind` names settings, each with its table, such as
     `world.limit`: files and help list this one after the first of them that the world of a run has,
     and in its table. It is empty for a table of their own. `only` names the world that alone has
-    the option, `frozen` or `closed-loop`; empty for both.
+    the option, `frozen` or `closed-loop`; empty for both. `listed` allows to type it several times.
     """
 
     kind: type  # str, int, float, bool or tuple, for texts
@@ -76,11 +76,24 @@ class Setting:
     # and help have it. Empty for the table of all that extensions add
     behind: tuple[str, ...] = ()
     only: str = ""  # the world that alone has its option: `frozen` or `closed-loop`; empty for both
+    # of one behind another: where files have it, as `TABLE.KEY`; empty for its name, in that one's
+    # table
+    place: str = ""
+    listed: bool = False  # a text that may be typed several times, which are joined by commas
+    models: bool = False  # names of models: a file alone opens only those that have a card
 
     @property
     def table(self) -> str:
         """The table of files in which it stands behind another; empty for none."""
-        return self.behind[0].rpartition(".")[0] if self.behind else ""
+        beside = self.place or next(iter(self.behind), "")
+        return beside.rpartition(".")[0]
+
+    def path(self, name: str) -> str:
+        """Return the key of files that have this setting, behind its table: `world.limit`.
+
+        `name` is the setting's.
+        """
+        return self.place or f"{self.table}.{name}".lstrip(".")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +198,7 @@ def in_order(names: Iterable[str]) -> list[str]:
     out.
     """
     core, order, followers = list(names), list[str](), dict[str, list[str]]()
-    others = {f"{each.table}.{name}".lstrip("."): each for name, each in beside().items()}
+    others = {each.path(name): each for name, each in beside().items()}
     for name, setting in others.items():
         places = [place for place in setting.behind if place in {*core, *others}]
         followers.setdefault(next(iter(places), ""), []).append(name)
@@ -213,10 +226,20 @@ def owner_of_plugin(kind: str, name: str) -> str | None:
 def setting_of_run(name: str) -> OfExtension | None:
     """Return the extension that adds a setting of runs by a name without its table, or None.
 
-    It is read from package metadata, with the value that does nothing where that is not null.
+    The name is that of files, or the option's, with the table where both differ. It is read from
+    package metadata, with the value that does nothing where that is not null.
     """
     entry = entries(PLUG_INS).get(f"settings {name}")
     return _of_entry(entry) if entry else None
+
+
+def tables_of_settings() -> set[str]:
+    """Return the names of files' tables that have settings of extensions alone.
+
+    They are read from package metadata, which name such a setting by its table and key as well.
+    """
+    places = [key.partition(" ")[2] for key in entries(PLUG_INS) if key.startswith("settings ")]
+    return {place.partition(".")[0] for place in places if "." in place}
 
 
 def control_settings() -> dict[str, str]:
@@ -241,7 +264,7 @@ def _of_entry(entry: Any) -> OfExtension:
 
 def _extension_of(entry: Any) -> str:
     """Return the extension that an entry of the metadata names by its package."""
-    return str(entry.value).rpartition(".")[2]
+    return _of_entry(entry).extension
 
 
 def joined(core: Texts, kind: str) -> Mapping[str, Any]:
@@ -394,6 +417,7 @@ def _is_setting(name: Any, setting: Any) -> bool:
         )
         and (setting.kind is not tuple or not setting.default)
         and setting.only in ("", "frozen", "closed-loop")
+        and isinstance(setting.place, str)
         and (not isinstance(setting.default, float) or isfinite(setting.default))
         and isinstance(setting.help, str)
     )

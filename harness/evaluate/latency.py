@@ -81,7 +81,7 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
 def declared(text: str) -> Latency:
     """Return the latency of a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds.
 
-    A role left out has the ego's time. Several helper models have one time each:
+    A role left out has the ego's time. Several agents of helpers have one time each:
     `helper=0.164:0.2`. Raises UserError for any other text.
     """
     pairs = [part.partition("=") for part in text.split(",")]

@@ -3,8 +3,7 @@ operating points and seeds in place of names.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
@@ -20,7 +19,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Source, Spec, replayed
 from harness.prompts import versions
-from harness.runs import stopping, timers
+from harness.runs import role_agents, stopping, timers
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.runs.timers import Timer
 from harness.world.scenario import Scenario
@@ -111,10 +110,11 @@ def _shipped(scenario: str) -> dict[str, Any]:
 def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, ...]]:
     """Return the ego's agent, and those of the helpers, by a run's settings.
 
-    Raises UserError for models, prompts or answer modes that do not exist or do not fit.
+    There are none of helpers for whom the ego's agent answers. Raises UserError for models, prompts
+    or answer modes that do not exist or do not fit.
     """
-    helpers, version = settings.helpers, settings.prompt or scenario.prompt
     card = cards.resolve(settings.model, settings.engine)
+    prompt = versions.load(settings.prompt or scenario.prompt)
     # Agent checks the modes.
     how = (
         settings.answer,
@@ -124,50 +124,14 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
         settings.sums,
         settings.flip,
     )
-    ego = Agent(card, versions.load(version), *how)  # type: ignore[arg-type]
-    prompt, mode = (
-        versions.load(helpers.prompt or version),
-        helpers.answer or settings.answer,
-    )
-    if settings.letters and not {settings.answer, mode} & {*BARE}:
+    ego = Agent(card, prompt, *how)  # type: ignore[arg-type]
+    helpers = role_agents.opened(settings, ego)
+    if settings.letters and not any(agent.answer in BARE for agent in (ego, *helpers)):
         raise UserError(
             f"--letters {settings.letters}: no letters are read of an answer in {settings.answer}; "
             "leave it out, or give --answer readout"
         )
-    helper_cards = (
-        [cards.resolve(name.strip()) for name in helpers.model.split(",")]
-        if helpers.model
-        else [card]
-    )
-    with helper_options({"--answer": helpers.answer, "--thinking": helpers.thinking}):
-        helper_arguments = (
-            prompt,
-            mode,
-            settings.thinking if helpers.thinking is None else helpers.thinking,
-            settings.image if prompt.image else "own",
-            settings.letters if mode in BARE else None,
-            settings.sums if mode == "json" else "refuse",
-            settings.flip and mode in BARE,
-        )
-        return ego, tuple(Agent(helper_card, *helper_arguments) for helper_card in helper_cards)  # type: ignore[arg-type]
-
-
-@contextmanager
-def helper_options(typed: Mapping[str, object]) -> Iterator[None]:
-    """Enter a context in which a UserError about a helper's setting names its own option.
-
-    `typed` has the helper's own values by the ego's option, such as `--answer`; None where the
-    ego's holds.
-    """
-    try:
-        yield
-    except UserError as error:
-        reason = str(error)
-        if typed.get(reason.partition(" ")[0].rstrip(":")) is not None:
-            reason = reason.replace("--", "--helper-", 1)
-        raise UserError(
-            reason if reason.startswith("--helper-") else f"helpers: {reason}"
-        ) from None
+    return ego, helpers
 
 
 def points(

@@ -29,14 +29,13 @@ from harness.evaluate.command_options import Guard
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
-from harness.runs import formats, stopping, timers
+from harness.runs import formats, role_agents, stopping, timers
 from harness.runs.folder import read
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Manifest
 from harness.runs.settings import (
     DriveSettings,
     FrozenSettings,
-    HelperSettings,
     Settings,
     of_extensions,
 )
@@ -156,17 +155,8 @@ class Spec:
         self._check_sampling()
         for agent in self.agents:
             self._check(agent)
-        drivers = [agent for agent in self.agents if not agent.can.asks_helpers]
-        if self.helpers and drivers and (self.ego in drivers or not self.several_decide):
-            if self.ego in drivers:
-                raise UserError(
-                    f"--model {printable(self.ego.card.name)}: it is a driver, which asks no "
-                    "helpers; give another model, or leave the helpers' options out"
-                )
-            raise UserError(
-                f"--helper-model: {printable(drivers[0].card.name)} is a driver, which decides for "
-                "an ego only; give other models"
-            )
+        if self.helpers:
+            role_agents.of_helpers().check(self)
         if (latency := self.settings.latency) not in (None, *NAMES):
             times = len(declared(latency).helpers_s)
             if times and times != len(self.helpers):
@@ -331,14 +321,7 @@ class Spec:
         """Why the ego's prompt cannot show helpers' messages; None if it can."""
         if bare := [agent.answer for agent in self.agents if agent.answer in BARE]:
             return f"a {bare[0]} gives no messages to fuse; use --answer json or constrained"
-        version, form = self.ego.prompt.version, self.ego.prompt.helper_answer
-        for prompt in (helper.prompt for helper in self.helpers):
-            if prompt.helper_answer != form:
-                return (
-                    f"prompt {version} fuses messages with a {form}, those of {prompt.version} "
-                    f"have a {prompt.helper_answer}; use another --helper-prompt"
-                )
-        return None
+        return role_agents.of_helpers().unlike(self) if self.helpers else None
 
     @property
     def agents(self) -> tuple[Agent, ...]:
@@ -363,8 +346,8 @@ class Spec:
     def agent_of_answer(self, agent: int) -> int | UnsetType:
         """Return what an answer of an agent says of it: its index, where its place would not say.
 
-        So it is unset with one helper model, or where every helper is asked in turn, and for the
-        ego unless other vehicles decide as well.
+        So it is unset with one agent of helpers, or where every helper is asked in turn, and for
+        the ego unless other vehicles decide as well.
         """
         if self.several_decide and self.helpers:
             return agent
@@ -470,23 +453,11 @@ class Spec:
 
         A counterpart of a condition has a name of its own, and so has a model on another engine.
         """
-        helpers = HelperSettings()
-        if self.helpers:
-            thinking = any(
-                agent.thinking and agent.card.thinking != "always" for agent in self.helpers
-            )
-            helpers = HelperSettings(
-                model=",".join(argument(agent.card) for agent in self.helpers),
-                prompt=self.helpers[0].prompt.version,
-                answer=self.helpers[0].answer,
-                thinking=None if thinking == self.ego.thinking else thinking,
-            )
         first = self.seeds[0]
         return {
             "model": argument(self.ego.card),
             "engine": None,
             "prompt": self.ego.prompt.version,
-            "helpers": helpers,
             "world": self.source.settings(),
             "condition": tuple(point.name for point in self.points),
             "seeds": ",".join(map(str, self.seeds))
@@ -510,11 +481,11 @@ class Spec:
         beside = extensions.beside()
         settings: dict[str, Any] = {}
         for name, setting in of_extensions().items():
-            if name not in beside and setting.default not in formats.NO_TEXTS:
+            if name not in beside and setting.default not in (None, *formats.NO_TEXTS):
                 settings[name] = setting.default
         others = stopping.without(timers.without(select.without(self.settings.extensions)))
         for name, value in others.items():
-            if name not in COUNTERPARTS:
+            if name not in (*COUNTERPARTS, *role_agents.settings()):
                 settings[name] = value
         given = self.source.choice.given if self.source.choice else {}
         for name, value in given.items():
@@ -522,7 +493,10 @@ class Spec:
                 settings[name] = value
         by_timer = self.timer.settings() if self.timer else {}
         by_rule = self.stopping_rule.settings() if self.stopping_rule else {}
-        return {**settings, **by_timer, **by_rule}
+        by_agents = {}
+        if self.helpers:
+            by_agents = role_agents.of_helpers().settings(self.ego, self.helpers)
+        return {**settings, **by_timer, **by_rule, **by_agents}
 
     @property
     def ties(self) -> str:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from harness.core import extensions
 from harness.core.errors import UserError, printable
 from harness.core.extensions import part_of
+from harness.runs import role_agents
 from harness.world.families import FAMILIES
 
 NUMBER = 2
@@ -41,8 +42,8 @@ BESIDE: Mapping[str, str] = {
 }
 
 # Settings that a user types in several ways, by a name, a path or a URL: a name is held to what it
-# names.
-TYPED = ("model", "helpers.model", "world.dataset", "world.scenario")
+# names. So are those of extensions that name models.
+TYPED = ("model", "world.dataset", "world.scenario")
 
 
 class Added(NamedTuple):
@@ -244,12 +245,16 @@ def gathered(settings: Mapping[str, Any], of_run: bool = False) -> dict[str, Any
     tables = {name: value for name, value in settings.items() if isinstance(value, Mapping)}
     for name, setting in beside.items():
         place = tables.get(setting.table, {}) if setting.table else settings
-        if place.get(name) is not None:
-            entries[name] = place[name]
+        value = place.get(_key(name, setting))
+        if value is not None:
+            entries[name] = value
     table = _without_gone(_without(settings, ""))
     for name, inner in tables.items():
         if name != EXTENSIONS:
-            table[name] = _without_gone(_without(inner, name), of_run and name == WORLD)
+            others = _without_gone(_without(inner, name), name, of_run and name == WORLD)
+            table[name] = others
+            if not others and name in extensions.tables_of_settings():
+                del table[name]
     by_name = table.get(EXTENSIONS, {})
     if isinstance(by_name, Mapping):
         unset = [(name, setting.default) for name, setting in beside.items()]
@@ -261,30 +266,38 @@ def gathered(settings: Mapping[str, Any], of_run: bool = False) -> dict[str, Any
     return {**table, EXTENSIONS: by_name}
 
 
+def _key(name: str, setting: extensions.Setting) -> str:
+    """Return the key of files, in its table, that has this setting of an extension."""
+    return setting.path(name).rpartition(".")[2]
+
+
 def _without(table: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return the table of this name without the settings of extensions that stand in it."""
     beside = extensions.beside()
-    others = {key for key, setting in beside.items() if setting.table == name}
+    others = {_key(each, setting) for each, setting in beside.items() if setting.table == name}
     return {key: value for key, value in table.items() if key not in others}
 
 
-def _without_gone(table: Mapping[str, Any], of_scenes: bool = False) -> dict[str, Any]:
-    """Return a table without settings whose extension is not installed.
+def _without_gone(
+    table: Mapping[str, Any], name: str = "", of_scenes: bool = False
+) -> dict[str, Any]:
+    """Return the table of this name without settings whose extension is not installed.
 
     Raises UserError for one that does something, but not of those `of_scenes` of a run.
     """
     kept = {}
-    for name, value in table.items():
-        owner = extensions.setting_of_run(name)
+    for key, value in table.items():
+        places = [place for place in (key, f"{name}.{key}") if extensions.setting_of_run(place)]
+        owner = extensions.setting_of_run(places[0]) if places else None
         if owner is None or owner.extension in extensions.extensions():
-            kept[name] = value
+            kept[key] = value
         elif (
             not of_scenes
             and value is not None
             and value not in NO_TEXTS
             and str(value) != owner.idle
         ):
-            raise UserError(f"setting {name} is {part_of(owner.extension)}")
+            raise UserError(f"setting {places[0]} is {part_of(owner.extension)}")
     return kept
 
 
@@ -320,11 +333,15 @@ def _in_order(
     table: Mapping[str, Any], of_extensions: Mapping[str, Any], prefix: str
 ) -> dict[str, Any]:
     """Return a table with the settings of extensions that stand in it; `prefix` is its name."""
-    beside, full = extensions.beside(), {}
+    beside, full = extensions.beside(), dict[str, Any]()
+    names = {setting.path(name): name for name, setting in beside.items()}
     for path in extensions.in_order(f"{prefix}{name}" for name in table):
-        name = path.removeprefix(prefix)
-        is_added = name not in table
-        full[name] = of_extensions.get(name, beside[name].default) if is_added else table[name]
+        *outer, key = path.removeprefix(prefix).split(".")
+        if not outer and key in table:
+            full[key] = table[key]
+        else:
+            inner = full.setdefault(outer[0], {}) if outer else full
+            inner[key] = of_extensions.get(names[path], beside[names[path]].default)
     return full
 
 
@@ -350,15 +367,32 @@ def _table(record: Mapping[str, Any], in_file: Any) -> Any:
     flat = _flat(table)
     if isinstance(in_file, Mapping):
         flat = {**_flat(in_file), **flat}
+    if "settings" in record:  # and states none of these, where there is none
+        flat = {**dict.fromkeys(map(_extensions_key, role_agents.settings())), **flat}
+    of_extensions = extensions.beside().items()
+    by_model = [_extensions_key(name) for name, setting in of_extensions if setting.models]
     card = record.get("model")
     places = [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
     for name, there in _flat(beside).items():
         typed = flat.get(name, there)
         is_place = name == "model" and typed is not None and typed in places
-        if typed != there and not (name in TYPED and (is_place or _may_be(typed, there))):
+        may_be = name in (*TYPED, *by_model) and (is_place or _may_be(typed, there))
+        if typed != there and not may_be:
             both = f"{printable(flat[name], 60)}, and beside them it is {printable(there, 60)}"
-            raise ValueError(f"its settings have {name} {both}")
+            raise ValueError(f"its settings have {_place(name)} {both}")
     return _with(SETTINGS, table)
+
+
+def _extensions_key(name: str) -> str:
+    """Return what `_flat` calls a setting of an extension."""
+    return f"{EXTENSIONS}.{name}"
+
+
+def _place(name: str) -> str:
+    """Return the place in files of a setting that `_flat` calls so: `model`, or `world.limit`."""
+    table, _, key = name.partition(".")
+    beside = extensions.beside()
+    return beside[key].path(key) if table == EXTENSIONS and key in beside else name
 
 
 def _may_be(typed: Any, names: Any) -> bool:
@@ -386,9 +420,10 @@ def _is_called(text: str, name: str) -> bool:
 
 def _opened(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings that opened what a run states, each as it is called there."""
-    seeds, world, helpers = (record[name] for name in ("seeds", "world", "helpers"))
+    seeds, world = record["seeds"], record["world"]
     opened = dict.fromkeys(extensions.beside()) | record["beside"]
     names = {name: _name_of(value) for name, value in opened.items()}
+    names |= role_agents.recorded(record["helpers"])
     scenes = {"kind": world["kind"], "dataset": world.get("path"), **world.get("selection", {})}
     if "scenario" in world:
         scenes |= {"scenario": world["scenario"]["name"], "first_seed": world["first_seed"]}
@@ -400,13 +435,6 @@ def _opened(record: Mapping[str, Any]) -> dict[str, Any]:
         "condition": [point["name"] for point in record["conditions"]],
         EXTENSIONS: {name: value for name, value in names.items() if value is not None},
         "world": scenes,
-        "helpers": {
-            "model": ",".join(helper["model"]["name"] for helper in helpers),
-            "prompt": helpers[0]["prompt"]["version"],
-            "answer": helpers[0]["answer"],
-        }
-        if helpers
-        else {},
     }
 
 

@@ -121,8 +121,8 @@ class Answer(Struct, frozen=True, kw_only=True):
     # whether the likeliest action changed when the list of actions was reversed; unset where that
     # was not asked, or got no answer
     flipped: bool | UnsetType = UNSET
-    # which of several helper models answered, from 1; where several vehicles decide, also 0, the
-    # ego's; unset where the place among all answers says
+    # which of several agents of helpers answered, from 1; where several vehicles decide, also 0,
+    # the ego's; unset where the place among all answers says
     agent: int | UnsetType = UNSET
     # all that is wrong with a failed answer, the status first; unset where that is the only fault
     faults: tuple[str, ...] | UnsetType = UNSET
@@ -233,11 +233,11 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     basis: str  # where the numbers come from
     # seconds of one inference of the ego; None if each answer is timed, like the next two
     ego_s: Seconds | None = None
-    # seconds of one inference of a helper; of the first of several helper models
+    # seconds of one inference of a helper; of the first of several agents
     helper_s: Seconds | None = None
     fusion_s: Seconds | None = None  # seconds of the ego's fusion call
     sample: dict[str, Times] = {}  # times of the answers behind a measured latency, by role
-    # seconds of each of several helper models; empty if there is only one
+    # seconds of each of several agents of helpers; empty if there is only one
     helpers_s: tuple[Seconds, ...] = ()
     # the speed of each agent, the ego's first, if each answer is timed (`Timer.speed`); else empty
     speeds: tuple[Any, ...] = ()
@@ -254,7 +254,7 @@ class Latency(Struct, frozen=True, omit_defaults=True):
             structs.force_setattr(self, "speeds", speeds)
 
     def helper_times_s(self) -> tuple[Seconds, ...]:
-        """Return the seconds of each helper model, which are assigned to helpers in turn.
+        """Return the seconds of each agent of helpers, which are assigned to helpers in turn.
 
         It is empty if each answer is timed.
         """

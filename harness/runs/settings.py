@@ -17,7 +17,7 @@ from msgspec import Meta, Struct, structs, to_builtins
 
 from harness.core import extensions
 from harness.core.config import convert, toml
-from harness.core.errors import UserError, in_range, printable, sayable
+from harness.core.errors import UserError, in_range, printable, sayable, unknown
 from harness.core.extensions import Setting
 from harness.core.plugins import say_once
 from harness.core.resources import DATASET, card_to_copy, names
@@ -58,31 +58,6 @@ def option(
     """
     in_command = {"help": text, "panel": panel, "only": only, "listed": listed}
     return Meta(extra={**in_command, "same": same, "compared": compared})
-
-
-class HelperSettings(Struct, frozen=True, kw_only=True):
-    """Hold the settings of the helpers' agents, where they differ from the ego's."""
-
-    model: Annotated[
-        str | None,
-        option(
-            "Model of the helpers. Several, such as a,b,c, are assigned to the helpers in turn. "
-            "Repeatable. Default: the ego's model.",
-            HELPERS,
-            listed=True,
-        ),
-    ] = None
-    prompt: Annotated[
-        str | None, option("Prompt version of the helpers. Default: the ego's prompt.", HELPERS)
-    ] = None
-    answer: Annotated[
-        str | None,
-        option("How the helpers answer, as --answer says. Default: like the ego.", HELPERS),
-    ] = None
-    thinking: Annotated[
-        bool | None,
-        option("Ask the helpers to think before they answer. Default: like the ego.", HELPERS),
-    ] = None
 
 
 class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="frozen"):
@@ -157,7 +132,6 @@ class Settings(Struct, frozen=True, kw_only=True):
             same=OPENED,
         ),
     ] = None
-    helpers: HelperSettings = HelperSettings()
     world: FrozenSettings | DriveSettings = FrozenSettings()
     seeds: Annotated[
         str,
@@ -312,7 +286,7 @@ class Option(NamedTuple):
     """
 
     path: tuple[str, ...]  # the names of the table and the key in `run.toml`
-    name: str  # as a parameter: helper_model
+    name: str  # as a parameter: batch_size
     kind: Any  # str, int, float, bool or list[str]
     default: Any
     help: str
@@ -320,6 +294,7 @@ class Option(NamedTuple):
     listed: bool  # whether it may be typed several times, which are joined by commas
     same: str  # what of it is the same when a stopped run resumes
     compared: bool  # whether a comparison of two runs tells it
+    models: bool = False  # whether it names models
     is_added: bool = False  # whether an extension adds it
 
     @property
@@ -354,12 +329,14 @@ def options(world: type[Struct]) -> list[Option]:
     by_path = {".".join(each.path): each for each in core_options(world)}
     declared, last, kind = list[Option](), list[Option](), str(world.__struct_config__.tag)
     beside = extensions.beside()
+    names_beside = {setting.path(name): name for name, setting in beside.items()}
     for path in extensions.in_order(by_path):
-        *table, name = path.split(".")
         if path in by_path:
             declared.append(by_path[path])
-        elif beside[name].only in ("", kind):
-            declared.append(_added(name, beside[name], (*table, name)))
+            continue
+        name = names_beside[path]
+        if beside[name].only in ("", kind):
+            declared.append(_added(name, beside[name], tuple(path.split("."))))
     for name, setting in of_extensions().items():
         if name not in beside and setting.only in ("", kind):
             last.append(_added(name, setting, (EXTENSIONS, name)))
@@ -371,14 +348,13 @@ def _added(name: str, setting: Setting, path: tuple[str, ...]) -> Option:
     owners = extensions.extensions().values()
     panel = next(f"Extension {owner.name}" for owner in owners if name in owner.settings)
     kind = list[str] if setting.kind is tuple else setting.kind
-    shape = (kind, setting.default, setting.help, panel)
-    return Option(path, name, *shape, False, ITSELF, True, is_added=True)
+    shape = (kind, setting.default, setting.help, panel, setting.listed, ITSELF, True)
+    return Option(path, name, *shape, models=setting.models, is_added=True)
 
 
 def core_options(world: type[Struct]) -> list[Option]:
     """Return the options of the command for this world, without those of extensions."""
-    tables: dict[str, type[Struct]] = {"helpers": HelperSettings, "world": world}
-    return [*_options(Settings, str(world.__struct_config__.tag), tables)]
+    return [*_options(Settings, str(world.__struct_config__.tag), {"world": world})]
 
 
 def of_extensions() -> dict[str, Setting]:
@@ -402,10 +378,10 @@ def _options(
             continue
         plain, meta = get_args(hints[field.name])
         if meta.extra["only"] in ("", only):
-            name = f"helper_{field.name}" if table == "helpers" else field.name
             path = (table, field.name) if table else (field.name,)
             facts = [meta.extra[key] for key in ("help", "panel", "listed", "same", "compared")]
-            yield Option(path, name, _kind(plain), field.default, *facts)
+            each = Option(path, field.name, _kind(plain), field.default, *facts)
+            yield each._replace(models=field.name == "model")
 
 
 def _kind(plain: Any) -> Any:
@@ -448,7 +424,11 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
     """
     tables: dict[str, Any] = to_builtins(settings)
     for each in options(type(settings.world)):
-        if each.name in given:
+        if each.name not in given:
+            continue
+        if each.is_added:
+            tables[EXTENSIONS][each.name] = given[each.name]
+        else:
             table = tables if len(each.path) == 1 else tables[each.path[0]]
             table[each.path[-1]] = given[each.name]
     return convert(formats.gathered(tables), Settings, "settings")
@@ -515,17 +495,14 @@ def text_of(settings: Settings) -> str:
     beside = [word for words in _only_typed(settings).values() for word in words]
     again = _again(settings, Path(FILE), beside)
     lines = [f"# The settings of a run. `{again}` runs it again; an option beside it wins."]
-    tables: dict[str, list[str]] = {
-        "": [],
-        "helpers": [],
-        "world": [f"kind = {_toml(kind_of(settings))}"],
-        EXTENSIONS: [],
-    }
+    tables: dict[str, list[str]] = {"": []}
     for option in options(type(settings.world)):
         value = option.of(settings)
+        *table, key = option.path
+        rows = tables.setdefault("".join(table), [])
         if value not in (None, ()):
-            *table, key = option.path
-            tables["".join(table)].append(f"{key} = {_toml(value)}")
+            rows.append(f"{key} = {_toml(value)}")
+    tables["world"].insert(0, f"kind = {_toml(kind_of(settings))}")
     for name, rows in tables.items():
         if name and rows:
             lines.append(f"\n[{name}]")
@@ -547,7 +524,7 @@ def _only_typed(settings: Settings) -> dict[str, list[str]]:
     named: dict[str, list[str]] = {}
     for each in options(type(settings.world)):
         value = each.of(settings)
-        if each.name in ("model", "helper_model"):
+        if each.models:
             models = filter(None, map(str.strip, (value or "").split(",")))
             allowed = all(model.startswith("replay:") or _is_card(model) for model in models)
         else:
@@ -649,25 +626,38 @@ def check_extensions(settings: Settings, where: str) -> None:
         if name not in names:
             command = f"harness {COMMANDS[kind_of(settings)]}"
             raise UserError(f"{where}: {name} is no setting of `{command}`; leave it out")
-        kind = known_settings[name].kind
+        setting = known_settings[name]
+        kind, place = setting.kind, setting.path(name)
         if type(value) is not kind and not (kind is float and type(value) is int):
             allowed = "a list of texts" if kind is tuple else kind.__name__
-            raise UserError(f"{where}: {name} = {printable(repr(value))}; allowed: {allowed}")
+            raise UserError(f"{where}: {place} = {printable(repr(value))}; allowed: {allowed}")
 
 
 def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str, Any]:
     """Return the tables of a file, with the kind of episodes that its command has,
     if it states none.
 
-    Raises UserError if an option stands outside of its table.
+    Raises UserError if an option stands outside of its table, or if a table of extensions' options
+    alone holds another.
     """
     kind = str(world.__struct_config__.tag)
+    of_extensions: dict[str, list[str]] = {}
     for each in options(world):
         table, *inner = each.path
         for key in {each.name, each.flag.removeprefix("--")} & tables.keys() if inner else ():
             raise UserError(
                 f"{where}: {key} stands in a table; write {inner[0]} below a line [{table}] instead"
             )
+        if inner and table not in Settings.__struct_fields__:
+            of_extensions.setdefault(table, []).append(inner[0])
+    for table, keys in of_extensions.items():
+        options_there = tables.get(table, {})
+        if not isinstance(options_there, dict):
+            value = printable(repr(options_there))
+            raise UserError(f"{where}: {table} = {value}; allowed: a table")
+        for key in options_there:
+            if key not in keys:
+                raise unknown(f"key in {where} [{table}]", key, keys)
     section = tables.get("world", {})
     return {**tables, "world": {"kind": kind, **section}} if isinstance(section, dict) else tables
 

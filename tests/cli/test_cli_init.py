@@ -112,12 +112,12 @@ def test_each_line_of_its_settings_can_be_switched_on(project: Path) -> None:
     assert switched > 6
     file.write_text(text)
     every = settings.read(file, settings.FrozenSettings, {})
-    assert (every.answer, every.tag, every.helpers.model) == (
+    assert (every.answer, every.tag, every.extensions) == (
         "constrained",
         ("first",),
-        "swarm-tiny",
+        {"helper_model": "swarm-tiny", "helper_prompt": "v2"},
     )
-    assert (usual.answer, usual.tag, usual.helpers.model) == ("json", (), None)
+    assert (usual.answer, usual.tag, usual.extensions) == ("json", (), {})
     assert usual.condition == every.condition == ("single-local", "6g")
 
 

@@ -51,6 +51,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ENTRIES = PROJECT["entry-points"]
 # kinds of plug-ins that conditions name, and of what reads their files
 NAMED = (
+    "agents",
     "channel_models",
     "contents",
     "encodings",
@@ -404,6 +405,8 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     extension = known.extensions()[name]
     plug_ins = [f"{kind} {each}" for kind in NAMED for each in extension.adds.get(kind, {})]
     plug_ins += [f"settings {each}" for each in extension.settings]
+    places = [each.place for each in extension.settings.values() if each.place]
+    plug_ins += [f"settings {place}" for place in places]
     assert ENTRIES[known.GROUP][name] == f"{PACKAGES}{name}:EXTENSION"
     for group, names in (
         (known.COMMANDS, [*extension.commands, *extension.spellings, *extension.short]),
@@ -420,6 +423,8 @@ def test_the_metadata_name_what_an_extension_that_ships_has(name: str) -> None:
     for setting, each in extension.settings.items():
         idle = "" if each.default in (None, ()) else str(each.default)
         assert known.setting_of_run(setting) == known.OfExtension(name, idle)
+        if each.place:
+            assert known.setting_of_run(each.place) == known.OfExtension(name, idle)
     for part in extension.adds.get("parts", {}):
         for setting, default in structs.asdict(more_parts()[part]()).items():
             idle = "" if default is None else str(default)
@@ -601,35 +606,42 @@ def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
     (tmp_path / "run.toml").write_text('device_profile = "agx-orin"\n')
     (tmp_path / "attacked.toml").write_text('control = []\nattack = ["liar"]\n')
     (tmp_path / "until.toml").write_text("[world]\nuntil_width = 10\n")
+    (tmp_path / "mixed.toml").write_text('[helpers]\nmodel = "proxy-faulty"\n')
     code = (
         "import sys\nfrom harness.core.errors import UserError\nfrom harness.runs import formats, "
-        "stopping, timers\nfrom harness.__main__ import main\nidle = {'device_profile': None, "
-        "'device_model': None, 'control': [], 'attack': [], 'ties': 'drawn', 'world': {'until_width': None}}\n"
+        "role_agents, stopping, timers\nfrom harness.__main__ import main\nidle = {'device_profile': None, "
+        "'device_model': None, 'control': [], 'attack': [], 'helpers': {'model': None}, "
+        "'ties': 'drawn', 'world': {'until_width': None}}\n"
         "print(formats.gathered(idle))\n"
         "print('device_profile' in formats.upgraded({**idle, 'settings': idle}))\n"
         "for ask in (lambda: formats.upgraded({'device_profile': {'name': 'mine'}}), "
         "lambda: formats.gathered({'world': {'until_width': 10.0}}), "
-        "lambda: timers.timer('device'), lambda: stopping.rule_of({'layouts': 4})):\n"
+        "lambda: formats.gathered({'helpers': {'prompt': 'v2'}}), "
+        "lambda: timers.timer('device'), lambda: stopping.rule_of({'layouts': 4}), "
+        "lambda: role_agents.recorded([{}])):\n"
         "    try:\n        ask()\n"
         "    except UserError as error:\n        print(error)\n"
         "for typed in (['--device-profile', 'agx-orin'], ['run.toml'], ['--control', 'no-messages'], "
-        "['attacked.toml'], ['until.toml']):\n"
+        "['attacked.toml'], ['until.toml'], ['--helper-model', 'proxy'], ['mixed.toml']):\n"
         "    sys.argv = ['harness', 'eval', *typed]\n"
         "    try:\n        main()\n    except SystemExit as end:\n        print(end.code)\n"
     )
     done = in_the_core(core, tmp_path, code)
     gone = "is part of the extension devices, which is not installed"
     early_stop = "is part of the extension early_stop, which is not installed"
+    mixed = "part of the extension mixed_helpers, which is not installed"
     assert done.stdout.splitlines() == [
         "{'ties': 'drawn', 'world': {}, 'extensions': {}}",
         "False",
         f"setting device_profile {gone}",
         f"setting until_width {early_stop}",
+        f"setting helpers.prompt is {mixed}",
         f"what timed the answers of a run, device, {gone}",
         f"what may stop a run, looks in its run.json, {early_stop}",
-        *["2"] * 5,
+        f"helpers that the ego's agent does not answer for are {mixed}",
+        *["2"] * 7,
     ]
-    typed, stated, control, attack, until = done.stderr.splitlines()
+    typed, stated, control, attack, until, helper, helpers = done.stderr.splitlines()
     assert typed.startswith(f"harness: --device-profile {gone} in `harness eval --device-profile ")
     assert stated == f"harness: setting device_profile {gone}"
     assert control.startswith("harness: --control is part of the extension controls, which is not ")
@@ -637,6 +649,8 @@ def test_a_setting_of_a_run_that_is_gone_is_null_or_says_what_it_was_part_of(
         attack == "harness: setting attack is part of the extension trust, which is not installed"
     )
     assert until == f"harness: setting until_width {early_stop}"
+    assert helper.startswith(f"harness: --helper-model is {mixed} in `harness eval --helper-model ")
+    assert helpers == f"harness: setting helpers.model is {mixed}"
 
 
 @pytest.mark.slow

@@ -1,6 +1,4 @@
-"""Ask beyond one run: repeats, every pair of agents, twins of questions, what moved answers,
-frozen against driven.
-"""
+"""Ask beyond one run: repeats, twins of questions, what moved answers, frozen against driven."""
 
 from harness.core.extensions import Extension
 
@@ -9,19 +7,17 @@ _HERE = "harness.extensions.studies"
 EXTENSION = Extension(
     name="studies",
     commands={
-        "study grid": f"{_HERE}.grid.command:command",
         "study repeats": f"{_HERE}.repeats.command:command",
         "study twins": f"{_HERE}.twins.command:command",
         "study attribute": f"{_HERE}.attribution.command:command",
         "study fidelity": f"{_HERE}.fidelity.command:command",
     },
     spellings={
-        "grid": "study grid",
         "twins": "study twins",
         "attribute": "study attribute",
         "fidelity": "study fidelity",
         "eval --repeats": "study repeats",
     },
-    studies={"grid": "grid", "repeats": "repeats", "twins": "twins", "fidelity": "study"},
+    studies={"repeats": "repeats", "twins": "twins", "fidelity": "study"},
     adds={"remarks": {"attribution": f"{_HERE}.attribution.remarks:REMARKS"}},
 )

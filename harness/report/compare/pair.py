@@ -42,7 +42,8 @@ ORDER = (
     "dtype",
     "latency",
 )
-SETTINGS = (*sorted(COMPARED, key=lambda name: (*ORDER, name).index(name)), "identity", "versions")
+NAMES = {**COMPARED, "helpers": None}  # settings, and the helpers' agents
+SETTINGS = (*sorted(NAMES, key=lambda name: (*ORDER, name).index(name)), "identity", "versions")
 
 
 def where(run: Run) -> str:

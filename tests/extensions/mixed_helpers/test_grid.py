@@ -21,8 +21,15 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
 from harness.evaluate.spec import Spec
-from harness.extensions.studies.grid.command import _combinations
-from harness.extensions.studies.grid.study import Cell, Grid, front, grid_study, headline, run_cells
+from harness.extensions.mixed_helpers.grid.command import _combinations
+from harness.extensions.mixed_helpers.grid.study import (
+    Cell,
+    Grid,
+    front,
+    grid_study,
+    headline,
+    run_cells,
+)
 from harness.prompts import versions
 from harness.runs.metrics import BALANCED, LATENCY, SUCCESS
 from harness.runs.settings import Settings

@@ -13,10 +13,10 @@ from harness.cli.progress import bar
 from harness.cli.run import file_name, first_folder
 from harness.cli.show import finish
 from harness.core.errors import UserError, printable
+from harness.extensions.mixed_helpers import EXTENSION
 from harness.runs.settings import FrozenSettings, Settings, changed
 
 MOST_CELLS = 256
-HELPERS = ("helper_model", "helper_prompt", "helper_answer", "helper_thinking")
 HELP = {
     "model": "Models of the ego, separated by commas.",
     "prompt": "Prompt versions of the ego, such as v2,v3. Default: the scenario's usual one.",
@@ -45,7 +45,8 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.evaluate import resolve
-    from harness.extensions.studies.grid.study import grid_study, run_cells
+    from harness.extensions.mixed_helpers.agents import named
+    from harness.extensions.mixed_helpers.grid.study import grid_study, run_cells
     from harness.studies.study import refuse_taken
 
     world: Any = settings.world
@@ -60,9 +61,8 @@ def command(
     modes = {*_names("--answer", settings.answer), *_names("--helper-answer", of_helpers.answer)}
     by_ego = _combinations(settings, "--", modes)
     egos = [resolve.agents(each, frozen.scenario)[0] for each in by_ego]
-    with resolve.helper_options(
-        {"--answer": settings.helpers.answer, "--thinking": of_helpers.thinking}
-    ):
+    answer = settings.extensions.get("helper_answer")
+    with named({"--answer": answer, "--thinking": of_helpers.thinking}):
         helpers = [
             resolve.agents(each, frozen.scenario)[0]
             for each in _combinations(of_helpers, "--helper-", modes)
@@ -87,17 +87,13 @@ def command(
 
 def _of_helpers(settings: Settings) -> Settings:
     """Return settings whose model, prompt and modes are those of the helpers."""
-    helpers = settings.helpers
-    given = {
-        "model": helpers.model,
-        "prompt": helpers.prompt,
-        "answer": helpers.answer,
-        "thinking": helpers.thinking,
-    }
-    engine = {"engine": None} if helpers.model else {}
-    return changed(
-        settings, {name: value for name, value in given.items() if value is not None} | engine
-    )
+    given: dict[str, Any] = {}
+    for name in EXTENSION.settings:
+        value = settings.extensions.get(name)
+        if value is not None:
+            given[name.removeprefix("helper_")] = value
+    engine = {"engine": None} if given.get("model") else {}
+    return changed(settings, {**given, **engine})
 
 
 def _combinations(settings: Settings, flag: str, modes: Collection[str]) -> list[Settings]:
@@ -111,7 +107,12 @@ def _combinations(settings: Settings, flag: str, modes: Collection[str]) -> list
     ]
     combinations = []
     for model, prompt, answer in product(*lists):
-        given = {**dict.fromkeys(HELPERS), "model": model, "prompt": prompt, "answer": answer}
+        given = {
+            **dict.fromkeys(EXTENSION.settings),
+            "model": model,
+            "prompt": prompt,
+            "answer": answer,
+        }
         if any(mode in modes for mode in BARE) and answer not in BARE:
             given |= {"letters": None, "flip": False}
         if "json" in modes and answer != "json":

@@ -1,5 +1,7 @@
 """Mixed swarms: the ego and its helpers have different models, prompts or answer modes."""
 
+import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -7,6 +9,7 @@ from typing import Any
 
 import pytest
 from evaluating import live_spec_of, run, same_decisions, spec_of
+from former import SCENARIO
 from run_on_disk import answers_of
 
 from harness.backends import cards
@@ -15,10 +18,12 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
 from harness.evaluate.latency import declared
+from harness.evaluate.resolve import agents
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs.folder import read
 from harness.runs.records import Answer
+from harness.runs.settings import Settings, changed
 
 RULE = "proxy · v2 · json"
 
@@ -240,3 +245,60 @@ def test_a_fusion_call_takes_messages_of_its_own_form(small: Dataset) -> None:
         mixed(small, helper("swarm-tiny", "paper"), model="swarm-tiny", points=asks)
     with pytest.raises(UserError, match="a readout gives no messages to fuse"):
         mixed(small, helper("swarm-tiny", answer="readout"), model="swarm-tiny", points=asks)
+
+
+def test_helpers_are_flipped_where_they_read_out() -> None:
+    for mode, flips in (("json", False), ("readout", True)):
+        read_out = Settings(model="swarm-tiny", prompt="v4", answer="readout", flip=True)
+        ego, [helpers] = agents(changed(read_out, {"helper_answer": mode}), SCENARIO)
+        assert (ego.flip, helpers.flip) == (True, flips)
+        assert helpers.settings().get("flip", False) == flips
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[helpers]\nmodle = 'proxy'",
+            "unknown key in settings stated.toml [helpers] 'modle'; did you mean",
+        ),
+        ("[helpers]\nmodel = 3", "settings stated.toml: helpers.model = 3; allowed: str"),
+        (
+            "[helpers]\nthinking = 'no'",
+            "settings stated.toml: helpers.thinking = 'no'; allowed: bool",
+        ),
+        (
+            "[helpers]\nmodel = ['proxy']",
+            "settings stated.toml: helpers.model = ('proxy',); allowed: str",
+        ),
+        ("helpers = 3", "settings stated.toml: helpers = 3; allowed: a table"),
+        (
+            "helper_model = 'proxy'",
+            "settings stated.toml: helper_model stands in a table; write model below a line "
+            "[helpers] instead",
+        ),
+    ],
+)
+def test_what_is_no_setting_of_helpers_in_a_file_is_one_line(
+    text: str, said: str, harness: Callable[..., Any]
+) -> None:
+    Path("stated.toml").write_text(text)
+    code, out, err = harness("eval", "stated.toml")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"harness: {said}")
+
+
+@pytest.mark.parametrize(
+    ("name", "other"), [("model", "swarm-tiny"), ("prompt", "v4"), ("answer", None)]
+)
+def test_a_run_whose_settings_say_otherwise_than_its_helpers_is_refused(
+    name: str, other: str | None, mix: Path, tmp_path: Path, harness: Callable[..., Any]
+) -> None:
+    shutil.copytree(mix, tmp_path / "copy")
+    file = tmp_path / "copy" / "run.json"
+    record = json.loads(file.read_text())
+    record["settings"]["helpers"][name] = other
+    file.write_text(json.dumps(record))
+    code, _, err = harness("run", "check", tmp_path / "copy")
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"its settings have helpers.{name} {other}, and beside them it is" in err
