@@ -24,7 +24,7 @@ from hypothesis import settings
 from shares import SHARES, share_of
 
 from harness import cli
-from harness.cli import shell
+from harness.cli import scenario, shell
 from harness.coordination import operating_point, parts, schedules
 from harness.core import extensions, resources
 from harness.dataset import rebuilt
@@ -236,7 +236,17 @@ def part_noted(extension: str) -> str:
 
 if not EXTENSIONS.is_dir():
     shell.__dict__["owner"] = owner_noted
-    for module in (axes, cli, formats, operating_point, parts, profiles, role_agents, schedules):
+    for module in (
+        axes,
+        cli,
+        formats,
+        operating_point,
+        parts,
+        profiles,
+        role_agents,
+        scenario,
+        schedules,
+    ):
         module.__dict__["part_of"] = part_noted
 
 

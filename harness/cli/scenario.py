@@ -1,7 +1,7 @@
 """`harness dataset scenario`: the scenarios, and how hard each is for the reference drivers."""
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -10,14 +10,15 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.terminal import attributes, console, echo_each, echo_fields, echo_json, table
 from harness.core import resources
-from harness.core.errors import in_range, printable
-from harness.core.figures import Unit, interval_of
+from harness.core.errors import UserError, in_range, printable
+from harness.core.extensions import owner_of_plugin, part_of
+from harness.core.figures import interval_of
+from harness.core.plugins import Shipped
 from harness.core.seeds import purpose, seeds_text
 
 if TYPE_CHECKING:
+    from harness.core.parallel import Workers
     from harness.world.scenario import Scenario
-
-Row = Sequence[str]  # of a table
 
 
 def list_scenarios(as_json: options.Json = False) -> None:
@@ -68,32 +69,63 @@ def drive(
 ) -> None:
     """Let the reference drivers drive, and show how episodes end.
 
-    All drive the same episodes. With several agents each is driven so, and by
-    a joint plan for all of them: the best found, and the best where it was
-    searched to the end.
+    All drive the same episodes. With several agents a driver drives all of them.
     """
     from harness.cli.drive import deciding
 
     name = name if agents is None else deciding(name, agents)
     scenario, who = ready_to_drive(name, episodes, seed), options.workers_of(workers)
-    from harness.world import policies, scenarios
-    from harness.world import reference as live
-    from harness.world.seats import agent_share
+    from harness.world import scenarios
 
-    together = agent_share(scenario) > 0
+    drives = drives_of(scenario)
     with bar(f"driving {printable(name, 30)}", episodes) as progress:
-        outcomes = (policies if together else live).check(scenario, episodes, seed, who, progress)
-    if together:
-        if as_json:
-            echo_json({"scenario": name, "episodes": episodes, "seed": seed, **outcomes})
-        else:
-            typer.echo(printable(scenarios.title(scenario)))
-            _swarm_tables(episodes, seed, outcomes)
-    elif as_json:
-        echo_json({"scenario": name, "episodes": episodes, "seed": seed, "drivers": outcomes})
+        outcomes = drives.check(scenario, episodes, seed, who, progress)
+    if as_json:
+        echo_json({"scenario": name, "episodes": episodes, "seed": seed, **outcomes})
     else:
         typer.echo(printable(scenarios.title(scenario)))
-        _table(episodes, seed, outcomes)
+        drives.show(episodes, seed, outcomes)
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Describe how reference drivers drive the layouts of a scenario, and what is said of it."""
+
+    # takes the scenario, how many layouts, the seed of the first, the workers, and what is told how
+    # many are done; returns the results as the JSON output has them
+    check: Callable[["Scenario", int, int, "Workers", Callable[[int], None]], dict[str, Any]]
+    show: Callable[[int, int, dict[str, Any]], None]  # prints them; takes both numbers first
+
+
+def _check(
+    scenario: "Scenario", episodes: int, seed: int, workers: "Workers", done: Callable[[int], None]
+) -> dict[str, Any]:
+    from harness.world import reference
+
+    return {"drivers": reference.check(scenario, episodes, seed, workers, done)}
+
+
+def _show(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
+    _table(episodes, seed, outcomes["drivers"])
+
+
+EGO, AGENTS = "ego", "agents"  # who decides in a scenario
+DRIVES = Shipped[Drives]("swarmdrive.drives", Drives, {EGO: Drives(_check, _show)})
+
+
+def drives_of(scenario: "Scenario") -> Drives:
+    """Return how reference drivers drive a scenario.
+
+    Raises UserError if several agents decide in it, and no extension says so for these.
+    """
+    from harness.world.seats import agent_share
+
+    who = AGENTS if agent_share(scenario) > 0 else EGO
+    if who not in DRIVES:
+        owner = owner_of_plugin("drives", who) or who
+        what = f"{printable(scenario.name)} with several agents"
+        raise UserError(f"{what}: how reference drivers drive it is {part_of(owner)}")
+    return DRIVES[who]
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
@@ -140,42 +172,3 @@ def _table(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
         f"n = {episodes} episodes, {seeds_text(seed, episodes)};\nWilson intervals; off the road: "
         f"{off_road}"
     )
-
-
-def _swarm_tables(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
-    seconds, ratio, driver = Unit("s", 2), Unit(decimals=3), "driver of all agents"
-    outcome_rows, time_rows, decision_rows = list[Row](), list[Row](), list[Row]()
-    for policy, of in outcomes["policies"].items():
-        shares = [f"{100 * of[name].value:.1f}" for name in ("arrived", "met", "stuck")]
-        less = interval_of(of["less_than_joint"], sign="+")
-        outcome_rows.append((policy, interval_of(of["success"]), less, *shares))
-        lost_s = [interval_of(of[name], seconds) for name in ("lost_s", "most_lost_s")]
-        anarchy = of["anarchy"]
-        time_rows.append((policy, *lost_s, interval_of(anarchy, ratio), str(anarchy.n)))
-        decisions = [interval_of(of[name]) for name in ("best_decisions", "gave_away")]
-        decision_rows.append((policy, *decisions, interval_of(of["regret_s"], seconds)))
-    success = "success % [95 % CI]"
-    table((driver, success, "less than joint", "arrived %", "met %", "stuck %"), outcome_rows)
-    table((driver, "lost s, in sum", "lost s, the most", "price of anarchy", "n"), time_rows)
-    table((driver, "best decisions %", "arrival given away %", "regret s"), decision_rows)
-    text = console()
-    text.print(
-        f"n = {episodes} episodes, {seeds_text(seed, episodes)}; times where all arrive;\n"
-        "price of anarchy: summed time of trips against joint's, on the n that both clear;\n"
-        "regret: of an agent's first decisions, had the others done what they did"
-    )
-    text.print(f"without a joint plan: {_seeds(outcomes['unsolved'])}")
-    if inexact := outcomes["inexact"]:
-        text.print(
-            f"joint is the best found, and the best plan in {episodes - len(inexact)} of "
-            f"{episodes} episodes; not searched to the end, or a driver did better: "
-            f"{_seeds(inexact)}"
-        )
-    else:
-        text.print(f"joint is the best plan, searched to the end in all {episodes} episodes")
-
-
-def _seeds(seeds: list[int]) -> str:
-    """Return how many seeds there are, and the first of them."""
-    named = ", ".join(map(str, seeds[:10])) + (", …" if len(seeds) > 10 else "")
-    return f"{len(seeds)}" + (f" (seeds {named})" if named else "")

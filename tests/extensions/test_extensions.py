@@ -54,6 +54,7 @@ NAMED = (
     "agents",
     "channel_models",
     "contents",
+    "drives",
     "encodings",
     "families",
     "options",
@@ -534,6 +535,7 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
     code = (
         "from harness.coordination.operating_point import OperatingPoint, named_point\nfrom "
         "harness.core.errors import UserError\nfrom harness.world.scenarios import get\n"
+        "from harness.cli.scenario import drives_of\n"
         "print(OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g', 'calibration': ''}).record() == OperatingPoint.from_dict({'name': '6g', "
         "'profile': '6g'}).record())\nfor ask in (lambda: OperatingPoint.from_dict({'name': '6g', "
@@ -542,7 +544,8 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
         "lambda: named_point('6g:schedule=learnt'), lambda: get('env:merge-v0:decisions=2'), "
         "lambda: named_point('its-g5'), lambda: named_point('mine'), "
         "lambda: named_point('6g:consensus=auction'), lambda: named_point('6g:rounds=2'), "
-        "lambda: named_point('6g:encoding=etsi')):\n    try:\n        "
+        "lambda: named_point('6g:encoding=etsi'), "
+        "lambda: drives_of(get('all-way-crossing:agent_share=1'))):\n    try:\n        "
         "ask()\n    except UserError as error:\n        print(error)\n"
     )
     (tmp_path / "swarmdrive.toml").touch()
@@ -574,6 +577,8 @@ def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_p
         "consensus auction is part of the extension plan, which is not installed",
         "setting rounds=2 of a condition is part of the extension plan, which is not installed",
         "encoding etsi is part of the extension radio, which is not installed",
+        "all-way-crossing with several agents: how reference drivers drive it is part of the "
+        "extension joint_plans, which is not installed",
     ]
 
 

@@ -22,6 +22,7 @@ BETWEEN = re.compile(r"""["'`#\s]+|//""")  # marks of quotation, comments and en
 
 # Names of extensions that the core has for something of its own.
 ORDINARY = {
+    "agents": "those who decide, and what answers for a vehicle",
     "always": "at every time",
     "attack": "what an attacker does",
     "attribute": "of a Python object",

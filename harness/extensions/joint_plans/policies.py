@@ -20,11 +20,12 @@ from harness.core.statistics import (
     resampled,
     resampled_estimate,
 )
-from harness.world import joint, reference
+from harness.extensions.joint_plans import joint
+from harness.extensions.joint_plans.regret import Regret, regret
+from harness.world import reference
 from harness.world.drivers import PRIVILEGED
 from harness.world.outcome import ROUNDING_S
 from harness.world.precedence import RULES
-from harness.world.regret import Regret, regret
 from harness.world.scenario import Scenario
 from harness.world.seats import offsets
 from harness.world.swarm import alone, ends, gravest

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from harness.core.arrays import Bools
-from harness.world import joint, policies, scenarios
-from harness.world.joint import NEVER_S, Options, Search
-from harness.world.policies import JOINT, Fate, best_of, summary
+from harness.extensions.joint_plans import joint, policies
+from harness.extensions.joint_plans.joint import NEVER_S, Options, Search
+from harness.extensions.joint_plans.policies import JOINT, Fate, best_of, summary
+from harness.world import scenarios
 from harness.world.scenario import Scenario
 
 SCENES = [f"{name}:agent_share=1" for name in scenarios.names() if scenarios.get(name).seats]

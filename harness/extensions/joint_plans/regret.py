@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Bools, Floats
-from harness.world.joint import HORIZON, Options, near
+from harness.extensions.joint_plans.joint import HORIZON, Options, near
 from harness.world.outcome import ROUNDING_S
 
 

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from harness.world import joint, reference, scenarios
-from harness.world.joint import Options
-from harness.world.regret import Regret, regret, soonest_s
+from harness.extensions.joint_plans import joint
+from harness.extensions.joint_plans.joint import Options
+from harness.extensions.joint_plans.regret import Regret, regret, soonest_s
+from harness.world import reference, scenarios
 from harness.world.world import World
 
 TWO = "all-way-crossing:agent_share=1"
