@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,7 +26,7 @@ from harness.core.progress import Progress
 from harness.dataset.load import Dataset, load
 from harness.evaluate.kept_answers import MORE_FOLLOWS, read_kept
 from harness.evaluate.latency import PAPER
-from harness.evaluate.run import evaluate, read_or_evaluate
+from harness.evaluate.run import _check_measured, evaluate, read_or_evaluate
 from harness.evaluate.spec import Spec
 from harness.runs.run_parts import write_part
 
@@ -145,6 +146,16 @@ def test_a_finished_part_that_was_not_finished_here_is_walked_again(
             seal.write_bytes(of_user)
     _becomes_whole(out, whole, to_kill)
     assert "has 1 finished part that nobody finished here with your key" in capsys.readouterr().err
+
+
+def test_measured_times_of_a_stopped_run_were_measured_here(tmp_path: Path) -> None:
+    record: Any = SimpleNamespace(latency=SimpleNamespace(source="measured"))
+    (tmp_path / CONFIG).write_text('{"latency": 0.1}')
+    _check_measured(tmp_path, tmp_path, record, resumes=False)
+    _check_measured(tmp_path, tmp_path, record, resumes=True)
+    (tmp_path / CONFIG).write_text('{"latency": 0.001}')
+    with pytest.raises(UserError, match="times that were not measured here with your key"):
+        _check_measured(tmp_path, tmp_path, record, resumes=True)
 
 
 def sooner(row: dict[str, Any]) -> None:

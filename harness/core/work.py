@@ -85,7 +85,7 @@ def idle(out: Path) -> bool:
 
 
 def _nothing_done(work: Path) -> bool:
-    return {path.name for path in work.iterdir()} <= {CONFIG, LOCK, UNANSWERED}
+    return {path.name for path in work.iterdir()} <= {CONFIG, f"seal-{CONFIG}", LOCK, UNANSWERED}
 
 
 def same(

@@ -21,12 +21,12 @@ from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError, in_range, printable
-from harness.core.files import write_whole
-from harness.core.formats import WORK
+from harness.core.files import bytes_of, write_whole
+from harness.core.formats import CONFIG, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
 from harness.core.progress import Progress
-from harness.core.seals import is_sealed, say_unsealed
+from harness.core.seals import is_sealed, say_unsealed, write_seal
 from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
 from harness.dataset.load import Scene
@@ -140,6 +140,7 @@ def _driven(
     resumes = run_start is not None
     run_start, chunks = _begin_driving(spec, out, run_start, workers)
     with work.working(out, run_start, "run.json") as place:
+        _check_measured(out, place, run_start, resumes)
         if resumes:
             _open_unsealed(out, place)
         seen, looked = _walked(
@@ -274,6 +275,7 @@ def _frozen(
     resumes = run_start is not None
     run_start = begin(spec, out, run_start, identity, latency)
     with work.working(out, run_start, "run.json") as place:
+        _check_measured(out, place, run_start, resumes)
         if resumes:
             _open_unsealed(out, place)
 
@@ -314,6 +316,23 @@ def _frozen(
         layouts = source.layouts(sum(map(len, seen)))
         return _gather(
             out, as_finished(spec, run_start, looked), seen, place, made_of, layouts=layouts
+        )
+
+
+def _check_measured(out: Path, place: Path, run_start: RunStart, resumes: bool) -> None:
+    """Raise UserError if a stopped run states measured times that nobody measured here.
+
+    Those of a run that begins are sealed.
+    """
+    if run_start.latency.source != latencies.MEASURED:
+        return
+    record = place / CONFIG
+    if not resumes:
+        write_seal(record, {CONFIG: bytes_of(record, "record")})
+    elif not is_sealed(record):
+        raise UserError(
+            f"--out {printable(out)} states inference times that were not measured here with your "
+            "key; begin in another folder"
         )
 
 
