@@ -14,7 +14,14 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from harness.core.errors import Unanswered, Unfinished, UserError, printable, sayable
+from harness.core.errors import (
+    Unanswered,
+    Unfinished,
+    UserError,
+    one_line,
+    printable,
+    sayable,
+)
 from harness.core.files import alone, forget_halves, text_of, write_whole
 from harness.core.formats import CONFIG, WORK
 
@@ -187,6 +194,17 @@ def going_on(out: Path) -> Iterator[None]:
     except (KeyboardInterrupt, Unfinished) as error:
         error.add_note(f"{printable(out)} keeps what is done")
         raise
+
+
+@contextmanager
+def kept_file(file: Path) -> Iterator[None]:
+    """Read a file that unfinished work kept; whatever fails is one line, which names the file."""
+    try:
+        yield
+    except Exception as error:  # whatever its format's reader raises
+        raise UserError(
+            f"{printable(file)} is damaged ({one_line(error)}); delete its folder and start again"
+        ) from error
 
 
 def tidy(out: Path) -> None:

@@ -390,6 +390,13 @@ def test_a_run_is_not_continued_with_other_settings_and_never_overwritten(
             stop,
             "cpu",
         )
+    work = tmp_path / "m/.work"
+    for file in (work / "tokenizer.json", next(work.glob("lessons/**/00000.json"))):
+        before = file.read_text()
+        file.write_text("{}")
+        with pytest.raises(UserError, match=rf"{file.name} is damaged \(.*; delete its folder and"):
+            distill(CURRICULUM, PLAN, tmp_path / "m", silent, stop, "cpu")
+        file.write_text(before)
 
 
 @pytest.mark.exhaustive

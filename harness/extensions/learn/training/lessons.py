@@ -28,6 +28,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.files import bytes_of, write_whole
 from harness.core.parallel import Workers, each
+from harness.core.work import kept_file
 from harness.dataset.freeze import edges, record_of
 from harness.dataset.load import Scene
 from harness.dataset.schema import Record, scene_id
@@ -129,7 +130,10 @@ def draw(
 
     each(partial(_encoded, scenario, seed), todo, workers, keep, lambda number: f"layout {number}")
     decoder = msgspec.json.Decoder(list[Point])
-    points = [point for file in files for point in decoder.decode(bytes_of(file, "record"))]
+    points = list[Point]()
+    for file in files:
+        with kept_file(file):
+            points += decoder.decode(bytes_of(file, "record"))
     scenes = tuple(Scene(point.record) for point in points)
     labels = {point.record.scene: np.array(point.label) for point in points}
     return Lessons(scenario, tuple(prompts), scenes, labels)

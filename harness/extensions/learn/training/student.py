@@ -15,6 +15,7 @@ from harness.backends.tokens import token_ids, whole
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import text_of
+from harness.core.work import kept_file
 from harness.extensions.learn.training.answers import CLASSES, answer, evidence, sights
 from harness.extensions.learn.training.lessons import Lessons
 from harness.extensions.learn.training.model import (
@@ -152,8 +153,9 @@ class Student:
         if not file.is_file():  # after a kill, a later stage's model would read otherwise
             read = [torch.from_numpy(intent) for intent in self.read(samples)]
             save({"intents": read}, file)
-        stored = [intent.numpy() for intent in torch.load(file, weights_only=True)["intents"]]
-        intents = dict(zip(names, stored, strict=True))
+        with kept_file(file):
+            stored = [intent.numpy() for intent in torch.load(file, weights_only=True)["intents"]]
+            intents = dict(zip(names, stored, strict=True))
         heard: list[Question] = []
         for lessons, scenes in zip(self.lessons, scenes_of, strict=True):
             heard += with_messages(lessons, scenes, intents)
@@ -204,9 +206,10 @@ class Student:
         """
         done = self.work / f"{name}.pt"
         if done.is_file():
-            state = torch.load(done, weights_only=True, map_location=self.model.device)
-            restore(self.model, state["model"])
-            return [tuple(point) for point in state["curve"]]
+            with kept_file(done):
+                state = torch.load(done, weights_only=True, map_location=self.model.device)
+                restore(self.model, state["model"])
+                return [tuple(point) for point in state["curve"]]
         checkpoint = self.work / f"{name}.going.pt"
         count, show = self.plan.samples[name], partial(progress, name)
         if not count:
@@ -320,7 +323,8 @@ class Student:
             texts = [m["content"] for q in some for m in q.read_out]
             texts += [answer(q.prompt, q.graph, q.label, q.actions) for q in some]
             train_tokenizer(texts, sees).save(str(file))
-        return whole(Tokenizer.from_str(text_of(file, "record")))
+        with kept_file(file):
+            return whole(Tokenizer.from_str(text_of(file, "record")))
 
 
 def _place(question: Question) -> str:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from harness.core.arrays import Floats
 from harness.core.files import replacing
+from harness.core.work import kept_file
 from harness.extensions.learn.training.answers import cells
 from harness.extensions.learn.training.model import image_processor
 from harness.extensions.learn.training.muon import Muon
@@ -121,13 +122,14 @@ def run_stage(
     start, curve = 0, []
     losses: list[Any] = []
     if checkpoint.is_file():
-        # where AdamW counts its steps
-        state = torch.load(checkpoint, weights_only=True, map_location="cpu")
-        restore(model, state["model"])
-        for opt, kept in zip(opts, state["opts"], strict=True):
-            opt.load_state_dict(kept)
-        start, curve = state["step"], [tuple(point) for point in state["curve"]]
-        losses = [loss.to(device) for loss in state.get("losses", ())]
+        with kept_file(checkpoint):
+            # where AdamW counts its steps
+            state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+            restore(model, state["model"])
+            for opt, kept in zip(opts, state["opts"], strict=True):
+                opt.load_state_dict(kept)
+            start, curve = state["step"], [tuple(point) for point in state["curve"]]
+            losses = [loss.to(device) for loss in state.get("losses", ())]
     letter_ids, digit_ids = (torch.tensor(ids, device=device) for ids in (letters, digits))
     model.train()
     kept_s = time.monotonic()
