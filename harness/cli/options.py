@@ -242,12 +242,19 @@ def takes(
 def as_command(typed: Any, command: Any, parameters: list[inspect.Parameter]) -> Any:
     """Return the function `typed` with these parameters, and with the name and help of `command`.
 
-    So typer reads it as a command.
+    So typer reads it as a command. Options of extensions come last in its help.
     """
-    typed.__signature__ = inspect.Signature(parameters)
-    typed.__annotations__ = {each.name: each.annotation for each in parameters}
+    in_order = sorted(parameters, key=_is_of_extension)
+    typed.__signature__ = inspect.Signature(in_order)
+    typed.__annotations__ = {each.name: each.annotation for each in in_order}
     typed.__doc__, typed.__name__ = command.__doc__, command.__name__
     return typed
+
+
+def _is_of_extension(parameter: inspect.Parameter) -> bool:
+    """Return whether help has a parameter below the heading of an extension."""
+    panel = getattr(parameter.default, "rich_help_panel", None)
+    return isinstance(panel, str) and panel.startswith(stated.OF_EXTENSION)
 
 
 def _parameter(option: stated.Option) -> inspect.Parameter:
@@ -319,7 +326,7 @@ def of_extensions(followed: bool) -> Callable[[Any], Any]:
 
     added = []
     for name, option in OPTIONS.usable().items():
-        heading = f"Extension {owner_of_plugin('options', name)}"
+        heading = stated.OF_EXTENSION + str(owner_of_plugin("options", name))
         default = Option(None, metavar=option.metavar, help=option.help, rich_help_panel=heading)
         if followed or not option.follows:
             added.append(_added(name, default, option.kind))

@@ -31,6 +31,7 @@ MOST_SEEDS = 1000
 
 CONDITIONS, EPISODES, ANSWERS = "Conditions", "Episodes", "How models answer"
 HELPERS, ENGINE, LATENCY, OUTPUT = "Helpers", "Engines and servers", "Latency", "Output"
+OF_EXTENSION = "Extension "  # and its name: the heading of the options that it adds
 
 
 # What of a setting is the same when a stopped run resumes: itself, what it opens (a run states
@@ -346,7 +347,7 @@ def options(world: type[Struct]) -> list[Option]:
 def _added(name: str, setting: Setting, path: tuple[str, ...]) -> Option:
     """Return the option of a setting that an extension adds, below the extension's name."""
     owners = extensions.extensions().values()
-    panel = next(f"Extension {owner.name}" for owner in owners if name in owner.settings)
+    panel = next(OF_EXTENSION + owner.name for owner in owners if name in owner.settings)
     kind = list[str] if setting.kind is tuple else setting.kind
     shape = (kind, setting.default, setting.help, panel, setting.listed, ITSELF, True)
     return Option(path, name, *shape, models=setting.models, is_added=True)
