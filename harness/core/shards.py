@@ -7,13 +7,11 @@ and its config names the shard.
 import os
 import re
 import shutil
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
-from zipfile import BadZipFile
 
 import msgspec
 
@@ -22,12 +20,12 @@ from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, text_of
 from harness.core.formats import CONFIG, WORK
 from harness.core.seals import write_seal
+from harness.core.zips import BROKEN_ZIP
 
 T = TypeVar("T")
 MOST = 100_000
-# What taking a shard's values, and a dataset's archives, apart raises where they are forged.
+# What taking a shard's values apart raises where they are forged.
 BROKEN_PARTS = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
-BROKEN_ZIP = (BadZipFile, zlib.error, EOFError, NotImplementedError)
 # Environment variables that number a job's tasks, with the number taken as the first: an array of
 # Slurm has the numbers that it was given, and Kubernetes counts from 0.
 TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}

@@ -3,8 +3,6 @@ and each tree and decision point by type and consistency.
 """
 
 import os
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +18,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import bytes_of, refuse_bomb, sha256_bytes, sha256_file
 from harness.core.files import opened as opened_file
+from harness.core.zips import BROKEN_ZIP
 from harness.dataset.schema import (
     LAYOUTS,
     Manifest,
@@ -169,7 +168,7 @@ def opened(path: Path) -> Iterator[ZipFile]:
     try:
         now = file.stat()
         yield _layouts(file, (now.st_ino, now.st_size, now.st_mtime_ns), os.getpid())
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, *BROKEN_ZIP) as error:
         raise unusable(path, f"{LAYOUTS}: cannot be read ({printable(error)})") from None
 
 
@@ -199,14 +198,7 @@ def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
         if file.getinfo(name).file_size > LARGEST_ENTRY:
             raise Damaged(f"{LAYOUTS} {name}: too large")
         data = file.read(name)
-    except (
-        KeyError,
-        OSError,
-        RuntimeError,
-        NotImplementedError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except (OSError, KeyError, *BROKEN_ZIP) as error:
         raise Damaged(f"{LAYOUTS} {name}: cannot be read ({printable(error)})") from None
     if sha256_bytes(data) != sha256:
         raise Damaged(f"{LAYOUTS} {name}: changed, its sha256 is not the one that was pinned")

@@ -210,7 +210,9 @@ class Asker:
         for request, here in zip(of_rules, self._backend().complete(of_rules), strict=True):
             kept_answer = self.answers[request.id]
             first_answer = kept_answer.first or kept_answer  # before a repair turn
-            if (first_answer.raw, first_answer.slow_s) != (here.text, here.slow_s):
+            counts = first_answer.prompt_tokens, first_answer.completion_tokens
+            of_file = first_answer.raw, first_answer.slow_s, *counts
+            if of_file != (here.text, here.slow_s, here.prompt_tokens, here.completion_tokens):
                 raise self._refused(request, "is not what the rule here gives")
 
     def _has(self, name: str) -> bool:

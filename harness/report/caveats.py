@@ -5,6 +5,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 
 from harness.backends.registry import reads_prompts
 from harness.coordination.operating_point import more_parts
@@ -13,6 +14,7 @@ from harness.core.figures import PERCENT, amount
 from harness.core.plugins import Plugins, texts
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
+from harness.report.apart import apart
 from harness.runs import doubts, pinned
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
@@ -209,9 +211,14 @@ def of_extensions(run: Run) -> Iterator[str]:
     """Yield the sentences that extensions have on a run; for one that fails, its error message."""
     for name in CAVEATS:
         try:
-            yield from CAVEATS.ask(name, lambda of: texts(of(run.manifest)))
+            manifest = apart(run.manifest, CAVEATS.is_ours(name))
+            yield from CAVEATS.ask(name, partial(_sentences, manifest))
         except UserError as error:
             yield str(error)
+
+
+def _sentences(manifest: Manifest, of: Callable[[Manifest], Iterable[str]]) -> list[str]:
+    return texts(of(manifest))
 
 
 def by_letter(run: Run) -> Iterator[str]:

@@ -3,10 +3,12 @@
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import Unit
 from harness.core.plugins import Plugins, texts
+from harness.report.apart import apart
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, written
 from harness.runs.records import Latency, Score, role_word, roles
@@ -81,9 +83,13 @@ def of_extensions(run: Shown) -> Iterator[str]:
     """Yield what extensions say of the figures; one that fails says so itself."""
     for name in NOTES:
         try:
-            yield from NOTES.ask(name, lambda of: texts(of(run)))
+            yield from NOTES.ask(name, partial(_lines, apart(run, NOTES.is_ours(name))))
         except UserError as error:
             yield str(error)
+
+
+def _lines(run: Shown, of: Callable[[Shown], Iterable[str]]) -> list[str]:
+    return texts(of(run))
 
 
 def answer_times(run: Shown) -> Iterator[str]:

@@ -8,11 +8,13 @@ of the page: each is about one decision point, or leads to some.
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 from markupsafe import Markup, escape
 
 from harness.core.plugins import Failed, Plugins, texts
+from harness.report.apart import apart
 from harness.report.runs import Runs
 from harness.report.templating import visible
 from harness.runs.folder import Run
@@ -53,15 +55,15 @@ def sentences(runs: Runs) -> list[Markup]:
     broken.
     """
 
-    def escaped(remarks: Remarks) -> list[Markup]:
-        texts_of_extension = list(remarks.sentences(runs))
+    def escaped(name: str, remarks: Remarks) -> list[Markup]:
+        texts_of_extension = list(remarks.sentences(apart(runs, REMARKS.is_ours(name))))
         texts(texts_of_extension)  # raises what stands for a failure if one is no text
         return [escape(sentence) for sentence in texts_of_extension]
 
     sentences: list[Markup] = []
     for name in REMARKS:
         try:
-            sentences += REMARKS.ask(name, escaped)
+            sentences += REMARKS.ask(name, partial(escaped, name))
         except Failed as error:
             sentences.append(escape(visible(str(error))))
     return sentences
@@ -76,10 +78,15 @@ def left_out(run: Run) -> LeftOut:
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:
         with suppress(Failed):
-            by_scene = REMARKS.ask(name, lambda remarks: _plain(remarks.left_out(run)))
+            copied = apart(run, REMARKS.is_ours(name))
+            by_scene = REMARKS.ask(name, partial(_left_out, copied))
             for scene, rows in by_scene.items():
                 joined.setdefault(scene, []).extend(rows)
     return joined
+
+
+def _left_out(run: Run, remarks: Remarks) -> LeftOut:
+    return _plain(remarks.left_out(run))
 
 
 def _plain(left_out: LeftOut) -> LeftOut:

@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from harness.core.errors import UserError, printable
 from harness.core.plugins import Plugins, texts
+from harness.report.apart import apart
 from harness.report.document import Section
 from harness.report.runs import Runs
 from harness.report.templating import environment
@@ -30,7 +31,8 @@ def sections(runs: Runs) -> list[tuple[str, Markup]]:
 
 def _written(name: str, run: Run) -> tuple[str, Markup] | None:
     try:
-        return SECTIONS.ask(name, lambda of: _titled(of(run)))
+        copied = apart(run, SECTIONS.is_ours(name))
+        return SECTIONS.ask(name, lambda of: _titled(of(copied)))
     except UserError as error:
         return printable(name), _content(Section(name, warnings=[str(error)]))
 

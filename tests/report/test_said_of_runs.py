@@ -1,6 +1,7 @@
 """What is said of a run: the same sentences, in one order, wherever it is shown."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, cast
 
@@ -8,10 +9,11 @@ import pytest
 from run_on_disk import made_up
 
 from harness.core.plugins import Plugins
-from harness.report import caveats, remarks, sections
+from harness.report import caveats, notes, remarks, sections
 from harness.report.document import Section, Table
 from harness.report.runs import Runs
 from harness.runs.folder import Run, read
+from harness.runs.records import Manifest
 
 
 @pytest.fixture
@@ -92,3 +94,22 @@ def test_a_title_and_a_caveat_of_a_package_are_plain_where_they_are_shown(
     [(title, _)] = sections.sections(Runs((run,), ("run",), None))
     [caveat] = caveats.of_extensions(run)
     assert (type(title), title, type(caveat), caveat) == (str, "A", str, "B")
+
+
+def test_a_package_changes_no_record_of_a_run(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def vandal(of: Any) -> list[str]:
+        manifest = of if isinstance(of, Manifest) else of.manifest
+        manifest.model["name"] = "better"
+        manifest.conditions[0]["name"] = "EVIL"
+        return []
+
+    before = deepcopy(run.manifest)
+    registries = ((caveats, "CAVEATS"), (notes, "NOTES"), (sections, "SECTIONS"))
+    for module, name in registries:
+        packaged = Plugins("swarmdrive.none", Callable, {"odd": vandal})
+        monkeypatch.setattr(packaged, "is_ours", lambda name: False)
+        monkeypatch.setattr(module, name, packaged)
+    assert list(caveats.of_extensions(run)) == []
+    assert list(notes.of_extensions(run)) == []
+    sections.sections(Runs((run,), ("run",), None))
+    assert run.manifest == before

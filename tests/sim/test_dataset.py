@@ -534,6 +534,18 @@ def test_a_tree_that_is_not_what_it_should_be_is_refused(copy, what):
         load(copy)
 
 
+def test_an_archive_that_is_packed_otherwise_than_it_says_is_refused(copy):
+    file = copy / "layouts.zip"
+    data = bytearray(file.read_bytes())
+    for mark, at_method in ((b"PK\1\2", 10), (b"PK\3\4", 8)):
+        at = -1
+        while (at := data.find(mark, at + 1)) >= 0:
+            data[at + at_method] = 14  # LZMA
+    file.write_bytes(bytes(data))
+    with pytest.raises(UserError, match=r"layouts\.zip .*cannot be read"):
+        load(copy)
+
+
 @pytest.mark.parametrize("text", [b"", b"[", b"[" * 100_000, b"null", b"[]", b"9" * 5000, b"\xff"])
 def test_a_tree_that_cannot_be_read_is_refused(copy, text):
     rewrite(copy, "00001/tree.json", lambda data: text)

@@ -9,6 +9,7 @@ import pytest
 from markupsafe import Markup
 
 from harness.core.errors import UserError
+from harness.core.seals import seal
 from harness.report.document import Table, strong
 from harness.studies.study import Cells, Study, p_cell, refuse_other, write_study, write_table
 
@@ -121,3 +122,21 @@ def test_a_part_that_was_not_computed_here_is_computed_again(
     assert Cells(path, "this").part(("a",), lambda: {"n": 0.25}) == {"n": 0.25}
     assert Cells(path, "this").part(("a",), lambda: {"n": 0.75}) == {"n": 0.25}
     assert Cells(path, "this", computed=False).part(("a",), lambda: {"n": 0}) == {"n": 0.25}
+
+
+@pytest.mark.parametrize("broken", ["empty", "a link", "too long"])
+def test_a_broken_key_is_made_again(
+    broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path))
+    key = tmp_path / "seal.key"
+    if broken == "a link":
+        key.symlink_to(tmp_path / "nowhere")
+    else:
+        key.write_bytes(b"x" * (broken == "too long") * 99)
+    assert seal({"a": b"b"}, "here") == seal({"a": b"b"}, "here") is not None
+    assert len(key.read_bytes()) == 32
+    assert not (tmp_path / "nowhere").exists()
+    (tmp_path / "folder").mkdir()
+    monkeypatch.setenv("SWARMDRIVE_CACHE", str(tmp_path / "seal.key"))
+    assert seal({"a": b"b"}, "here") is None

@@ -5,7 +5,6 @@ episodes ended, and the figures that its edition names. Its bytes follow from th
 """
 
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +26,7 @@ from harness.core.files import (
     replacing,
     write_whole,
 )
+from harness.core.zips import BROKEN_ZIP
 from harness.runs.folder import Run
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
@@ -47,7 +47,6 @@ MOST_LETTERS = 200  # of who made it
 LARGEST_LIST = 1 << 20  # bytes of the archive's list of files
 END, END_64 = b"PK\5\6", b"PK\6\7"  # how the two records begin that stand after this list
 CHUNK = 1 << 20
-BROKEN_ZIP = (*BROKEN, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 
 
 class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -156,7 +155,7 @@ def _archive(file: Path) -> Iterator[ZipFile]:
         _refuse_long_list(file)
         with opened(file, "record") as whole, ZipFile(whole) as archive:
             yield archive
-    except BROKEN_ZIP as error:
+    except (*BROKEN, *BROKEN_ZIP) as error:
         if getattr(error, "errno", None) in NO_ROOM and not isinstance(error, Refused):
             raise  # it is of where this is unpacked
         reason = getattr(error, "strerror", None) or error

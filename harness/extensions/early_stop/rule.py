@@ -15,7 +15,8 @@ from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.core.statistics import Estimate, known_mean
 from harness.extensions.early_stop.sequences import any_time, any_time_difference
-from harness.runs.folder import Run, read
+from harness.runs.contradictions import sound
+from harness.runs.folder import Run
 from harness.runs.headline import ANY_TIME
 from harness.runs.metrics import BASELINE, GAINS, Grid
 from harness.runs.records import Episode, Score
@@ -66,7 +67,7 @@ class Until(StoppingRule):
         if width is not None and against is not None:
             raise UserError("--until-width and --until-decided: give one of them")
         if against is not None:
-            return Until(against=read(Path(against)), folder=Path(against))
+            return Until(against=sound(Path(against)), folder=Path(against))
         if width is None:
             return None
         if not 0.1 <= width < 100:

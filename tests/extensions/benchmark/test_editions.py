@@ -309,9 +309,20 @@ def locked(file: Path) -> None:
     file.write_bytes(bytes(data))
 
 
+def packed_otherwise(file: Path) -> None:
+    """Say of every file that it is packed by LZMA, which its bytes are not."""
+    data = bytearray(file.read_bytes())
+    for mark, at_method in ((b"PK\1\2", 10), (b"PK\3\4", 8)):
+        at = -1
+        while (at := data.find(mark, at + 1)) >= 0:
+            data[at + at_method] = zipfile.ZIP_LZMA
+    file.write_bytes(bytes(data))
+
+
 @pytest.mark.parametrize(
     "harm",
     [
+        packed_otherwise,
         raw(b""), raw(b"PK\5\6"), raw(b"\0" * 10_000), twice, listed_at_length, locked,
         lambda file: file.write_bytes(file.read_bytes()[:-30]),
         lambda file: file.unlink() or file.mkdir(),

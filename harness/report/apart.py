@@ -1,0 +1,32 @@
+"""Give packages copies of what they read, so that they change nothing that others read."""
+
+from copy import copy, deepcopy
+from dataclasses import replace
+from typing import Any, TypeVar, cast
+
+from harness.report.runs import Runs
+from harness.runs.folder import Run
+from harness.runs.records import Manifest
+from harness.runs.suite import SuiteRun
+
+T = TypeVar("T", bound=Manifest | Run | SuiteRun | Runs)
+
+
+def apart(thing: T, built_in: bool) -> T:
+    """Return a copy whose records nobody else has; with `built_in`, the thing itself.
+
+    Its tables cannot be changed, and are those of the thing, so that none is read again.
+    """
+    copied: Any = thing
+    if built_in:
+        return thing
+    if isinstance(thing, Manifest):
+        copied = deepcopy(thing)
+    elif isinstance(thing, Run):
+        copied = copy(thing)
+        object.__setattr__(copied, "manifest", deepcopy(thing.manifest))
+    elif isinstance(thing, SuiteRun):
+        copied = replace(thing, runs={name: apart(run, False) for name, run in thing.runs.items()})
+    else:
+        copied = replace(thing, runs=tuple(apart(run, False) for run in thing.runs))
+    return cast(T, copied)
