@@ -312,7 +312,11 @@ def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
 
     from harness.runs.listing import Listed, runs
 
-    return pd.DataFrame(runs(_path("folder", folder)), columns=list(Listed.__dataclass_fields__))
+    names = list(Listed.__dataclass_fields__)
+    rows = []
+    for listed in runs(_path("folder", folder)):
+        rows.append({name: _encodable(getattr(listed, name)) for name in names})
+    return pd.DataFrame(rows, columns=names)
 
 
 def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Comparison:
@@ -383,6 +387,11 @@ def sweep(
         draws = parse_seeds(seeds) if seeds else replayed.seeds
         study = run_sweep([replayed], panels, draws, folder, progress)
     return Study(write_study(study, folder).parent, study.headline, study.about, study.data)
+
+
+def _encodable(value: Any) -> Any:
+    """Return a value; of a text, lone surrogates are escaped, which no table can hold."""
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
 def _folder_of(name: str, run: Any) -> Path:

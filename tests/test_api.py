@@ -1,5 +1,6 @@
 """The harness from Python: few names, which say what the command line says and show themselves."""
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -223,3 +224,12 @@ def test_what_is_no_path_is_one_line() -> None:
     for call in (harness.load, harness.ls, lambda run: harness.compare(run, "x")):
         with pytest.raises(harness.UserError, match="= 5; allowed: a path"):
             call(5)  # type: ignore[arg-type]
+
+
+def test_a_lone_surrogate_in_a_run_hides_no_other(folder: Path, tmp_path: Path) -> None:
+    for name in ("one", "other"):
+        shutil.copytree(folder / "proxy", tmp_path / name)
+    file = tmp_path / "one/run.json"
+    file.write_text(file.read_text().replace('"version":"v2"', '"version":"\\ud800"'))
+    assert "ud800" in file.read_text()
+    assert sorted(harness.ls(tmp_path)["name"]) == ["one", "other"]
