@@ -1,5 +1,6 @@
 """The harness from Python: few names, which say what the command line says and show themselves."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -230,6 +231,8 @@ def test_a_lone_surrogate_in_a_run_hides_no_other(folder: Path, tmp_path: Path) 
     for name in ("one", "other"):
         shutil.copytree(folder / "proxy", tmp_path / name)
     file = tmp_path / "one/run.json"
-    file.write_text(file.read_text().replace('"version":"v2"', '"version":"\\ud800"'))
+    stated = json.loads(file.read_text())
+    stated["prompt"]["version"] = "\ud800"
+    file.write_text(json.dumps(stated))
     assert "ud800" in file.read_text()
     assert sorted(harness.ls(tmp_path)["name"]) == ["one", "other"]
