@@ -21,7 +21,7 @@ from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.evaluate.agent import Agent
 from harness.evaluate.live_world import LiveSource
 from harness.evaluate.requests import requests

@@ -39,7 +39,7 @@ from harness.backends.card import Card
 from harness.backends.engine import common_length
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.evaluate.agent import Agent

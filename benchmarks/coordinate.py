@@ -14,7 +14,7 @@ from rows import Row, finish
 
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.radio.channel import Draws
 
 SMALLEST = "--decisions 100 --repeats 1"

@@ -25,7 +25,7 @@ from harness.backends import cards
 from harness.backends.driver import DriverBackend
 from harness.backends.proxy import Proxy
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset import freeze
 from harness.evaluate.agent import Agent
 from harness.evaluate.asking import Asker

@@ -29,7 +29,7 @@ from rows import Row, finish
 from harness.backends import cards
 from harness.backends.proxy import Proxy
 from harness.cli import COLLECT_AFTER
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.files import canonical_json
 from harness.core.resources import DATASET
 from harness.dataset import load

@@ -22,7 +22,7 @@ from playwright.sync_api import Browser, sync_playwright
 from rows import Row, finish
 
 from harness.backends import cards
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.resources import DATASET
 from harness.dataset.load import find, load
 from harness.evaluate.agent import Agent

@@ -44,7 +44,7 @@ from harness.backends.openai import backend as client  # before processes part: 
 from harness.backends.openai.shapes import body
 from harness.backends.registry import opened
 from harness.backends.servers import Server
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.parallel import each, share
 from harness.core.resources import DATASET
 from harness.dataset import load

@@ -21,7 +21,7 @@ from typing import Any
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import find, load
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from rows import Row, finish
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.extensions.paper.calibrated import STEPS, Calibrated
 from harness.extensions.paper.panels import panels
 from harness.report.drawing.pictures import FORMATS, lay_out, save

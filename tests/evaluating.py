@@ -14,7 +14,8 @@ import msgspec
 
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.named_points import POINTS
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.progress import Progress
 from harness.core.work import tidy
 from harness.dataset.load import Dataset, Scene, Trees

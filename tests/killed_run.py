@@ -19,7 +19,7 @@ from typing import Any
 
 from evaluating import run, spec_of
 
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.dataset.load import Dataset, load
 from harness.evaluate import run as evaluation
 from harness.evaluate.spec import Spec

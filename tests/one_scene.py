@@ -11,7 +11,7 @@ import numpy as np
 
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.coordination.scheduling import Outlook
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips

@@ -28,7 +28,7 @@ from harness import cli
 from harness.backends import registry
 from harness.backends.base import Completion, Request
 from harness.backends.card import Card
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core import resources
 from harness.core.files import sha256_file
 from harness.dataset import rebuilt

@@ -13,7 +13,7 @@ from evaluating import live_spec_of, run, spec_of
 
 import harness
 from harness import extend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.extensions import PYTHON
 from harness.dataset.load import Dataset
 from harness.evaluate.command_options import OPTIONS

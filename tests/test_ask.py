@@ -14,7 +14,7 @@ from harness.backends import cards
 from harness.backends.base import Backend, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.dataset import load
 from harness.evaluate import run

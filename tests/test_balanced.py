@@ -14,7 +14,7 @@ from msgspec import structs
 from run_on_disk import Row, made_up
 from tiers import some
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.figures import interval_of
 from harness.core.statistics import mean_of, paired_difference, rate_interval
 from harness.dataset.load import Dataset, load

@@ -15,7 +15,7 @@ from run_on_disk import configure, damage, made_up, rows_of
 from tiers import some
 
 import harness
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.report.compare import text
 from harness.report.compare.difference import compare

@@ -26,7 +26,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.cache import NOT_IN_KEY, Cached, CompletionFile, cached, default_file, key
 from harness.backends.card import Latency
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.files import digest
 from harness.core.image import Image
 from harness.dataset.load import Dataset, load

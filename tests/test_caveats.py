@@ -12,7 +12,7 @@ from evaluating import run as evaluate
 from evaluating import spec_of
 from msgspec.structs import replace
 
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
 from harness.report.caveats import no_prompt, unheard

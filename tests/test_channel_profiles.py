@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.radio.constant import Radio
 from harness.radio.profiles import CHANNELS

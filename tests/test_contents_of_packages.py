@@ -27,7 +27,9 @@ from harness.coordination.contents import (
     OfIntent,
 )
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, calls, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.part_settings import calls
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Scene
 from harness.prompts import versions

@@ -12,7 +12,8 @@ import pytest
 
 from harness.coordination.coordinate import Coordination, FusionInputs, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import CLOUD, POINTS, OperatingPoint
+from harness.coordination.named_points import CLOUD, POINTS
+from harness.coordination.operating_point import OperatingPoint
 from harness.radio.channel import Draws
 
 DOUBT = (0.3, 0.4, 0.3)

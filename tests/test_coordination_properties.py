@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from harness.coordination.coordinate import Coordination, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.named_points import POINTS
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.rules import POOLS
 from harness.radio.channel import Draws
 

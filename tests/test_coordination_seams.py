@@ -18,7 +18,8 @@ from harness.coordination.claims import Claims
 from harness.coordination.consensus import Messages, Pool, Rule, linear_pool
 from harness.coordination.coordinate import Coordination, FusionInputs, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.plans import Plans
 from harness.coordination.rules import RULES
 from harness.coordination.schedules import SCHEDULES

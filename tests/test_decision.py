@@ -11,7 +11,7 @@ from evaluating import run, scenes_of, spec_of, with_ego
 
 from harness.backends import cards
 from harness.backends.base import Completion, Request, failed
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent

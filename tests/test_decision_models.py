@@ -27,7 +27,7 @@ from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.dataset.load import Dataset, find, load

@@ -17,7 +17,7 @@ from run_on_disk import configure
 from scipy.stats import t as student
 from tiers import some
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core import covariate
 from harness.core.arrays import Floats
 from harness.core.covariate import LEAST, corrected, worth

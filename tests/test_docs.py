@@ -9,7 +9,8 @@ import pytest
 
 from harness.backends.base import AnswerMode
 from harness.backends.card import Failures
-from harness.coordination.operating_point import POINTS, typed_settings
+from harness.coordination.named_points import POINTS
+from harness.coordination.part_settings import typed_settings
 from harness.coordination.rules import EGO_PROMPT, POOLS
 from harness.coordination.schedules import SCHEDULES
 from harness.parsing.parse import Repair, Status

@@ -17,7 +17,7 @@ from tiers import some
 
 from harness.backends import cards
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, load

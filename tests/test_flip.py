@@ -15,7 +15,7 @@ from harness.backends import cards
 from harness.backends.base import Completion, Letters, Request
 from harness.backends.orders import average_orders
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent

@@ -33,7 +33,8 @@ from tiers import some
 from harness.backends.base import Completion, Request
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.named_points import POINTS, named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.sent import SentIntents
 from harness.core.arrays import Ints
 from harness.core.errors import UserError

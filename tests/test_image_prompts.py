@@ -11,7 +11,7 @@ from evaluating import spec_of
 from harness.backends import cards
 from harness.backends.base import Request
 from harness.backends.vision import Vision
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.coordination.parts import PLAIN, Question
 from harness.core.errors import UserError
 from harness.core.resources import folder

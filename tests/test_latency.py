@@ -22,7 +22,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.card import Card
 from harness.backends.card import Latency as CardLatency
 from harness.backends.cards import resolve
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.core.config import LONGEST_S
 from harness.core.errors import Unanswered
 from harness.dataset.load import Dataset

@@ -11,7 +11,7 @@ from evaluating import spec_of
 
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import CLOUD, named_point
+from harness.coordination.named_points import CLOUD, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.radio.channel import Draws

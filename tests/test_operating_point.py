@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from harness.coordination.operating_point import POINTS, SHORT, OperatingPoint, named_point
+from harness.coordination.named_points import POINTS, SHORT, named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.radio.profiles import CHANNELS
 from harness.studies.axes import AXES

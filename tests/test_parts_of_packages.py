@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, kept_of, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.parts import PACKAGES_PARTS, PLAIN, Kept, Part, Question
 from harness.coordination.parts_of_packages import (
     SpeakerOfPart,

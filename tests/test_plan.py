@@ -165,7 +165,7 @@ def test_a_stated_rate_plans_without_a_run(harness: Harness) -> None:
 def test_bad_input_is_one_line(
     words: tuple[str, ...], says: str, tmp_path: Path, harness: Harness
 ) -> None:
-    from harness.coordination.operating_point import POINTS
+    from harness.coordination.named_points import POINTS
 
     runs: dict[str, dict[str, object]] = {
         "RUN": {}, "ONE": {"episodes": 1}, "ALONE": {"points": (POINTS["single-local"],)},

@@ -15,7 +15,8 @@ from harness.backends.base import Request
 from harness.backends.card import Failures
 from harness.backends.proxy import answers, draw_failure, spoil
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.named_points import POINTS
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.parsing.parse import parse

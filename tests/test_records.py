@@ -22,7 +22,8 @@ from tiers import some
 
 import harness as package
 from harness.backends.card import Card
-from harness.coordination.operating_point import OperatingPoint, more_parts
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.part_settings import more_parts
 from harness.core.errors import UserError
 from harness.core.versions import versions
 from harness.evaluate.lifecycle import RunStart

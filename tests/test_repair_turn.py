@@ -32,7 +32,7 @@ import harness as package
 from harness.backends import cards, replay
 from harness.backends.base import AGAIN, Completion, Request
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import Unanswered, UserError
 from harness.core.process import Stop
 from harness.core.resources import folder

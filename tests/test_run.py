@@ -33,7 +33,8 @@ from run_on_disk import UNTIMED, answers_of, rows_of
 from harness.backends import cards
 from harness.backends.card import Latency
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.named_points import POINTS
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import Unanswered, UserError
 from harness.dataset.load import Dataset, load
 from harness.evaluate.agent import Agent

@@ -13,7 +13,7 @@ from evaluating import live_spec_of
 from evaluating import run as evaluated
 from run_on_disk import Row, change, configure, damage
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core import extras
 from harness.core.errors import UserError
 from harness.runs.contradictions import refuse

@@ -19,7 +19,7 @@ from harness.backends.cards import resolve
 from harness.backends.decoding import drawn
 from harness.backends.registry import open_backend
 from harness.backends.servers import Server
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent

@@ -11,7 +11,7 @@ from one_scene import ALL, NOBODY, SIXG, asked, draws, same, scene
 from swarm_extras import NEAR
 
 from harness.coordination.exchange import exchange
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import Outlook, Schedule, ScheduleInputs, chosen
 from harness.core.errors import UserError

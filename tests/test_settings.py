@@ -14,7 +14,7 @@ from evaluating import same_decisions, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import resolve

@@ -15,7 +15,7 @@ from run_on_disk import answers_of
 
 from harness.backends.base import Request
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.asking import Asker
 from harness.evaluate.latency import PAPER

@@ -12,7 +12,7 @@ from evaluating import live_spec_of, run, spec_of, with_ego
 from run_on_disk import answers_of, made_up, rows_of
 
 import harness
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import Dataset
 
 pytestmark = pytest.mark.slow

@@ -30,7 +30,7 @@ from harness.backends.base import Completion, Request
 from harness.backends.card import Card
 from harness.coordination.coordinate import TIE, FusionInputs, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import finished

@@ -10,7 +10,7 @@ from former import NAME
 from msgspec import structs
 
 from harness.cli.run import BY_WITNESSES, by_witnesses
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import Dataset
 from harness.evaluate.live_world import LiveSource
 from harness.runs.folder import Run, read

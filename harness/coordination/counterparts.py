@@ -9,7 +9,8 @@ is not allowed.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.plugins import Plugins, texts
 
 COUNTERPARTS = Plugins[Callable[[str], str]]("swarmdrive.counterparts", Callable, {})

@@ -2,34 +2,40 @@
 model.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple, get_type_hints
 
 import msgspec
 from msgspec import structs
 
-from harness.coordination.added_parts import added_parts
 from harness.coordination.contents import (
     CONTENTS,
     INTENTS,
     KINDS,
     PLANS,
-    Call,
     Content,
-    is_ours,
 )
 from harness.coordination.encodings import JSON, beacon_bytes, request_bits
 from harness.coordination.intents import Intents
+from harness.coordination.part_settings import (
+    OVERRIDES,
+    PARTS,
+    RECORDED,
+    calls,
+    more_parts,
+    part_of_settings,
+    settings_alone,
+    without_gone,
+)
 from harness.coordination.parts import (
     FUSION,
     PLAIN,
     RELAY,
     ActsOn,
     Ask,
-    Change,
     Changes,
     Cloud,
     Fusion,
@@ -42,14 +48,13 @@ from harness.coordination.parts import (
     wrong,
 )
 from harness.coordination.parts import is_ours as is_ours_part
-from harness.coordination.parts_of_packages import change_by, prepared, speaker_of
+from harness.coordination.parts_of_packages import prepared, speaker_of
 from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
 from harness.coordination.sent import Honest, SentIntents, Speaker
-from harness.core.config import changed, settable, value_of
+from harness.core.config import changed
 from harness.core.errors import UserError, printable, unknown
-from harness.core.extensions import OfExtension, part_of, setting_of_extension
 from harness.core.pairs import pairs
 from harness.radio import constant
 from harness.radio.channel import Channel, Physical, Unit
@@ -62,110 +67,12 @@ if TYPE_CHECKING:
     from harness.coordination.coordinate import Coordination
     from harness.coordination.exchange import Exchange
 
-OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
 # settings of a roadside unit with a place
 UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")
 WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 # Settings of helpers' intents: how they are fused, and when a helper's model is asked.
 OF_INTENTS = ("consensus", *WEIGHING, "on_demand", "helper_rounds")
 LONGEST_NAME = 1000
-PARTS: dict[str, type[Part]] = {
-    "radio": Radio,
-    "ask": Ask,
-    "fusion": Fusion,
-    "cloud": Cloud,
-}
-RECORDED = {"further": "radio"}  # settings that records call otherwise: `radio` is the further ones
-IN_NO_TEXT = ("profile", "further")  # settings that a condition's text has in another way
-
-
-@cache
-def more_parts() -> Mapping[str, type[Part]]:
-    """Return the `Part` subclasses of installed extensions, by name; imports their packages."""
-    return added_parts([key for kind in PARTS.values() for key in kind.__struct_fields__])
-
-
-@cache
-def part_of_settings() -> Mapping[str, str]:
-    """Return for each setting of an operating point the name of its part.
-
-    The order is that of the flat records in manifests and run files.
-    """
-    part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
-    behind: dict[str, set[str]] = {}  # parts that stand behind the same setting, in their order
-    for part, kind in more_parts().items():
-        after = 1 + [key for key, _ in part_of].index(kind.behind)
-        while after < len(part_of) and part_of[after][1] in behind.get(kind.behind, ()):
-            after += 1
-        behind.setdefault(kind.behind, set()).add(part)
-        part_of[after:after] = [(key, part) for key in kind.__struct_fields__]
-    return dict(part_of)
-
-
-@cache
-def typed_settings() -> tuple[str, ...]:
-    """Return the settings that can be typed in a condition such as `6g:tau=0.5`, by full name."""
-    return tuple(key for key in part_of_settings() if key not in IN_NO_TEXT)
-
-
-@cache
-def settings_alone() -> Collection[str]:
-    """Return the settings that still have an effect on an ego without a channel."""
-    core = ("fallback", "round_trip", "round_trip_s", "window_s")
-    of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_ego]
-    return {*core, *chain(*of_extensions)}
-
-
-def change_of(text: str) -> Change:
-    """Return the change of messages that `text` names in the key of a fusion call's answer.
-
-    `text` is one that some part's `changes` gave, such as `liar:share=1/3` or `quoted`. Raises
-    UserError if no installed part knows it.
-    """
-    for kind in more_parts().values():
-        if (change := change_by(kind, text)) is not None:
-            return change
-    raise UserError(f"no part that is installed changes messages by {printable(text)!r}")
-
-
-@cache
-def calls() -> Mapping[str, Call]:
-    """Return the second questions that contents of messages ask the ego's model, by name.
-
-    A package's call is left out if some part already changes messages by that name.
-    """
-    by_name: dict[str, Call] = {}
-    for content in CONTENTS.usable().values():
-        call = content.call
-        if call and (is_ours(call) or not _changes_messages(call.name)):
-            by_name[call.name] = call
-    return by_name
-
-
-def _changes_messages(text: str) -> bool:
-    return any(change_by(kind, text) is not None for kind in more_parts().values())
-
-
-@cache
-def questions() -> Mapping[str, Question]:
-    """Return the questions that helpers may be asked, by name.
-
-    The ordinary one, what the ego should do as the helper sees it, has the name "".
-    """
-    others = chain(*(kind.questions for kind in more_parts().values()))
-    return {"": PLAIN, **{question.name: question for question in others}}
-
-
-def question_under(settings: Mapping[str, Any]) -> Question:
-    """Return the question that helpers were asked under a condition's recorded, flat settings.
-
-    Settings that belong to no installed part are ignored.
-    """
-    for kind in more_parts().values():
-        part_settings = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
-        if kind.questions and part_settings:
-            return kind(**part_settings).question
-    return PLAIN
 
 
 class Rewrites(NamedTuple):
@@ -673,30 +580,6 @@ def as_here(settings: Mapping[str, Any]) -> dict[str, Any]:
     return here
 
 
-def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's flat settings without those of extensions that are not installed.
-
-    Raises UserError if such a setting has another value than the one that does nothing.
-    """
-    kept: dict[str, Any] = {}
-    for key, value in settings.items():
-        gone = _gone(key)
-        if not gone:
-            kept[key] = value
-        elif ("" if value is None else str(value)) != gone.idle:
-            raise UserError(_lacks(key, value, gone))
-    return kept
-
-
-def _gone(setting: str) -> OfExtension | None:
-    """Return whose a setting is, if it is of an extension that is not installed; else None."""
-    return None if setting in part_of_settings() else setting_of_extension(setting)
-
-
-def _lacks(setting: str, value: object, gone: OfExtension) -> str:
-    return f"setting {setting}={printable(value)} of a condition is {part_of(gone.extension)}"
-
-
 def _may_read(consensus: str, content: Content) -> bool:
     """Return whether a rule fuses what a content holds, or what the ego answers to it."""
     kinds = content.holds
@@ -712,103 +595,3 @@ def _any_of(names: Iterable[str]) -> str:
 
 def _error_of(name: str, error: ValueError) -> UserError:
     return UserError(f"operating point {printable(name)!r}: {error}")
-
-
-POINTS = {
-    point.name: point
-    for point in (
-        OperatingPoint("single-local"),
-        OperatingPoint("v2x", Radio(profile="v2x")),
-        OperatingPoint("6g", Radio(profile="6g")),
-    )
-}
-# The cloud reference that the paper cites; it runs only if it is named.
-CLOUD = OperatingPoint("cloud", cloud=Cloud(round_trip_s=0.51))
-
-
-def named_point(text: str) -> OperatingPoint:
-    """Return an operating point by text, such as `6g:consensus=ego-prompt,window_s=0.4`.
-
-    Before the colon is one of the paper's points, or a channel profile, which stands for a point
-    with that profile and the defaults. A setting may have its short name of `SHORT`, and may be one
-    of the channel's own. The whole text becomes the point's name.
-
-    Raises:
-        UserError: there is no such point or setting, or a value is not allowed.
-    """
-    name, colon, rest = text.partition(":")
-    points = {**POINTS, CLOUD.name: CLOUD}
-    if name not in points and name not in CHANNELS:
-        raise unknown("operating point", name, {*points, *CHANNELS})
-    point = points.get(name) or OperatingPoint(name, Radio(profile=name))
-    channel_settings = (
-        [key for key in settable(point.channel) if key not in OVERRIDES]
-        if point.radio.profile
-        else []
-    )
-    settings: dict[str, Any] = {}
-    radio: dict[str, str] = {}
-    for setting in rest.split(",") if colon else ():
-        key, _, value = setting.partition("=")
-        field, scale = SHORT.get(key, (key, 1.0))
-        if field not in typed_settings() and field not in channel_settings:
-            if gone := _gone(field):
-                raise UserError(_lacks(field, value, gone))
-            allowed = (*typed_settings(), *SHORT, *channel_settings)
-            raise unknown(
-                f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3"
-            )
-        after_colon = value.partition(":")[2].partition("=")[0]
-        if after_colon in SHORT or after_colon in (*typed_settings(), *channel_settings):
-            joined = f"{key}={value.replace(':', ',')}"
-            raise UserError(
-                f"operating point {printable(text)!r}: {printable(setting)} has a colon; settings "
-                f"are joined by commas, as in {printable(f'{name}:{joined}')}"
-            )
-        if field in settings or field in radio:
-            raise UserError(
-                f"operating point {printable(text)!r}: {field} is given twice; give it once"
-            )
-        if field not in typed_settings():
-            radio[field] = value
-            continue
-        parsed = setting_of(field, value)
-        settings[field] = parsed * scale if isinstance(parsed, float) else parsed
-    for key in (*OVERRIDES, "edge", *UNIT):
-        if key in settings and point.radio.profile is None:
-            raise UserError(
-                f"operating point {printable(text)!r}: {name} has no channel, so {key} changes "
-                "nothing; leave it out"
-            )
-    if "round_trip" in settings and "round_trip_s" not in settings:
-        settings["round_trip_s"] = None  # `cloud` has the paper's; only one of the two may be set
-    point = point.of_radio(radio) if radio else point
-    return point.changed(name=text, **settings) if settings or radio else point
-
-
-def misnamed(settings: Mapping[str, Any]) -> list[str]:
-    """Return the recorded settings of a condition that differ from what its name stands for.
-
-    The list is empty for a name that `named_point` cannot read, as of a point made in Python.
-    """
-    name = str(settings["name"])
-    try:
-        named = as_here(named_point(name).record())
-    except UserError:
-        return []
-    here = {**OperatingPoint(name).record(), **as_here(settings)}  # what it lacks, it has plainly
-    keys = dict.fromkeys((*named, *here))
-    return [key for key in keys if key not in named or key not in here or named[key] != here[key]]
-
-
-# Short names of settings, as in `harness study sweep --over`, each with the factor to the setting's
-# unit.
-SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("latency_s", 1e-3)}
-
-
-def setting_of(key: str, text: str) -> object:
-    """Return the value of setting `key` from its text, converted to the type of its default.
-
-    A text that cannot be converted is returned as it is, and refused where the point is made.
-    """
-    return value_of(POINTS["6g"].setting(key), text)

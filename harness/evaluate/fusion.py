@@ -17,7 +17,8 @@ from harness.coordination.contents import WHOLE, Call
 from harness.coordination.contents_of_packages import words
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import Rewrites, calls, change_of
+from harness.coordination.operating_point import Rewrites
+from harness.coordination.part_settings import calls, change_of
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.evaluate.repair import as_text

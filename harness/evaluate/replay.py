@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from harness.backends.registry import capabilities
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Course, Trajectory
 from harness.evaluate.live_world import ended, looks

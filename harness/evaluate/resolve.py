@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from harness.backends import cards
 from harness.backends.base import BARE
 from harness.coordination.counterparts import counterparts
-from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.named_points import POINTS, named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, in_range
 from harness.core.files import text_of
 from harness.core.resources import folder

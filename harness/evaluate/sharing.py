@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import structs
 
 from harness.coordination.contents_of_packages import graphs as graphs_heard
-from harness.coordination.operating_point import change_of, questions
+from harness.coordination.part_settings import change_of, questions
 from harness.coordination.parts_of_packages import shown_graph
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable

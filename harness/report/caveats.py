@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 
 from harness.backends.registry import reads_prompts
-from harness.coordination.operating_point import more_parts
+from harness.coordination.part_settings import more_parts
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
 from harness.core.plugins import Plugins, texts

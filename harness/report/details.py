@@ -14,7 +14,7 @@ from msgspec import UNSET
 
 from harness.backends.base import BARE
 from harness.backends.registry import reads_prompts
-from harness.coordination.operating_point import questions
+from harness.coordination.part_settings import questions
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.figures import number_or_none

@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from harness.coordination.operating_point import question_under
+from harness.coordination.part_settings import question_under
 from harness.core.errors import UserError, printable
 from harness.core.files import opened, replacing
 from harness.core.formats import refuse_data

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.coordination.operating_point import misnamed
+from harness.coordination.named_points import misnamed
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.formats import SUITE

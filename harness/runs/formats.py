@@ -493,7 +493,7 @@ def _condition(table: Mapping[str, Any]) -> dict[str, Any]:
 
     2026-11-29: settings of extensions are left out where they do nothing.
     """
-    from harness.coordination.operating_point import as_here  # imports NumPy, as above
+    from harness.coordination.operating_point import as_here
 
     renamed = {name: value for name, value in table.items() if name != "roadside_edge"}
     if table.get("roadside_edge") is True:

@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, cast
 
 from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field, structs, to_builtins
 
-from harness.coordination.operating_point import OperatingPoint, questions
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.part_settings import questions
 from harness.core.config import Seconds, Whole, convert
 from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate

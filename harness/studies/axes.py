@@ -10,14 +10,9 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.contents import of_any_model
-from harness.coordination.operating_point import (
-    POINTS,
-    SHORT,
-    OperatingPoint,
-    more_parts,
-    setting_of,
-    typed_settings,
-)
+from harness.coordination.named_points import POINTS, SHORT, setting_of
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.part_settings import more_parts, typed_settings
 from harness.coordination.rules import POOLS, names
 from harness.coordination.schedules import SCHEDULES
 from harness.core.config import settable

@@ -6,7 +6,8 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.parts import PLAIN
 from harness.core.errors import UserError, printable
 from harness.core.versions import versions

@@ -4,7 +4,7 @@ each way into markup with each thing to do there.
 
 from run_on_disk import configure, made_up
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.files import digest
 from harness.runs.folder import read
 from harness.runs.records import FrozenScenes, Latency, Score, Times

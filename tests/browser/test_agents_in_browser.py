@@ -11,7 +11,7 @@ from opening import wait
 from playwright.sync_api import expect
 
 from harness.backends import cards
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.evaluate.agent import Agent
 from harness.evaluate.live_world import LiveSource
 from harness.prompts import versions

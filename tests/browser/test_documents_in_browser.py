@@ -12,7 +12,7 @@ from evaluating import run as evaluate
 from evaluating import spec_of
 from opening import NARROW, SCROLLS, picture
 
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.report.compare.difference import compare
 from harness.report.compare.page import render
 from harness.report.compare.pair import pair

@@ -14,7 +14,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from harness.cli import app
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.report.page import write_report
 from harness.report.runs import gather
 

@@ -14,7 +14,7 @@ import pytest
 from evaluating import live_spec_of, run, spec_of
 
 from harness import cli, studies
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.core.extensions import STUDIES, extensions
 from harness.core.extensions import studies as kinds_of_study

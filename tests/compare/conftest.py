@@ -6,7 +6,7 @@ from changing import SEEDS, ends
 from evaluating import run as evaluate
 from evaluating import spec_of
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import Dataset
 
 

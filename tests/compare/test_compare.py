@@ -17,7 +17,7 @@ from evaluating import run as evaluate
 from run_on_disk import Row, answers_of, change, configure, damage, made_up, rows_of
 from scipy.stats import norm
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.core.multiplicity import holm
 from harness.dataset.load import Dataset, load

@@ -31,7 +31,7 @@ from harness.backends.openai import shapes
 from harness.backends.openai.faults import fault_in
 from harness.backends.registry import BUILT_IN, missing, open_backend
 from harness.coordination.contents import CONTENTS, INTENT, INTENTS
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.coordination.rules import RULES, reads
 from harness.coordination.schedules import SCHEDULES
 from harness.core import versions

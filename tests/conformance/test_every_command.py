@@ -27,7 +27,7 @@ from misbehaving import Asked, Server, completion, serving
 from starlette.testclient import TestClient
 
 from harness import cli
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import Dataset, load
 from harness.prompts import versions
 

@@ -11,7 +11,8 @@ from evaluating import live_spec_of, says
 
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.named_points import POINTS
+from harness.coordination.operating_point import OperatingPoint
 from harness.evaluate.asking import Asker
 from harness.evaluate.latency import chosen_latency
 from harness.evaluate.live_world import LiveSource, LiveWorld

@@ -15,7 +15,7 @@ from tiers import some
 from harness.api import load
 from harness.backends import cards
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.dataset.build import build
 from harness.evaluate.agent import Agent

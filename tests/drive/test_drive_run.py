@@ -12,7 +12,7 @@ from killed_run import PLACES, at, killed_at
 from tiers import some
 
 from harness.backends.driver import DriverBackend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.core.work import tidy
 from harness.evaluate import live_world

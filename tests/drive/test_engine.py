@@ -13,7 +13,7 @@ from run_on_disk import UNTIMED
 from tiers import some
 
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.core.noise import uniforms
 from harness.evaluate.asking import Asker
 from harness.evaluate.branches import Course, Decision, Trajectory, advance

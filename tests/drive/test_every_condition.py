@@ -21,12 +21,9 @@ from hypothesis import strategies as st
 from harness.backends.base import Completion, Request
 from harness.coordination.contents import CONTENTS
 from harness.coordination.encodings import ENCODINGS, JSON
-from harness.coordination.operating_point import (
-    OperatingPoint,
-    more_parts,
-    named_point,
-    typed_settings,
-)
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.part_settings import more_parts, typed_settings
 from harness.coordination.parts import EDGES, FALLBACKS
 from harness.coordination.rules import names
 from harness.coordination.schedules import SCHEDULES

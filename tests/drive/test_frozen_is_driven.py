@@ -20,7 +20,8 @@ from evaluating import live_spec_of, run, spec_of
 from tiers import some
 
 from harness.coordination.contents import CONTENTS, of_any_model
-from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.named_points import POINTS, named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, find, load
 from harness.evaluate.live_world import LiveSource

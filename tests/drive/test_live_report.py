@@ -12,7 +12,7 @@ from former import NAME, SCENARIO
 from reading import Page, by_workers, details
 from run_on_disk import change, damage, rows_of
 
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.evaluate.replay import played, scenes_of
 from harness.prompts import versions as prompts

@@ -25,7 +25,7 @@ from harness.cli.commands import COMMANDS
 from harness.coordination.added_parts import added_parts
 from harness.coordination.counterparts import COUNTERPARTS
 from harness.coordination.encodings import ENCODINGS
-from harness.coordination.operating_point import more_parts
+from harness.coordination.part_settings import more_parts
 from harness.coordination.schedules import READERS
 from harness.core import extensions as known
 from harness.core import plugins

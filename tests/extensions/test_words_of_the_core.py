@@ -9,7 +9,7 @@ import pytest
 
 from harness.cli.commands import COMMANDS, GROUPS, OLD
 from harness.coordination.contents import CONTENTS
-from harness.coordination.operating_point import more_parts
+from harness.coordination.part_settings import more_parts
 from harness.coordination.rules import RULES
 from harness.coordination.schedules import SCHEDULES
 from harness.core.extensions import Extension, control_settings, extensions
@@ -185,7 +185,9 @@ def test_the_core_names_nothing_of_an_extension() -> None:
 LOOP = (
     "coordination/coordinate.py",
     "coordination/exchange.py",
+    "coordination/named_points.py",
     "coordination/operating_point.py",
+    "coordination/part_settings.py",
     "evaluate/answer_arrays.py",
     "evaluate/asking.py",
     "evaluate/requests.py",
@@ -196,7 +198,10 @@ OTHER_THINGS = {
     ("coordination/coordinate.py", "messages"): "what a rule fuses",
     ("coordination/operating_point.py", "objects"): "whether a call shows what is in the graph",
     ("coordination/operating_point.py", "rounds"): "of helpers, which load a channel",
-    ("coordination/operating_point.py", "text"): "of a condition, and of a message's key",
+    ("coordination/named_points.py", "text"): "of a condition",
+    ("coordination/operating_point.py", "text"): "of a message's key",
+    ("coordination/part_settings.py", "messages"): "whose changes parts know",
+    ("coordination/part_settings.py", "text"): "of a message's key",
     ("evaluate/asking.py", "text"): "what a model says",
     ("evaluate/spec.py", "objects"): "what a prompt shows",
     ("evaluate/spec.py", "text"): "of a prompt",

@@ -21,7 +21,7 @@ import pytest
 from msgspec import structs
 
 from harness.cli import main
-from harness.coordination.operating_point import more_parts
+from harness.coordination.part_settings import more_parts
 
 Row = dict[str, str]
 Table = list[Row]

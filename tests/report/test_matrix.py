@@ -11,7 +11,7 @@ from reading import by_workers, details
 from run_on_disk import answers_of, rows_of
 from sample_run import write_run
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import load
 from harness.report import matrix, panels
 from harness.report.charts import statuses

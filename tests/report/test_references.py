@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from evaluating import live_spec_of, run, spec_of
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.seeds import purpose
 from harness.dataset.load import Dataset
 from harness.report.charts import success_latency

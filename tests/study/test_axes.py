@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.coordination.rules import POOLS
 from harness.core.errors import UserError
 from harness.studies.axes import AXES, axis_of, grid, usual_at

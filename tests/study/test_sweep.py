@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from evaluating import figure, run, spec_of
 
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.versions import versions
 from harness.extensions.paper.calibrated import Calibrated
 from harness.extensions.paper.ledger import headline, ledger, marks, tables

@@ -302,7 +302,7 @@ def channel_of(text: str) -> "tuple[str, Channel]":
 
     Raises UserError if there is no such condition, or it has no channel.
     """
-    from harness.coordination.operating_point import named_point
+    from harness.coordination.named_points import named_point
     from harness.radio.wrapped import innermost
 
     point = named_point(text)

@@ -37,7 +37,7 @@ def learn(
 
     It learns from runs on train layouts, and chooses the threshold on tune layouts.
     """
-    from harness.coordination.operating_point import named_point
+    from harness.coordination.named_points import named_point
     from harness.extensions.schedules.learning import ROUNDS, run_learn
     from harness.studies.replayed_run import ReplayedRun
 

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from harness.coordination.contents import INTENTS
-from harness.coordination.operating_point import OperatingPoint, setting_of
+from harness.coordination.named_points import setting_of
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.rules import EGO_PROMPT, RULES, reads
 from harness.core import noise
 from harness.core.arrays import Floats

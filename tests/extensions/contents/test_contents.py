@@ -28,7 +28,8 @@ from harness.backends.proxy import distribution
 from harness.coordination.contents import CONTENTS
 from harness.coordination.coordinate import FusionInputs, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.named_points import POINTS, named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset, Scene

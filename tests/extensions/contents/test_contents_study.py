@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from evaluating import run, spec_of
 
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.statistics import mean_of, paired_difference
 from harness.dataset.load import Dataset
 from harness.extensions.contents.study import NOTHING, Outcome, holding, witnesses

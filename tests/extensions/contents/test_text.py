@@ -14,7 +14,8 @@ from graphs import MESSAGES
 from harness.backends.base import Completion, Request
 from harness.coordination.contents import CONTENTS
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset

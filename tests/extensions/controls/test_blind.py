@@ -26,7 +26,8 @@ from reading import unpacked
 from run_on_disk import answers_of
 
 from harness.backends.base import Completion, Request
-from harness.coordination.operating_point import named_point, questions
+from harness.coordination.named_points import named_point
+from harness.coordination.part_settings import questions
 from harness.coordination.parts import PLAIN
 from harness.core.errors import UserError
 from harness.core.process import Stop

@@ -35,7 +35,7 @@ from starlette.testclient import TestClient
 from harness.backends import cards
 from harness.backends.base import Completion, Request
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core import web
 from harness.core.errors import UserError
 from harness.core.image import Image

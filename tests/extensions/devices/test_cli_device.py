@@ -11,7 +11,7 @@ import pytest
 from evaluating import course, run, spec_of
 from msgspec.structs import replace
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.extensions.devices import profiles

@@ -21,7 +21,8 @@ from hypothesis import strategies as st
 from harness.backends.base import Completion, Request
 from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import CLOUD, POINTS, OperatingPoint, named_point
+from harness.coordination.named_points import CLOUD, POINTS, named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import Unanswered, UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset

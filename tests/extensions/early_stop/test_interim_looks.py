@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from harness.backends.base import Backend
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.core.shards import Shard
 from harness.core.statistics import paired_difference

@@ -10,7 +10,7 @@ from evaluating import run as evaluate
 from evaluating import spec_of
 from run_on_disk import Row, answers_of, change, configure, made_up, rows_of
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.files import digest
 from harness.dataset.load import Dataset
 from harness.runs.folder import read

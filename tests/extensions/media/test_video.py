@@ -16,7 +16,7 @@ from run_on_disk import made_up
 from typer.testing import CliRunner
 
 from harness.cli import app, main
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core import extras
 from harness.core.errors import UserError
 from harness.evaluate.live_world import LiveSource

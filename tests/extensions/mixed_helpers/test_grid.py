@@ -16,7 +16,7 @@ from run_on_disk import answers_of
 
 from harness.backends import cards
 from harness.backends.proxy import Proxy
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent

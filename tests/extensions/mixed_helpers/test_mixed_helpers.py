@@ -13,7 +13,7 @@ from former import SCENARIO
 from run_on_disk import answers_of
 
 from harness.backends import cards
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
@@ -236,7 +236,7 @@ def test_what_is_wrong_with_a_helper_names_the_option_that_was_typed(
 
 
 def test_a_fusion_call_takes_messages_of_its_own_form(small: Dataset) -> None:
-    from harness.coordination.operating_point import named_point
+    from harness.coordination.named_points import named_point
 
     asks = (named_point("6g:consensus=ego-prompt"),)
     with pytest.raises(

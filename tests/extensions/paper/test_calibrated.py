@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.coordination.coordinate import TIE
-from harness.coordination.operating_point import POINTS, OperatingPoint
+from harness.coordination.named_points import POINTS
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.arrays import Bools, Floats
 from harness.evaluate.walk import walk

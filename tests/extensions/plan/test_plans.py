@@ -13,7 +13,8 @@ from harness.coordination.consensus import Messages
 from harness.coordination.coordinate import Coordination, FusionInputs, fuse
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.plans import Plans
 from harness.coordination.rules import RULES
 from harness.coordination.sent import SentIntents

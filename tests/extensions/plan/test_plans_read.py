@@ -12,7 +12,7 @@ import pytest
 from evaluating import A_TENTH, Scripted, live_spec_of, says
 
 from harness.backends.base import Completion, Request
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Scene

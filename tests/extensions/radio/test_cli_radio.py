@@ -11,7 +11,7 @@ from evaluating import run as evaluate
 from evaluating import spec_of
 
 from harness.cli.terminal import attributes
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.dataset.load import Dataset
 from harness.extensions.radio.its_g5 import ItsG5
 from harness.radio.channel import Physical

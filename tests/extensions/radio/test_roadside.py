@@ -22,7 +22,8 @@ from hypothesis import strategies as st
 from harness.coordination.coordinate import Coordination, coordinate
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.dataset.load import Dataset
 from harness.extensions.radio.propagation import Propagation
 from harness.extensions.radio.trace import Point, Spread, Table, Trace

@@ -15,7 +15,7 @@ from evaluating import live_spec_of, run, spec_of
 from relabelling import relabel
 
 from harness.backends.registry import open_backend
-from harness.coordination.operating_point import POINTS, named_point
+from harness.coordination.named_points import POINTS, named_point
 from harness.coordination.schedules import SCHEDULES
 from harness.core.config import toml
 from harness.core.errors import UserError

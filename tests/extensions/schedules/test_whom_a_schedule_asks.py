@@ -12,7 +12,8 @@ from one_scene import ALL, NOBODY, SIXG, asked, draws, same, scene
 
 from harness.coordination.exchange import exchange
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import POINTS, OperatingPoint, named_point
+from harness.coordination.named_points import POINTS, named_point
+from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.errors import UserError

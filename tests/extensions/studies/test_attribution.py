@@ -19,7 +19,7 @@ from run_on_disk import answers_of
 from harness.backends import cards
 from harness.backends.base import Completion, Request
 from harness.coordination.consensus import Fused, linear_pool
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
 from harness.core.process import Stop

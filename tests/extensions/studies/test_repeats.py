@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from priced import priced, typed_eval
 
 from harness.backends.base import Completion, Request
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.spec import Spec

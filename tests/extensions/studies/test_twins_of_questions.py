@@ -13,7 +13,7 @@ from graphs import CAR, COMING, STANDING, TRUCK, graph
 
 from harness.backends import cards
 from harness.backends.vision import Vision
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core.resources import folder
 from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset, load

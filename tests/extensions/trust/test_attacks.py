@@ -15,7 +15,8 @@ from swarm_attacks import MUMBLE
 from harness.coordination.claims import Claims
 from harness.coordination.coordinate import FusionInputs, coordinate
 from harness.coordination.intents import Intents
-from harness.coordination.operating_point import OperatingPoint, Rewrites, named_point
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint, Rewrites
 from harness.coordination.parts import Changes
 from harness.coordination.sent import SentIntents, Speaker
 from harness.core.errors import UserError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from evaluating import Watched, figure, live_spec_of, run, spec_of
 
-from harness.coordination.operating_point import named_point
+from harness.coordination.named_points import named_point
 from harness.core import resources, versions
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load

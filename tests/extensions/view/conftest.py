@@ -6,7 +6,7 @@ from evaluating import spec_of
 from starlette.testclient import TestClient
 from viewing import laid_out, visitor
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.dataset.load import Dataset
 from harness.report.page import write_report
 from harness.report.runs import gather

@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from run_on_disk import Row, configure, made_up
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.extensions.view.history import history
 from harness.runs.folder import read
 from harness.runs.metrics import BALANCED

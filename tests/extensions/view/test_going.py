@@ -12,7 +12,7 @@ from markupsafe import escape
 from starlette.testclient import TestClient
 from viewing import SECRET, visitor
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.files import alone
 from harness.core.work import tidy
 from harness.dataset.load import Dataset

@@ -19,7 +19,7 @@ from evaluating import spec_of
 from opening import NARROW, SCROLLS, WIDE, picture, wait
 from playwright.sync_api import expect
 
-from harness.coordination.operating_point import POINTS
+from harness.coordination.named_points import POINTS
 from harness.core.work import tidy
 from harness.evaluate.run import evaluate as evaluation
 from harness.extensions.view.export import export

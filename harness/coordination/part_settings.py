@@ -1,0 +1,153 @@
+"""Join what installed parts of conditions have: settings, questions, changes of messages."""
+
+from collections.abc import Collection, Mapping
+from functools import cache
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+from harness.coordination.added_parts import added_parts
+from harness.coordination.contents import (
+    CONTENTS,
+    Call,
+    is_ours,
+)
+from harness.coordination.parts import (
+    PLAIN,
+    Ask,
+    Change,
+    Cloud,
+    Fusion,
+    Part,
+    Question,
+    Radio,
+)
+from harness.coordination.parts_of_packages import change_by
+from harness.core.errors import UserError, printable
+from harness.core.extensions import OfExtension, part_of, setting_of_extension
+
+if TYPE_CHECKING:
+    pass
+
+OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
+RECORDED = {"further": "radio"}  # settings that records call otherwise: `radio` is the further ones
+IN_NO_TEXT = ("profile", "further")  # settings that a condition's text has in another way
+PARTS: dict[str, type[Part]] = {
+    "radio": Radio,
+    "ask": Ask,
+    "fusion": Fusion,
+    "cloud": Cloud,
+}
+
+
+@cache
+def more_parts() -> Mapping[str, type[Part]]:
+    """Return the `Part` subclasses of installed extensions, by name; imports their packages."""
+    return added_parts([key for kind in PARTS.values() for key in kind.__struct_fields__])
+
+
+@cache
+def part_of_settings() -> Mapping[str, str]:
+    """Return for each setting of an operating point the name of its part.
+
+    The order is that of the flat records in manifests and run files.
+    """
+    part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
+    behind: dict[str, set[str]] = {}  # parts that stand behind the same setting, in their order
+    for part, kind in more_parts().items():
+        after = 1 + [key for key, _ in part_of].index(kind.behind)
+        while after < len(part_of) and part_of[after][1] in behind.get(kind.behind, ()):
+            after += 1
+        behind.setdefault(kind.behind, set()).add(part)
+        part_of[after:after] = [(key, part) for key in kind.__struct_fields__]
+    return dict(part_of)
+
+
+@cache
+def typed_settings() -> tuple[str, ...]:
+    """Return the settings that can be typed in a condition such as `6g:tau=0.5`, by full name."""
+    return tuple(key for key in part_of_settings() if key not in IN_NO_TEXT)
+
+
+@cache
+def settings_alone() -> Collection[str]:
+    """Return the settings that still have an effect on an ego without a channel."""
+    core = ("fallback", "round_trip", "round_trip_s", "window_s")
+    of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_ego]
+    return {*core, *chain(*of_extensions)}
+
+
+def change_of(text: str) -> Change:
+    """Return the change of messages that `text` names in the key of a fusion call's answer.
+
+    `text` is one that some part's `changes` gave, such as `liar:share=1/3` or `quoted`. Raises
+    UserError if no installed part knows it.
+    """
+    for kind in more_parts().values():
+        if (change := change_by(kind, text)) is not None:
+            return change
+    raise UserError(f"no part that is installed changes messages by {printable(text)!r}")
+
+
+@cache
+def calls() -> Mapping[str, Call]:
+    """Return the second questions that contents of messages ask the ego's model, by name.
+
+    A package's call is left out if some part already changes messages by that name.
+    """
+    by_name: dict[str, Call] = {}
+    for content in CONTENTS.usable().values():
+        call = content.call
+        if call and (is_ours(call) or not _changes_messages(call.name)):
+            by_name[call.name] = call
+    return by_name
+
+
+def _changes_messages(text: str) -> bool:
+    return any(change_by(kind, text) is not None for kind in more_parts().values())
+
+
+@cache
+def questions() -> Mapping[str, Question]:
+    """Return the questions that helpers may be asked, by name.
+
+    The ordinary one, what the ego should do as the helper sees it, has the name "".
+    """
+    others = chain(*(kind.questions for kind in more_parts().values()))
+    return {"": PLAIN, **{question.name: question for question in others}}
+
+
+def question_under(settings: Mapping[str, Any]) -> Question:
+    """Return the question that helpers were asked under a condition's recorded, flat settings.
+
+    Settings that belong to no installed part are ignored.
+    """
+    for kind in more_parts().values():
+        part_settings = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
+        if kind.questions and part_settings:
+            return kind(**part_settings).question
+    return PLAIN
+
+
+def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a condition's flat settings without those of extensions that are not installed.
+
+    Raises UserError if such a setting has another value than the one that does nothing.
+    """
+    kept: dict[str, Any] = {}
+    for key, value in settings.items():
+        gone = gone_setting(key)
+        if not gone:
+            kept[key] = value
+        elif ("" if value is None else str(value)) != gone.idle:
+            raise UserError(lacking_setting(key, value, gone))
+    return kept
+
+
+def gone_setting(setting: str) -> OfExtension | None:
+    """Return whose a setting is, if it is of an extension that is not installed; else None."""
+    return None if setting in part_of_settings() else setting_of_extension(setting)
+
+
+def lacking_setting(setting: str, value: object, gone: OfExtension) -> str:
+    """Return what is said of a setting with a value whose extension is not installed."""
+    return f"setting {setting}={printable(value)} of a condition is {part_of(gone.extension)}"
