@@ -8,13 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.plugins import Shipped
 from harness.runs.formats import LOOKS
 
 if TYPE_CHECKING:
+    from harness.core.arrays import Floats
     from harness.core.statistics import Estimate
     from harness.runs.metrics import Grid
     from harness.runs.records import Episode, Score
@@ -100,7 +100,7 @@ class StoppingRule(ABC):
         """
 
     @abstractmethod
-    def difference(self, success: "Success", a: Floats, b: Floats) -> "Estimate":
+    def difference(self, success: "Success", a: "Floats", b: "Floats") -> "Estimate":
         """Return success a - b, both (S, E), by an interval that holds at every look.
 
         The axes are S channel seeds and E episodes, by which it is paired.

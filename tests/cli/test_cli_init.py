@@ -115,7 +115,7 @@ def test_each_line_of_its_settings_can_be_switched_on(project: Path) -> None:
     assert (every.answer, every.tag, every.extensions) == (
         "constrained",
         ("first",),
-        {"helper_model": "swarm-tiny", "helper_prompt": "v2"},
+        {"danger": "left", "helper_model": "swarm-tiny", "helper_prompt": "v2"},
     )
     assert (usual.answer, usual.tag, usual.extensions) == ("json", (), {})
     assert usual.condition == every.condition == ("single-local", "6g")

@@ -47,15 +47,9 @@ def three_decisions(once):
 # Building.
 
 
-def _pipe(layout):
-    layout.unlink()
-    os.mkfifo(layout)
-
-
 SOME_PARTS = {
     "as it was": lambda layout: None,
     "garbage": lambda layout: layout.write_bytes(b"PK"),
-    "a pipe": _pipe,
     "no seal": lambda layout: layout.with_name(f"seal-{layout.name}").unlink(),
 }
 

@@ -418,7 +418,7 @@ def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_pat
         (["--samples", "64,64,64,7", "--batch", "1"], "8 or more each"),
         (["--batch", "0"], "--batch 0: give 1 or more"),
         (["--samples", "64,64,64,64", "--batch", "100000"], "100000 or more each"),
-        (["--threads", "0"], "--threads 0: give 1 or more"),
+        (["--threads", "0"], "--threads 0 is out of range; give 1 to 1024"),
         (["--seed", "-1"], "--seed -1 is out of range; give 0 to 2147483647"),
         (["--prompt", "v99"], "unknown prompt 'v99'"),
         (["--prompt", "v2", "do-not-pass"], "--prompt v2: none is for do-not-pass; give v4"),

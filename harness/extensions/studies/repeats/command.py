@@ -40,7 +40,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
 ) -> None:
-    """Evaluate several times with other draws of the model's answers, and see what differs.
+    """Evaluate several times, with other draws of answers.
 
     Each repeat is a run with the next sampling seed; give a --temperature above 0. If it is
     stopped, the same command continues it.
