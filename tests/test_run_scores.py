@@ -437,7 +437,7 @@ NASTY = st.text(max_size=40) | st.sampled_from(
 def test_whatever_is_said_the_record_is_one_json_object_a_line(
     lines: list[str], error: str, played: Dataset, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    spec = spec_of(played, points=(CLEAR,), seeds=(0,), ask="all")
+    spec = spec_of(played, "openai-example", points=(CLEAR,), seeds=(0,), ask="all")
     said: dict[str, str | Completion] = {f"00001-0/v{n}": line for n, line in enumerate(lines, 1)}
     kept = tmp_path_factory.mktemp("nasty") / "answers.jsonl"
     answered = walked(spec, Scripted(said), kept=kept)

@@ -186,22 +186,24 @@ def owners(
 def collect(parts: Mapping[str, Path], folder: Path) -> None:
     """Copy parts (files or folders, by name) to a working folder, each in one step.
 
-    Parts that the folder already holds are skipped; copied ones are sealed, since whoever typed the
-    command wants them as they are.
+    Parts that the folder already holds with the same bytes are skipped; copied ones are sealed,
+    since whoever typed the command wants them as they are.
     """
     for name, part in parts.items():
-        copy = folder / f".{name}.{os.getpid()}.part"
-        if not (folder / name).exists():
+        copy, there = folder / f".{name}.{os.getpid()}.part", folder / name
+        content = _content(part)
+        if there.exists() and _content(there) != content:
+            shutil.rmtree(there) if there.is_dir() else there.unlink()
+        if not there.exists():
             shutil.rmtree(copy, ignore_errors=True)
-            content = _content(part)
-            write_seal(folder / name, content)
+            write_seal(there, content)
             if part.is_dir():
                 copy.mkdir()
                 for file, data in content.items():
                     (copy / file).write_bytes(data)
             else:
                 copy.write_bytes(content[part.name])
-            os.replace(copy, folder / name)
+            os.replace(copy, there)
 
 
 def _content(part: Path) -> dict[str, bytes]:

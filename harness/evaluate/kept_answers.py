@@ -49,7 +49,8 @@ class KeptAnswers:
             ) from None
         self._read_b = sum(map(len, lines))
         if cut and self._read_b < size_b:
-            os.truncate(self.file, self._read_b)
+            with appending(self.file) as file:  # never through a link
+                file.truncate(self._read_b)
         return {answer.id: answer for answer in answers if answer.error is None}
 
     def append(self, answers: Sequence[Answer]) -> None:

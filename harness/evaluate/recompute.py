@@ -33,6 +33,7 @@ from harness.evaluate.texts import OF_TEXTS, others, same
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
+from harness.runs.stopping import looked_otherwise
 
 AGAIN = 3  # episodes of a driven run that are driven again
 OF_ENDS = (  # what an episode's row says of how it ended
@@ -184,10 +185,10 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
     For a run that work goes on from, and that anybody may have written. No model is asked; of a
     driven run a few episodes are driven again.
     """
+    looks = run.manifest.interim_looks
     if not isinstance(spec.source, FrozenSource):
         wrong = list(driven_otherwise(run))
     else:
-        looks = run.manifest.interim_looks
         evaluated = spec.stopped(looks) if looks else spec
         stays = replace(evaluated, stopping_rule=None, guards=())
         with TemporaryDirectory(prefix="harness-") as folder:
@@ -197,6 +198,8 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
                 wrong = [f"answers.jsonl has no answer to {lack.question}"]
             else:
                 wrong = [*_of_episodes(run, ours), *_of_decisions(run, ours), *_of_rule(otherwise)]
+    if spec.stopping_rule and looks:
+        wrong += looked_otherwise(spec.stopping_rule, looks, run.grid, run.episodes)
     if wrong:
         raise UserError(f"{printable(run.path)}: {wrong[0]}; delete that folder, and type it again")
 

@@ -198,12 +198,15 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
     parts = shards.owners(
         folders, run_starts, list(chunk_by_folder), lambda part: _label(chunk_by_folder[part])
     )
-    if (out / "run.json").exists() and (out / WORK).is_dir():
-        return finished_with(run_starts[0].settings, out)
-    refuse_finished(out)
     tags = tuple(dict.fromkeys(tag for each in run_starts for tag in each.tags))
     created = min(each.created for each in run_starts)
     whole = msgspec.structs.replace(run_starts[0], shard="", tags=tags, created=created)
+    if (out / "run.json").exists() and (out / WORK).is_dir():
+        # Anybody may have written what a stopped merge finished, and the shards are here.
+        finished_with(whole.settings, out)
+        write_whole(out / WORK / CONFIG, msgspec.json.encode(whole))
+        (out / "run.json").unlink()
+    refuse_finished(out)
     if stopped := work.start_of(out, RunStart):
         work.same(out, {**whole.facts(), "shard": ""}, {**stopped.facts(), "shard": stopped.shard})
     with work.working(out, stopped or whole, "run.json") as place:

@@ -186,6 +186,9 @@ def unchecked(run: Run) -> Iterator[str]:
     if names := dict.fromkeys(key[1] for key in figures if key not in held):
         what = "a package's metrics, or an earlier harness's"
         yield f"{_listed(names)}: as summary.csv states, and not checked, since they are {what}."
+    rule, record = run.manifest.stopping_rule, run.manifest.world.interim_looks
+    if rule and record and (open_point := rule.unchecked(record)):
+        yield open_point
     if names := dict.fromkeys(key[1] for key in _lacking(run, here.values())):
         version = printable(run.manifest.versions.get("figures", "1"))
         yield (

@@ -5,7 +5,7 @@ An extension that ships adds a rule by `adds={"stopping_rules": {LOOKS: "module:
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from harness.core.errors import UserError
@@ -88,6 +88,10 @@ class StoppingRule(ABC):
         `episodes` are all of the run, in the order of the grid.
         """
 
+    def unchecked(self, record: Mapping[str, Any]) -> str | None:
+        """Return what nobody can check of the looks that a run states, as a sentence, or None."""
+        return None
+
     @abstractmethod
     def sentence(self, record: Mapping[str, Any]) -> str:
         """Return when a run that states this was looked at, and which of its intervals hold."""
@@ -105,6 +109,29 @@ class StoppingRule(ABC):
 
         The axes are S channel seeds and E episodes, by which it is paired.
         """
+
+
+def looked_otherwise(
+    rule: StoppingRule, looks: InterimLooks, grid: "Grid", episodes: "Sequence[Episode]"
+) -> Iterator[str]:
+    """Yield where a run that has ended was looked at, or stopped, otherwise than a rule says.
+
+    `episodes` are all of the run, in the order of the grid.
+    """
+    planned = tuple(rule.planned_looks(looks.layouts)[: len(looks.at)])
+    if looks.at != planned:
+        yield f"run.json has looks after {list(looks.at)} layouts, and its rule after {planned}"
+        return
+    for count in looks.at:
+        part = replace(grid, episodes=grid.episodes[:count])
+        numbers = frozenset(part.episodes)
+        seen = [episode for episode in episodes if episode.episode in numbers]
+        is_last = count == looks.at[-1]
+        was_enough = is_last and looks.is_enough
+        if rule.enough(part, part.ordered(seen)) != was_enough:
+            is_enough = "not " * was_enough + "enough"
+            yield f"by its episodes {count} layouts were {is_enough}, and run.json says otherwise"
+            return
 
 
 STOPPING_RULES = Shipped[StoppingRule]("swarmdrive.stopping_rules", StoppingRule, {})

@@ -21,7 +21,7 @@ from harness.runs.headline import ANY_TIME
 from harness.runs.metrics import BASELINE, GAINS, Grid
 from harness.runs.records import Episode, Score
 from harness.runs.settings import DriveSettings
-from harness.runs.stopping import InterimLooks, StoppingRule
+from harness.runs.stopping import InterimLooks, StoppingRule, looked_otherwise
 from harness.runs.success import Success, by_condition
 
 if TYPE_CHECKING:
@@ -161,13 +161,15 @@ class Until(StoppingRule):
         self, record: Mapping[str, Any], grid: Grid, episodes: Sequence[Episode]
     ) -> Iterator[str]:
         looks = msgspec.convert(record, LooksRecord)
-        if looks.width is None:
-            return
-        if (is_enough := Until(looks.width).enough(grid, episodes)) != looks.enough:
-            yield (
-                f"run.json has looks.enough {looks.enough} at a width of {100 * looks.width:g} "
-                f"points, and by its episodes it is {is_enough}"
-            )
+        if looks.width is not None:
+            yield from looked_otherwise(Until(looks.width), self.looks(record), grid, episodes)
+
+    def unchecked(self, record: Mapping[str, Any]) -> str | None:
+        looks = msgspec.convert(record, LooksRecord)
+        if looks.width is not None:
+            return None
+        other = printable(looks.against, 40)
+        return f"Whether success differed from that of {other} at its looks is not checked."
 
     def sentence(self, record: Mapping[str, Any]) -> str:
         looks = msgspec.convert(record, LooksRecord)

@@ -245,9 +245,10 @@ def test_what_another_run_lacks_is_one_line(
         (None, "summary.csv has success_rate 1.0 in single-local (any time), which its other"),
         (
             {"width": 0.5},
-            "has looks.enough True at a width of 50 points, and by its episodes it is",
+            "by its episodes 2 layouts were not enough, and run.json says otherwise",
         ),
-        ({"enough": False}, "run.json has looks.enough False at a width of 99.9 points"),
+        ({"enough": False}, "by its episodes 2 layouts were enough, and run.json says other"),
+        ({"at": [1, 2]}, "has looks after [1, 2] layouts, and its rule after"),
         ({"at": []}, "looks: at no layouts, at more than all, or not in their order"),
         ({"at": [3, 2]}, "looks: at no layouts, at more than all, or not in their order"),
         ({"at": [2, 5]}, "looks: at no layouts, at more than all, or not in their order"),
@@ -268,6 +269,28 @@ def test_a_forged_look_is_named(
     code, out, err = harness("run", "check", tmp_path / "run")
     assert code == (2 if err else 1)
     assert says in " ".join((out + err).split())
+
+
+def test_a_look_at_another_run_is_held_against_it_where_work_goes_on(
+    small: Dataset, tmp_path: Path, harness: Typed
+) -> None:
+    """Else `run check` says that it is not checked."""
+    run(spec_of(small, "brake", **ALONE), tmp_path / "base")
+    against = Until(against=read(tmp_path / "base"), folder=tmp_path / "base")
+    spec = until(spec_of(small, "constant", **ALONE), against)
+    run(spec, tmp_path / "run")
+    code, out, _ = harness("run", "check", tmp_path / "run")
+    assert code == 0
+    assert "Whether success differed from that of base at its looks is not checked." in out
+    (tmp_path / "run/.work").mkdir()
+    run(spec, tmp_path / "run")
+    stated = json.loads((tmp_path / "run/run.json").read_text())
+    looks = stated["world"]["looks"]
+    looks["enough"] = not looks.get("enough", False)
+    (tmp_path / "run/run.json").write_text(json.dumps(stated))
+    (tmp_path / "run/.work").mkdir(exist_ok=True)
+    with pytest.raises(UserError, match=r"and run\.json says otherwise; delete that folder"):
+        run(spec, tmp_path / "run")
 
 
 def test_a_finished_run_is_taken_for_no_run_by_another_rule(small: Dataset, tmp_path: Path) -> None:
