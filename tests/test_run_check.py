@@ -16,6 +16,7 @@ from run_on_disk import Row, change, configure, damage
 from harness.coordination.named_points import POINTS
 from harness.core import extras
 from harness.core.errors import UserError
+from harness.core.extensions import extensions
 from harness.runs.contradictions import refuse
 from harness.runs.folder import read
 
@@ -496,6 +497,30 @@ def test_what_is_no_number_or_none_of_its_scenes_is_a_line_and_no_traceback(
     code, out, _ = harness("run", "check", run)
     assert code in (1, 2)
     assert "Traceback" not in out
+
+
+@pytest.mark.parametrize(
+    ("table", "name", "value", "needs"),
+    [
+        ("helpers", "model", "proxy", "mixed_helpers"),
+        ("world", "only", "0:1", "selection"),
+        ("world", "until_width", 30.0, "early_stop"),
+        ("", "control", ["blind"], "controls"),
+    ],
+)
+def test_settings_without_what_they_come_to_are_refused(
+    table: str, name: str, value: object, needs: str, run: Path, harness: Harness
+) -> None:
+    if needs not in extensions():
+        pytest.skip(f"{needs} is gone")
+    stated = json.loads((run / "run.json").read_text())
+    settings = stated["settings"][table] if table else stated["settings"]
+    assert settings[name] in (None, [])
+    settings[name] = value
+    (run / "run.json").write_text(json.dumps(stated))
+    code, _, error = harness("report", run)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "and nothing beside them says what that came to" in error
 
 
 def test_what_nobody_can_check_is_named_and_not_called_equal(

@@ -1,6 +1,7 @@
 """A run killed at any moment and resumed has the bytes of one that never was."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -287,11 +288,11 @@ def test_answers_that_are_all_there_are_not_asked_for_again(
     answers: bytes, small: Dataset, tmp_path: Path
 ) -> None:
     """One answer is altered by hand, not in what it says: it stays as it was kept."""
-    marked = answers.replace(b'"retries":0', b'"retries":1', 1)
+    marked = re.sub(rb'"batch_size":\d+', b'"batch_size":99', answers, count=1)
     assert marked != answers
     out = unfinished(spec_of(small), tmp_path / "run", marked)
     run(spec_of(small), out)
-    assert b'"retries":1' in (out / "answers.jsonl").read_bytes()
+    assert b'"batch_size":99' in (out / "answers.jsonl").read_bytes()
 
 
 FIRST_TURN = {
@@ -312,6 +313,8 @@ SURE = '{"action_distribution": {"SLOWER": 1.0, "IDLE": 0.0, "FASTER": 0.0}}'
         ("prompt_sha256", "0" * 64, "answer 00000-0-.* is to another prompt or picture than is"),
         ("raw", SURE, "answer 00000-0-.* is not what the rule here gives; delete that file"),
         ("slow_s", -0.1, "states a delay of -0.1 s, which no card of this run declares"),
+        ("seconds", 0.5, "answer 00000-0-.* is not what the rule here gives; delete that file"),
+        ("retries", 10**15, "answer 00000-0-.* is not what the rule here gives; delete that file"),
         ("prompt_tokens", -5, r"answers\.jsonl is damaged .*prompt_tokens"),
         ("agent", 1, "answer 00000-0-.* states another model than is asked there; delete that"),
         ("label_mass", 1.0, "states a label_mass, which only a read-out has"),
@@ -349,7 +352,7 @@ def test_damaged_answers_are_one_line(
 ) -> None:
     out = unfinished(spec_of(small), tmp_path / "run", line + b"\n" + answers)
     with pytest.raises(
-        UserError, match=r"answers\.jsonl is damaged .*; delete its folder and start again"
+        UserError, match=r"answers\.jsonl is damaged .*; delete that file, and its questions are"
     ):
         run(spec_of(small), out)
 

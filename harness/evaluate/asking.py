@@ -63,6 +63,19 @@ CHUNK = 64  # fewest requests that are asked, and kept, together
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 # questions without an answer, one after the other, after which nothing more is asked
 IN_A_ROW = CHUNK
+# What a rule gives again, whatever came before: its text, and what it says of its time and tokens.
+OF_RULES = (
+    "raw",
+    "finish_reason",
+    "prompt_tokens",
+    "completion_tokens",
+    "seconds",
+    "slow_s",
+    "retries",
+    "cached",
+    "first_token_s",
+    "token_s",
+)
 WITH_EXAMPLES = "v10"  # the prompt for every scenario that small models answer in its form
 
 
@@ -210,9 +223,10 @@ class Asker:
         for request, here in zip(of_rules, self._backend().complete(of_rules), strict=True):
             kept_answer = self.answers[request.id]
             first_answer = kept_answer.first or kept_answer  # before a repair turn
-            counts = first_answer.prompt_tokens, first_answer.completion_tokens
-            of_file = first_answer.raw, first_answer.slow_s, *counts
-            if of_file != (here.text, here.slow_s, here.prompt_tokens, here.completion_tokens):
+            expected = answer_of(request, here)
+            given = {name: getattr(expected, name) for name in OF_RULES}
+            # the record of an answer before a repair turn has some of these
+            if any(getattr(first_answer, name, value) != value for name, value in given.items()):
                 raise self._refused(request, "is not what the rule here gives")
 
     def _has(self, name: str) -> bool:

@@ -44,8 +44,8 @@ class KeptAnswers:
             answers = [_DECODER.decode(line) for line in lines]
         except (ValueError, RecursionError) as error:
             raise UserError(
-                f"{printable(self.file)} is damaged ({printable(error)}); delete its folder and "
-                "start again"
+                f"{printable(self.file)} is damaged ({printable(error)}); delete that file, and "
+                "its questions are asked again"
             ) from None
         self._read_b = sum(map(len, lines))
         if cut and self._read_b < size_b:

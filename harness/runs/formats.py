@@ -380,7 +380,37 @@ def _table(record: Mapping[str, Any], in_file: Any) -> Any:
         if typed != there and not may_be:
             both = f"{printable(flat[name], 60)}, and beside them it is {printable(there, 60)}"
             raise ValueError(f"its settings have {_place(name)} {both}")
+    if "settings" in record:
+        for name in _without_record(record):
+            default = extensions.beside()[name].default
+            value = flat.get(_extensions_key(name), default)
+            if value is not None and value != default and value not in NO_TEXTS:
+                raise ValueError(
+                    f"its settings have {name} {printable(value, 60)}, and nothing beside them says"
+                    " what that came to"
+                )
     return _with(SETTINGS, table)
+
+
+def _without_record(record: Mapping[str, Any]) -> set[str]:
+    """Return the settings of extensions that would have left something in a run, and have not.
+
+    They choose helpers' agents, episodes, when a run stops, or counterparts of conditions.
+    """
+    from harness.coordination.counterparts import COUNTERPARTS
+    from harness.dataset.select import SELECTIONS
+    from harness.runs.stopping import STOPPING_RULES
+
+    names = {*COUNTERPARTS}  # which conditions state by their names
+    world = record.get("world")
+    scenes = world if isinstance(world, Mapping) else {}
+    if not record.get("helpers"):
+        names |= {*role_agents.settings()}
+    if not scenes.get("selection"):
+        names |= {name for each in SELECTIONS.values() for name in each.chosen_by}
+    if not scenes.get(LOOKS):
+        names |= {name for each in STOPPING_RULES.values() for name in each.chosen_by}
+    return names & extensions.beside().keys()
 
 
 def _extensions_key(name: str) -> str:
