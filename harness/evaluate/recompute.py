@@ -1,7 +1,7 @@
 """Compute a run again from its answers alone; no model is asked, and rules, which are here, are."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -187,7 +187,7 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
     """
     looks = run.manifest.interim_looks
     if not isinstance(spec.source, FrozenSource):
-        wrong = list(driven_otherwise(run))
+        wrong = [*_of_card(run, spec.ego.card), *driven_otherwise(run)]
     else:
         evaluated = spec.stopped(looks) if looks else spec
         stays = replace(evaluated, stopping_rule=None, guards=())
@@ -197,7 +197,13 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
             except LacksAnswer as lack:
                 wrong = [f"answers.jsonl has no answer to {lack.question}"]
             else:
-                wrong = [*_of_episodes(run, ours), *_of_decisions(run, ours), *_of_rule(otherwise)]
+                wrong = [
+                    *_of_manifest(run, ours, spec.ego.card, ("path", "interim_looks")),
+                    *_of_episodes(run, ours),
+                    *_of_decisions(run, ours),
+                    *_of_answers(run, ours),
+                    *_of_rule(otherwise),
+                ]
     if spec.stopping_rule and looks:
         wrong += looked_otherwise(spec.stopping_rule, looks, run.grid, run.episodes)
     if wrong:
@@ -258,6 +264,12 @@ def driven_otherwise(run: Run) -> Iterator[str]:
     from harness.evaluate.replay import driven_again, played
 
     yield from _of_latency(run)
+    world = run.manifest.world
+    selected = None if select.lacking(world.selection) else select.recorded(world.selection)
+    if selected:
+        numbers = selected.choice(range(int(world.selection["of"])), None).numbers
+        if tuple(numbers) != run.grid.episodes:
+            yield "episodes.csv has other episodes than run.json says that were selected"
     for row in spot_check(run.episodes, sha256_file(run.path / "episodes.csv"), AGAIN):
         here = driven_again(played(run, row.episode, row.condition, row.seed))
         for name, _ in differing([row], [here]):
@@ -268,22 +280,30 @@ def driven_otherwise(run: Run) -> Iterator[str]:
                 )
 
 
-def _of_manifest(run: Run, ours: Run, card: Card) -> Iterator[str]:
-    """Yield what run.json, with this card, says otherwise of scenes, conditions,
-    latency and model.
+def _of_manifest(
+    run: Run, ours: Run, card: Card, besides: Collection[str] = ("path",)
+) -> Iterator[str]:
+    """Yield what run.json, with this card, says otherwise of scenes, conditions, latency and model.
+
+    `besides` are fields of its scenes that are not compared.
     """
     world, here = (to_builtins(each.manifest.world) for each in (run, ours))
-    for name in here.keys() - {"path"}:
+    for name in here.keys() - {*besides}:
         if world.get(name) != here[name]:
             yield f"run.json has another {name} of its scenes than the dataset"
+    yield from _of_card(run, card)
+    yield from _of_latency(run)
+    if run.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
+        yield "run.json says of a driver that it sees other than it does"
+
+
+def _of_card(run: Run, card: Card) -> Iterator[str]:
+    """Yield whether a run's latency is otherwise than this card says, if it names that."""
     latency, card_s = run.manifest.latency, card.latency.inference_s
     if card.engine == REPLAY:  # its answers took as long as in the run that it replays
         card_s = asked_card(run).latency.inference_s
     if latency.source == "card" and card_s != latency.ego_s:
         yield "run.json has another latency than its model's card, which it names as the source"
-    yield from _of_latency(run)
-    if run.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
-        yield "run.json says of a driver that it sees other than it does"
 
 
 def asked_card(run: Run) -> Card:

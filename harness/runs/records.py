@@ -670,6 +670,8 @@ class Manifest(Struct, frozen=True, kw_only=True):
         tables += [("helpers", helper.get("model", {}), of_model) for helper in self.helpers]
         tables += [("helpers", helper.get("prompt", {}), of_prompt) for helper in self.helpers]
         for table_name, table, keys in tables:
+            if not isinstance(table, dict):
+                raise ValueError(f"{table_name}: {printable(repr(table), 40)} is no table")
             if missing := [key for key in keys if not isinstance(table.get(key), str)]:
                 raise ValueError(f"{table_name}: {missing[0]} is no text")
             if table_name != "conditions" and not _is_name(table[keys[0]]):

@@ -10,6 +10,7 @@ from harness.coordination.named_points import named_point
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.parts import PLAIN
 from harness.core.errors import UserError, printable
+from harness.core.files import folder_in
 from harness.core.versions import versions
 from harness.report.document import Table
 from harness.runs.headline import IN_WORDS, headline_metric
@@ -176,7 +177,7 @@ def panels_over(
 
 def folder_of(run: Path, panels: Iterable[str]) -> Path:
     """Return the default folder of a run's sweep, inside the run's folder."""
-    return run / f"sweep-{'-'.join(panels).replace(CROSS, '-')}"
+    return folder_in(run, f"sweep-{'-'.join(panels).replace(CROSS, '-')}")
 
 
 def run_sweep(

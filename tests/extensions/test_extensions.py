@@ -533,7 +533,7 @@ def test_a_name_for_python_that_is_gone_says_what_it_was_part_of(
 def test_what_is_gone_does_nothing_or_says_what_it_was_part_of(core: Path, tmp_path: Path) -> None:
     """Runs have it, whether it did something or not."""
     code = (
-        "from harness.coordination.operating_point import OperatingPoint, named_point\nfrom "
+        "from harness.coordination.named_points import named_point\nfrom harness.coordination.operating_point import OperatingPoint\nfrom "
         "harness.core.errors import UserError\nfrom harness.world.scenarios import get\n"
         "from harness.cli.scenario import drives_of\n"
         "print(OperatingPoint.from_dict({'name': '6g', "

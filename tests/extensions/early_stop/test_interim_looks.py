@@ -242,7 +242,7 @@ def test_what_another_run_lacks_is_one_line(
 @pytest.mark.parametrize(
     ("forged", "says"),
     [
-        (None, "summary.csv has success_rate 1.0 in single-local (any time), which its other"),
+        (None, "its settings have until_width 99.9, and nothing beside them says what that came"),
         (
             {"width": 0.5},
             "by its episodes 2 layouts were not enough, and run.json says otherwise",
