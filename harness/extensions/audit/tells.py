@@ -43,21 +43,21 @@ Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]
 class Audit:
     """Hold how well the hidden danger of a scenario can be predicted from what the ego sees.
 
-    `auc` has an AUC for each question (is there a danger, does it come from this sector); `told_by`
-    has the numbers of the scene graph that gave it away.
+    The danger is the vehicle that the ego would meet; a sector is where it can come from.
     """
 
     scenario: str  # name of the scenario
-    layouts: int  # number of layouts
+    layouts: int  # number of layouts, drawn start situations
     seed: int  # layout seed of the first one
-    # decision points that were compared: those at which at least half of the dangers are hidden.
-    # Later, an empty road is an observation and gives nothing away
+    # numbers, from 0, of the decisions that were compared: those at which at least half of the
+    # dangers are hidden. Later, an empty road is an observation and gives nothing away
     steps: tuple[int, ...]
     # for each question (`danger`, and each sector that it can come from) the AUC: probability that
     # a layout with it ranks above one without. Intervals are a bootstrap over layouts, for these
     # models
     auc: Mapping[str, Estimate]
-    # the numbers that gave it away, with the AUC lost without each; empty unless it `tells`
+    # names of the scene graph's numbers that gave it away, with the AUC lost without each; empty
+    # unless it `tells`
     told_by: Mapping[str, float]
 
     @property
@@ -71,16 +71,15 @@ class Audit:
 
 @dataclass(frozen=True)
 class HiddenPoints:
-    """Hold m decision points of some layouts at which the danger is out of sight.
+    """Hold m decision points of some layouts at which the danger is out of the ego's sight.
 
-    `numbers` (m, k) has the k numbers of the scene graph at each, by `names`, NaN if the ego does
-    not know one; `danger` (m,) is the sector that the danger comes from.
+    A scene graph, what the ego knows of the scene, gives k numbers at each.
     """
 
-    layout: Ints  # index of each point's layout, (m,)
-    step: Ints  # index of its decision, (m,)
-    danger: Any  # sector that its danger comes from, (m,); `NONE` without a danger
-    names: tuple[str, ...]  # name of each number
+    layout: Ints  # index of each point's layout (start situation), (m,)
+    step: Ints  # index of its decision in the episode, (m,)
+    danger: Any  # NumPy array: sector that its danger comes from, (m,); `NONE` without a danger
+    names: tuple[str, ...]  # name of each of the k numbers
     numbers: Floats  # numbers of the scene graphs, (m, k); NaN if the ego does not know one
 
 

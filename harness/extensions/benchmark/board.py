@@ -25,10 +25,10 @@ from harness.runs.suite import SuiteRun, plays
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one entry of a benchmark's board: its rank, its success by condition, and its gain.
+    """Hold one entry of a board, the ranking of an edition: its rank, its success, and its gain.
 
-    `success` is a mean over families of scenes; `gain` is success in the condition that ranks, less
-    that without V2V. The rank is None for an entry that sees more than a vehicle can.
+    Success is the share of episodes in which the ego reaches its goal in time, averaged over
+    families (scenes of one scenario). Conditions are the edition's operating points, by name.
     """
 
     entry: Rescored  # the file of results, computed again
@@ -37,7 +37,9 @@ class Line:
     rank: int | None
     # success by condition, a mean over families; the condition that ranks comes first
     success: Mapping[str, Score | None]
-    gain: Score | None  # success under the first condition less that under `BASELINE`
+    # success under the first condition less that under `BASELINE`, an ego without a radio; None if
+    # the edition has no such condition
+    gain: Score | None
 
     @property
     def name(self) -> str:
@@ -53,9 +55,10 @@ class Line:
 
 
 def lines(entries: Sequence[Rescored]) -> list[Line]:
-    """Return the board's lines for the entries of one edition, the best first.
+    """Return the board's lines for the entries of one edition, the most successful first.
 
-    Raises UserError if the entries are of several editions, or if there are none.
+    `entries` are files of results whose figures were computed again here. Raises UserError if they
+    are of several editions, or if there are none.
     """
     names = dict.fromkeys(entry.edition.name for entry in entries)
     if len(names) != 1:
@@ -118,16 +121,16 @@ def _gain(suite: SuiteRun, edition: Edition, metric: str) -> Score | None:
 
 
 def write(ordered: Sequence[Line], left_out: Collection[str], out: Path) -> Path:
-    """Write a board's HTML page to `out`, and return its path.
+    """Write the HTML page of a board's lines, in their order, to `out`, and return its path.
 
-    `left_out` has, for other files, the reason why they are not on the board.
+    `left_out` has a sentence for each file that is not on the board: which it is, and why.
     """
     save([render(ordered, left_out)], out, "--out")
     return out
 
 
 def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
-    """Return a board's HTML page; `left_out` has reasons why other files are not on it."""
+    """Return the HTML page of a board's lines, in their order; arguments are as of `write`."""
     first = ordered[0].entry
     edition, suite = first.edition, first.suite
     by = edition.ranked_by

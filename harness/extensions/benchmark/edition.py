@@ -38,26 +38,32 @@ Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of d
 
 
 class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe `editions/NAME.golden.zip`, a results file that pins how figures are computed."""
+    """Describe `editions/NAME.golden.zip`, a results file that pins how figures are computed.
 
-    sha256: str  # digest of the file
-    layouts: Count  # number of layouts of each dataset that it has, from the first
+    An installation is checked against it: it must compute the figures that the file states.
+    """
+
+    sha256: str  # hex digest of the file
+    layouts: Count  # number of start situations of each dataset that it has, from the first
 
 
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe a version of the benchmark that never changes: all that a score on it depends on.
+    """Describe an edition: a release of the benchmark that never changes.
 
-    It pins datasets and prompts by digest, operating points (`condition`), channel seeds, latency,
-    ties and metrics. `ranked_by` is the operating point by which entries are ranked; `golden` is
-    None in a project's own edition that pins no figures.
+    It has all that a score on it depends on, beside the model: datasets and prompts by digest,
+    operating points (everything else that a decision depends on, such as the radio and whom the ego
+    asks), the seeds of the channel's random draws, latency, ties and metrics. An entry is one
+    model's results on it. `golden` is None in a project's own edition that pins no figures.
     """
 
     name: str  # name of its file, without .toml
     digest: str  # hex SHA-256 of its file's tables
     description: str  # its purpose
-    datasets: Digests  # digests of the datasets' manifests, by name, in the order of tables
-    prompts: Digests  # digests of the prompts that an entry may choose from, by version
-    condition: Names  # the operating points that are scored
+    # hex SHA-256 of the datasets' manifests, by name, in the order of tables
+    datasets: Digests
+    # hex SHA-256 of the prompts that an entry may choose from, by version
+    prompts: Digests
+    condition: Names  # the operating points that are scored, such as `6g`
     ranked_by: str  # the one of them by which entries are ranked
     seeds: str  # channel seeds, as `--seeds` reads them
     latency: str  # latency of every answer, as `--latency` reads it
@@ -74,9 +80,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return find(KIND, f"{self.name}.golden.zip")
 
     def layouts(self, file_sha256: str) -> int | None:
-        """Return how many layouts of each dataset a file with this digest has; None for all.
+        """Return how many layouts (start situations) of each dataset a file of results is of.
 
-        It is a file of results; only the edition's golden file has fewer than all.
+        `file_sha256` is the file's hex digest. None means all: only the edition's golden file has
+        fewer.
         """
         return self.golden.layouts if self.golden and self.golden.sha256 == file_sha256 else None
 
@@ -98,9 +105,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 
     def settings(self, dataset: str, **further: Any) -> Settings:
-        """Return the settings of an evaluation on one of the edition's datasets.
+        """Return the settings of an evaluation on one of the edition's datasets, by its name.
 
-        `further` are settings, such as `model`, `prompt` and `answer`.
+        `further` are settings that the edition leaves open, such as `model`, `prompt` and `answer`,
+        by their names in `Settings`.
         """
         return Settings(
             world=FrozenSettings(dataset=dataset),
@@ -112,9 +120,11 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         )
 
     def source(self, dataset: str, limit: int | None = None) -> FrozenSource:
-        """Return one of the edition's datasets; with `limit`, its first layouts.
+        """Read the edition's dataset of a name, as scenes that a model is evaluated on.
 
-        Raises UserError if the dataset of that name here has another digest.
+        A dataset has layouts, drawn start situations of a scenario, each with every scene that
+        actions can lead to. With `limit`, only that many are taken, from the first. Raises
+        UserError if the dataset here is missing, or has another digest than the edition states.
         """
         source = FrozenSource(load.load(load.find(dataset), limit), limit)
         if source.dataset.sha256 != self.datasets[dataset]:
@@ -124,10 +134,11 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return source
 
     def entry(self, runs: Sequence[Run], limit: int | None = None) -> dict[str, Run]:
-        """Return the runs of one entry by dataset, in the edition's order.
+        """Return the runs of one entry by the name of their dataset, in the edition's order.
 
-        `limit` is how many layouts they are of; None for all, as an entry is. Raises UserError
-        unless each run is of this edition, each dataset has one, and all are of one agent.
+        `limit` is how many layouts (start situations) of each dataset they must be of; None for
+        all, as an entry is. Raises UserError unless each run has this edition's settings, each
+        dataset has one run, and all are of one agent: one model, answer mode and so on.
         """
         by_dataset: dict[str, Run] = {}
         for run in runs:
@@ -184,9 +195,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 yield f"its {what}: {printable(value)}, not {printable(wanted)}"
 
     def spec(self, run: Run, source: FrozenSource) -> Spec:
-        """Return the evaluation that computes a run again: the edition's settings, the run's agent.
+        """Return the evaluation that computes a run again, on the scenes of `source`.
 
-        Raises UserError if the prompt here is another than the edition's.
+        It has the edition's settings and the run's agent: its model, prompt and answer mode. Raises
+        UserError if the prompt of that name here has another digest than the edition states.
         """
         m = run.manifest
         prompt = versions.load(str(m.prompt["version"]))

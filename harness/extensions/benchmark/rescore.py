@@ -26,13 +26,13 @@ from harness.runs.suite import SuiteRun
 class Rescored:
     """Hold a results file whose figures were computed again here from its answers.
 
-    `suite` has the runs as computed here, and `compared` is how many figures were compared.
-    `differences` has, by dataset, the names of those that differ from the figures in the file.
+    The file packs one entry of a benchmark: a run on each dataset of an edition (a release of the
+    benchmark), with the model's answers and the figures that its maker states.
     """
 
     contents: Contents  # the file's own `results.json`
     edition: Edition  # the edition that the file names
-    suite: SuiteRun  # the runs as they were computed here, by family
+    suite: SuiteRun  # the runs as they were computed here, by family (the scenario's name)
     # what differs from the figures in the file, by dataset, in words; none where all are equal
     differences: Mapping[str, Sequence[str]]
     compared: int  # number of figures that were compared
@@ -41,21 +41,30 @@ class Rescored:
 
 
 class Here:
-    """Represent this installation: its datasets, each read once, and how it computes figures."""
+    """Represent this installation: its datasets, each read once, and how it computes figures.
+
+    One object is shared by all files of results that are computed again.
+    """
 
     def __init__(self) -> None:
         self._sources: dict[tuple[str, str], FrozenSource] = {}
         self._checked: set[str] = set()  # digests of editions
 
     def source(self, edition: Edition, name: str) -> FrozenSource:
-        """Return a dataset of an edition. Raises UserError if the one here has another digest."""
+        """Return the dataset of an edition with a name, read once.
+
+        Raises UserError if the dataset here has another digest than the edition states.
+        """
         key = edition.digest, name
         if key not in self._sources:
             self._sources[key] = edition.source(name)
         return self._sources[key]
 
     def check(self, edition: Edition) -> None:
-        """Raise UserError unless an edition's golden figures are computed here as it pins them."""
+        """Raise UserError unless this installation computes an edition's figures as it pins them.
+
+        An edition pins them by a golden file of results; one without such a file passes.
+        """
         if edition.golden is None or edition.digest in self._checked:
             return
         file = edition.golden_file
@@ -135,10 +144,11 @@ def _about(file: Path, folder: Path) -> Iterator[None]:
 
 
 def differing(stated_run: Run, computed_run: Run, edition: Edition) -> Iterator[str]:
-    """Yield the names of figures in which two runs of an edition differ, and of episodes' columns.
+    """Yield in words what differs between a run as a file states it and as it is computed here.
 
-    Numbers are compared as they are written, to the last digit. A column of episodes that the
-    stated run, which may be older, lacks is not compared.
+    That is the name of each figure of the edition that differs, then each column of the table of
+    episodes, with the number of episodes. Numbers are compared to the last digit. A column that is
+    empty in the stated run, which an earlier release may have written, is not compared.
     """
     stated_scores = {score.key: score for score in edition.figures(stated_run)}
     computed_scores = {score.key: score for score in edition.figures(computed_run)}

@@ -50,15 +50,14 @@ CHUNK = 1 << 20
 
 
 class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Hold the content of `results.json`, which describes a file of results.
+    """Hold the content of `results.json`, which describes a file of a benchmark's results.
 
-    It has the edition's name and digest, who made the file, and the names of its runs. Raises
-    ValueError for another format, bad names of runs, or a `made_by` that is too long.
+    Raises ValueError for another format, bad names of runs, or a `made_by` that is too long.
     """
 
     format: str  # `FORMAT`
-    edition: str  # its name
-    digest: str  # the edition's digest
+    edition: str  # name of the edition, the release of the benchmark, that the results are of
+    digest: str  # the edition's digest, hex SHA-256
     made_by: str  # who made the file, in their own words
     runs: tuple[str, ...]  # names of the datasets, each with a run
 
@@ -81,9 +80,10 @@ def pack(
     figures: Callable[[Run], Sequence[Score]],
     out: Path,
 ) -> None:
-    """Write an entry's runs, by dataset, to one zip file.
+    """Write a benchmark entry to the zip file `out`: `contents`, and `runs` by their datasets.
 
     `figures` returns the scores of a run that are written. Paths of this machine are left out.
+    Equal runs give equal bytes.
     """
     with (
         replacing(out) as part,
@@ -131,11 +131,11 @@ def contents_of(file: Path) -> Contents:
 
 
 def unpack(file: Path, contents: Contents, folder: Path) -> None:
-    """Write a results file's runs to a folder, by dataset.
+    """Write the runs in a file of results to a folder, each to one named after its dataset.
 
     Only the files that `contents` call for are written, under names made here and no larger than
-    `FILES` allows. Raises UserError, before anything is unpacked, if it holds others or larger
-    ones.
+    `FILES` allows. Raises UserError if the file is broken; or, before anything is unpacked, if it
+    holds others or larger ones.
     """
     with _archive(file) as archive:
         wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}

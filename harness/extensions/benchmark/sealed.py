@@ -9,11 +9,12 @@ SEALED = 1_000_000_000  # the first of as many layout seeds from which sealed la
 
 
 def sealed(commit: str, scenario: str) -> int:
-    """Return the first layout seed of a scenario's sealed layouts, computed from a commit's id.
+    """Return the seed of the first of a scenario's sealed layouts, computed from a commit's id.
 
-    It is 10^9 plus the SHA-256 of "COMMIT SCENARIO", read as a number, modulo 10^9. Nobody knows
-    the id before the commit is made, so nobody can have looked at these layouts before. Raises
-    UserError if `commit` is not a whole hex id.
+    Layouts are start situations, drawn from seeds. It is 10^9 plus the SHA-256 of "COMMIT
+    SCENARIO", read as a number, modulo 10^9. Nobody knows the id before the commit is made, so
+    nobody can have looked at these layouts before. Raises UserError if `commit` is not a whole hex
+    id.
     """
     if not re.fullmatch("[0-9a-f]{40}|[0-9a-f]{64}", commit):
         raise UserError(

@@ -23,10 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Budget:
-    """Hold the most money that a command may spend; its processes add up amounts in a file."""
+    """Hold the most money that a command may spend on answers, by the prices in model cards.
 
-    most: float  # amount, in `currency`
-    currency: str
+    A card is a file that describes a model. All processes of the command add up amounts in a file.
+    """
+
+    most: float  # the most, in `currency`
+    currency: str  # the currency of the cards' prices
     file: Path  # the amounts spent, one a line
 
     def __call__(self, card: Card, backend: Backend) -> Backend:
@@ -48,7 +51,7 @@ class Budget:
 
 
 class Limited:
-    """Wrap a backend and spend the price of its completions.
+    """Wrap a backend, which runs a model, and spend the price of its completions (answers).
 
     `complete` raises Unanswered, before it asks, if the budget is spent, or if nobody said how many
     tokens the last answers took, which a budget would never notice. All else is as in the backend.
@@ -81,9 +84,9 @@ class Limited:
 def budget(most: float, specs: "Sequence[Spec]", workers: "Workers") -> Iterator[Budget]:
     """Enter a context with the budget that a command's evaluations share, of `most` money.
 
-    A line on stderr names the servers' models that have no price and so do not count. Raises
-    UserError if `most` is not above 0, no card or cards in several currencies state a price, or the
-    workers are a cluster.
+    `specs` are the evaluations, and `workers` is how many processes play them. A line on stderr
+    names the servers' models that have no price and so do not count. Raises UserError if `most` is
+    not above 0, no card or cards in several currencies state a price, or the workers are a cluster.
     """
     option = f"--max-cost {most:g}"
     if not isinstance(workers, int):

@@ -38,12 +38,11 @@ ONLY_TUNE = "calibration is fitted on tune seeds"
 class Correction:
     """Hold the correction of one role's answers: a prior to divide out, and a temperature.
 
-    `prior` is a probability for each action, empty for none; a temperature of 1 changes nothing.
-    `answers` is how many answers it was fitted on.
+    Answers are probabilities of actions, and a role is who gives them: the ego, or a helper.
     """
 
     answers: Count  # number of answers that it was fitted on
-    # the exponent is 1 / temperature; 1 changes nothing
+    # probabilities are raised to 1 / temperature and scaled to sum to 1; 1 changes nothing
     temperature: Annotated[float, Meta(ge=COOLEST, le=HOTTEST)] = 1.0
     # the mean answer, a probability an action; empty where none is divided out
     prior: tuple[Annotated[float, Meta(ge=LEAST_PRIOR, le=1)], ...] = ()
@@ -59,8 +58,7 @@ class Correction:
 class Calibration:
     """Hold the content of a file of `calibrations/`: corrections for one model and one question.
 
-    It was fitted on layouts with seeds from `first_seed` to `last_seed`. `helper` is None if no
-    helper answered.
+    They were fitted on layouts, start situations that are drawn from layout seeds.
     """
 
     level: Level  # L0 divides a prior out, L1 has a temperature, L0+L1 both
@@ -69,7 +67,7 @@ class Calibration:
     first_seed: int  # least layout seed that it was fitted on
     last_seed: int  # greatest layout seed
     scenario: str  # name of the scenario
-    actions: tuple[str, ...]
+    actions: tuple[str, ...]  # names of its meta-actions, in the order of answers
     question: dict[str, str]  # what answers: model, prompt and answer mode (`question_of`)
     ego: Correction  # of the ego's answers
     helper: Correction | None = None  # of helpers' answers; None where no helper answered
@@ -90,7 +88,10 @@ class Calibration:
         return None
 
     def of(self, intents: Intents) -> Intents:
-        """Return intents of all vehicles with the answers of ego and helpers corrected."""
+        """Return a copy of vehicles' intents (probabilities of actions) with corrected answers.
+
+        Those of helpers stay as they are if `helper` is None.
+        """
         helpers = self.helper.of(intents.helpers) if self.helper else intents.helpers
         return replace(intents, own=self.ego.of(intents.own), helpers=helpers)
 

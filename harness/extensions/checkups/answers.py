@@ -19,7 +19,7 @@ Pictured = tuple[Request, Request, Request]
 class Looks:
     """Hold a model's answers to an image prompt: with a camera picture, a blank one, and none.
 
-    `answers` and `blank` have one for each answer mode; `text` is None if no answer mode worked.
+    Answer modes are the ways to answer, such as free text or one letter.
     """
 
     # answers to the camera picture, one in each answer mode, asked alone after a warm-up
@@ -57,11 +57,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class Checkup:
-    """Hold the result of checking a language model: its prompt, its tokens and its answers.
-
-    `tokens` are ids with their texts, and `answers` has one for each answer mode. What only a
-    server knows is None, and so is `looks` if the model takes no pictures.
-    """
+    """Hold the result of checking a language model: its prompt, its tokens and its answers."""
 
     prompt: str  # the first question as the model reads it, or as a server is sent it
     # its ids, each with its text; None if only a server knows them
@@ -72,7 +68,7 @@ class Checkup:
     thinking: Thinking | None  # what the model's own template can do; None for a server's
     # one answer in each answer mode, asked alone after a warm-up; the seconds are of batch size 1
     answers: dict[AnswerMode, Completion]
-    identity: dict[str, Any]
+    identity: dict[str, Any]  # what tells the model apart, such as its weights' digest
     # answers to pictures; None if the card says that the model takes none
     looks: Looks | None = None
 

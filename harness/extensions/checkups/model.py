@@ -27,11 +27,12 @@ PROMPT, IMAGE_PROMPT = "v2", "v7"
 
 @dataclass(frozen=True)
 class Check:
-    """Hold the result of `harness model check`: answers, and what fixed questions showed."""
+    """Hold the result of `harness model check`: a model's answers, and what they showed."""
 
-    spec: Spec  # how the model was asked
+    spec: Spec  # how the model was asked: model, prompt and settings
     seen: Checkup  # its prompt and answers
-    # what its read-outs follow, the letter or the scene; None where it was not examined
+    # what its read-outs (probabilities of one letter an action) follow, the letter or the scene;
+    # None where it was not examined
     findings: Findings | None
     unanswered: str | None = None  # why the fixed questions got no answer
 

@@ -30,10 +30,11 @@ class Pace:
 
 
 def paces(stem: str) -> list[Pace]:
-    """Time the engines of a model's card file that can run here.
+    """Time the engines that can run a model here: one entry for each.
 
-    It is empty unless there are several and the weights are small. Raises UserError if weights do
-    not load or the model cannot answer, and Unanswered if an answer fails.
+    `stem` is the name, without its ending, of the model's card, a file that describes it and names
+    the engines. The list is empty unless there are several and the weights are small. Raises
+    UserError if weights do not load or the model cannot answer, and Unanswered if an answer fails.
     """
     able = [card for card in each_engine(stem) if missing(card) is None] if stem in names() else []
     if len(able) < 2 or not all(_small(card) for card in able):
@@ -42,9 +43,10 @@ def paces(stem: str) -> list[Pace]:
 
 
 def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, list[Pace]]:
-    """Time the engines of several card files, by the file's name; cards without times are left out.
+    """Time the engines of several models, by the names of their cards, which describe them.
 
-    `progress` is called with 1 after each.
+    `stems` are these names, without the ending; cards without times are left out. `progress` is
+    called with 1 after each.
     """
     measured = {}
     for stem in stems:

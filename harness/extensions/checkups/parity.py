@@ -38,11 +38,7 @@ PASSES = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """Hold one comparison of an engine with the reference: a figure and its limit.
-
-    `measured` is the figure and `allowed` its limit, None without one; `holds` says whether the
-    figure is within it.
-    """
+    """Hold one comparison of an engine, which runs a model, with another as the reference."""
 
     what: str  # what was compared
     measured: float  # the figure
@@ -54,10 +50,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold all findings on one model on two engines, and what could not be compared.
-
-    `left_out` says why the same weights in F32 were not compared; None if they were.
-    """
+    """Hold all findings on one model on two engines, and what could not be compared."""
 
     findings: tuple[Finding, ...]  # everything compared
     left_out: str | None  # why llama.cpp was not held to the same float32 weights; None if it was
@@ -67,7 +60,8 @@ class Comparison:
 class Outputs:
     """Hold the outputs of one engine for n prompts: tokens, log-probabilities, texts and read-outs.
 
-    `logits` is (n, V) for a vocabulary of V, `readouts` (n, A) for A actions.
+    The vocabulary has V tokens, and the scenario A actions. A read-out takes the probabilities of
+    actions from those of one letter each.
     """
 
     tokens: list[list[int]]  # token ids of the text of each prompt, of those for JSON first

@@ -109,8 +109,10 @@ def try_on(
 ) -> tuple[Trial, Findings | str | None]:
     """Try a prompt on a model: ask the fixed questions for answers in words, and by read-outs.
 
-    The second value is None if the engine has no read-outs, and an error's text if a read-out got
-    no answer.
+    `card` describes the model, `device` is where it is loaded (None: the engine chooses), and
+    `dtype` the number format (None: the card's). `progress` is told how many questions there are,
+    and called with 1 after each. The second value returned is None if the engine has no read-outs
+    (probabilities of one letter an action), and an error's text if a read-out got no answer.
     """
     agent = Agent(card, prompt)
     reads_out = "readout" in agent.can.answer_modes and not agent.thinking

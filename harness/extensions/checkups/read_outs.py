@@ -204,7 +204,10 @@ def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | No
 
 
 def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
-    """Store findings in the user's cache, by the model's identity, prompt and answer mode."""
+    """Store findings in the user's cache, by the model's identity, prompt and answer mode.
+
+    `identity` is what tells the model apart, as its backend states it.
+    """
     name = _name(identity, findings.prompt_sha256, findings.answer)
     kept.keep(name, msgspec.json.encode(findings))
 
@@ -212,9 +215,10 @@ def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
 def recall_findings(
     identity: Mapping[str, Any], prompt_sha256: str, answer: str
 ) -> Findings | None:
-    """Return the stored findings on a model with this identity, prompt and answer mode.
+    """Return the stored findings on a model, for a prompt and an answer mode.
 
-    None if there are none on this machine.
+    `identity` is what tells the model apart, as its backend states it, and `prompt_sha256` the hex
+    digest of the prompt's files. None if there are none on this machine.
     """
     data = kept.recall(_name(identity, prompt_sha256, answer))
     try:

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 
 class ListsObjects(Call):
-    """Ask the ego's model again, with a scene graph that also has the helpers' lists of objects."""
+    """Ask the ego's model again, with a scene graph that also has the helpers' lists of objects.
+
+    A scene graph is what a vehicle knows of the scene; objects are vehicles and the like.
+    """
 
     name = "objects"
     in_graph = True
@@ -35,7 +38,10 @@ class ListsObjects(Call):
 
 
 class ShowsTruth(Call):
-    """Ask the ego's model again with the true scene graph, in which every region is in sight."""
+    """Ask the ego's model again with the true scene graph, in which every region is in sight.
+
+    It is a bound: no message can hold that.
+    """
 
     name = "truth"
     in_graph = True
@@ -73,10 +79,10 @@ class OfLists(Content):
 
 
 class OfBoth(Content):
-    """Describe two messages of a helper: one with its intent, one with its list of objects.
+    """Describe two messages of a helper: its intent, and the list of objects that it sees.
 
-    The ego's model answers again to the larger scene graph, and that answer is fused with the
-    intents.
+    The intent is probabilities of the ego's actions. The ego's model answers again to its scene
+    graph with the helpers' objects added, and that answer is fused with the intents.
     """
 
     holds = frozenset((INTENTS, WORDS, kinds.OBJECTS))

@@ -49,7 +49,10 @@ PAPER = {"loss": ("loss", 0.0), "tau_nats": ("tau", 0.0), "max_helpers": ("size"
 
 
 def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
-    """Return the study of contents of messages; `results` has one for each model."""
+    """Return the study (tables, pictures, sentences) of what messages should hold.
+
+    `results` has one item for each model, and `seeds` are the channel's seeds.
+    """
     manifest = manifest_of([result.model for result in results], results[0].panels, seeds)
     points, by_group = points_table(results), groups_table(results)
     runs = [run for result in results for run in result.model.runs.values()]
@@ -101,7 +104,10 @@ def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
 
 
 def headline(result: Result) -> list[str]:
-    """Return sentences on each content of messages: its gain over intents, and its cost."""
+    """Return sentences on each content of messages (what they hold): its gain over intents.
+
+    They also give its cost: bits sent, and latency.
+    """
     base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
     gains, costs = list[str](), list[str]()
     for content in result.sent:
@@ -389,7 +395,11 @@ def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
 
 
 def points_table(results: Sequence[Result]) -> "pd.DataFrame":
-    """Return a table with a row for each model, grid point, content and family."""
+    """Return the outcomes as a table: a row for each model, grid point, content and family.
+
+    A grid point is an operating point with one value changed, a content what messages hold, and a
+    family the scenes of one scenario.
+    """
     import pandas as pd
 
     rows = []
@@ -427,7 +437,10 @@ def _points_row(
 
 
 def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
-    """Return a table of the first condition, a row a model, group of episodes and content."""
+    """Return success by who sees the danger: a row for each model, group of episodes and content.
+
+    It is of the first condition as it is; `study.groups` makes the groups.
+    """
     import pandas as pd
 
     rows = []

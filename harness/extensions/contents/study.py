@@ -57,9 +57,10 @@ Place = tuple[OperatingPoint, int]  # of an outcome: the operating point, and th
 
 
 class Panel(NamedTuple):
-    """Describe what is varied in one condition: one setting (axis) over grid points.
+    """Describe what is varied in one condition (operating point): one setting, over grid points.
 
-    Without an axis, it is the condition as it is, one grid point.
+    The setting is the panel's axis, such as `loss`, and a grid point is one value of it. Without an
+    axis, it is the condition as it is, one grid point.
     """
 
     name: str  # such as `6g:encoding=etsi over loss`
@@ -71,12 +72,11 @@ class Panel(NamedTuple):
 class Model:
     """Hold the runs of one model by family of scenes (scenario), and contents it cannot play.
 
-    A content says what messages hold, such as `intent`, `objects` or `both`; `left_out` has the
-    reason for each that the model's agents cannot play.
+    A content says what messages hold, such as `intent`, `objects` or `both`.
     """
 
     name: str  # model, prompts and answer mode
-    runs: Mapping[str, ReplayedRun]  # by family of scenes
+    runs: Mapping[str, ReplayedRun]  # its runs by family, the scenario's name
     left_out: Mapping[str, str]  # contents that its agents cannot play, and why
 
     @property
@@ -89,11 +89,11 @@ class Model:
 class Outcome:
     """Hold the metrics of a model's runs with one content of messages at one grid point.
 
-    `families` has, by scenario and metric, an array (S, E) of S channel seeds and E episodes;
-    `success_rules` says for each scenario how success is averaged.
+    The axes are S channel seeds and E episodes; a family is the scenes of one scenario.
     """
 
-    families: Mapping[str, Mapping[str, Floats]]  # metrics by family, each (S, E)
+    # values by family and metric, such as `success_rate`, (S, E) each
+    families: Mapping[str, Mapping[str, Floats]]
     success_rules: Mapping[str, Success]  # of each family; the metric is the same in all
 
     @property
@@ -107,7 +107,10 @@ class Outcome:
         return self.estimate(self.headline_metric)
 
     def estimate(self, metric: str, family: str = MEAN) -> Estimate:
-        """Return a metric of a family of scenes, or its mean over families, over episodes."""
+        """Return the mean of a metric over the episodes of a family, with an interval.
+
+        `metric` is its name, and `family` the scenario's; by default the mean over families.
+        """
         estimates = []
         for name in self._of(family):
             values = self.families[name]
@@ -122,8 +125,8 @@ class Outcome:
     ) -> Estimate:
         """Return this outcome's success less another's, paired by episode.
 
-        It is of a family or the mean over families, at a confidence level. The metric is the
-        headline's, or plain success if `metric` names it.
+        It is of a family (scenario), or the mean over families, and `level` is the confidence of
+        its interval. The metric is the headline's, or plain success if `metric` names it.
         """
         return mean_difference([*self._pairs(other, family, metric)], level)
 
@@ -145,9 +148,10 @@ class Outcome:
             yield rule, self.families[name][SUCCESS], other.families[name][SUCCESS]
 
     def pooled(self, groups: Mapping[str, Bools]) -> Floats:
-        """Return success of the n episodes in a group, all families together, (S, n).
+        """Return success, 1 or 0, of the n episodes in a group, all families together, (S, n).
 
-        `groups` has a mask of each family's E episodes, (E,); S is the number of channel seeds.
+        `groups` has, by family, a mask (E,): which of its E episodes are in the group. S is the
+        number of channel seeds.
         """
         parts = []
         for family, values in self.families.items():
@@ -160,14 +164,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Result:
-    """Hold the outcomes of one model with every content of messages at every grid point.
-
-    `outcomes` has them by operating point, which includes the content, and number of vehicles.
-    """
+    """Hold the outcomes of one model with every content of messages at every grid point."""
 
     model: Model  # the model and its runs
     panels: Sequence[Panel]  # the axes and conditions that were played
-    outcomes: Mapping[Place, Outcome]  # by operating point and number of vehicles
+    # by operating point, of which the content is a setting, and number of vehicles
+    outcomes: Mapping[Place, Outcome]
 
     def at(self, setting: Setting, content: str) -> Outcome:
         """Return the outcome with a content of messages, such as `objects`, at a grid point."""
@@ -238,7 +240,7 @@ class Result:
 
 
 def holding(point: OperatingPoint, content: str) -> OperatingPoint:
-    """Return an operating point with this content of messages.
+    """Return an operating point with this content of messages, such as `objects`.
 
     With `nothing`, it is one at which the ego never asks.
     """
@@ -253,7 +255,7 @@ def place(setting: Setting, content: str) -> Place:
 
 
 def distinct(panels: Sequence[Panel]) -> list[Setting]:
-    """Return the grid points of all panels in order, each once."""
+    """Return the grid points (settings to play) of all panels in order, each once."""
     every = [setting for panel in panels for setting in panel.settings]
     last_first = {place(setting, INTENT): setting for setting in reversed(every)}
     return list(last_first.values())[::-1]
@@ -323,7 +325,8 @@ def panels_of(
 ) -> list[Panel]:
     """Return a panel for each condition as it is, and for each axis in each of them.
 
-    `over` names the axes, and `grids` their values; without conditions and axes, the usual ones are
+    An axis is a setting that is varied. `over` names the axes, such as `loss`, and `grids` has the
+    text of each one's values, such as `0,0.1,0.2`; without conditions and axes, the usual ones are
     taken. Raises UserError as `sweep.settings` does, or if there are more grids than axes.
     """
     if len(grids) > len(over):
@@ -347,9 +350,10 @@ def panels_of(
 
 
 def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, int]]:
-    """Return how many questions each run may lack at most, by family and role.
+    """Return how many answers each run may lack at most, by family (scenario) and role.
 
-    They are about the decision points that the run or a reference driver visits.
+    The roles are `ego`, `helper`, and `fusion` for an ego that is asked again with messages. The
+    questions are about the decision points that the run or a reference driver visits.
     """
     points = set[OperatingPoint]()
     for setting in distinct(panels):
@@ -365,7 +369,10 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
 def manifest_of(
     swarms: Sequence[Model], panels: Sequence[Panel], seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Return what identifies a study, as plain values: runs, contents, seeds and panels."""
+    """Return what identifies a study, as plain values: runs, contents, seeds and panels.
+
+    `swarms` are the models with their runs, and `seeds` the channel's seeds.
+    """
     return {
         "sources": [run.manifest() for model in swarms for run in model.runs.values()],
         "contents": list(PLAYED),
@@ -382,6 +389,13 @@ def run_contents(
     progress: Progress,
 ) -> list[Result]:
     """Play every content of messages at every grid point with every model's runs.
+
+    Args:
+        swarms: the models with their runs.
+        panels: the conditions, and the axes varied in them.
+        seeds: the channel's seeds.
+        out: the folder of the study, which may hold the same one only.
+        progress: told how much there is to do, and called with what is done.
 
     Raises:
         UserError: the folder `out` holds another study.
@@ -441,8 +455,8 @@ def _columns(parameters: Parameters, part: Decided[Any]) -> dict[str, Floats]:
 def witnesses(run: ReplayedRun) -> Ints:
     """Return how many helpers see the danger at the first decision of each of E episodes, (E,).
 
-    It is `SAFE` (-1) without a danger, and `HEARD` (-2) if the danger has a radio, whose beacons
-    tell of it.
+    The danger is the vehicle that the ego would meet if it drove on. The number is `SAFE` (-1)
+    without a danger, and `HEARD` (-2) if the danger has a radio, whose beacons tell of it.
     """
     forest, scenario = run.dataset.forest, run.dataset.scenario
     roots = [forest.ids[n] for n in forest.root.tolist()]
@@ -465,7 +479,7 @@ def witnesses(run: ReplayedRun) -> Ints:
 def groups(model: Model) -> dict[str, dict[str, Bools]]:
     """Return groups of episodes by how many helpers see the danger, by the group's name.
 
-    Each has a mask of the E episodes of every family of scenes, (E,), by the family's name.
+    A group has, by the name of a family (scenario), a mask (E,): which of its E episodes are in it.
     """
     counts = {family: witnesses(run) for family, run in model.runs.items()}
     most = max(int(of_family.max()) for of_family in counts.values())

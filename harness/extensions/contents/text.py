@@ -12,14 +12,20 @@ if TYPE_CHECKING:
 
 
 class SaysWords(Call):
-    """Ask the ego's model again, with each helper's words in a line, but without intents."""
+    """Ask the ego's model again, with each helper's words in a line of the prompt.
+
+    The helpers' intents, their probabilities of actions, are left out.
+    """
 
     name = "text"
     in_words = True
 
 
 class OfText(Content):
-    """Describe a message that holds a helper's words without an intent."""
+    """Describe a message that holds a helper's words without its probabilities of actions.
+
+    The ego's model is asked again with these words, and the ego acts on that answer.
+    """
 
     holds = frozenset((WORDS,))
     call = SaysWords()

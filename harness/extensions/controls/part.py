@@ -23,7 +23,10 @@ NO_MESSAGES = {"no-messages": "loss=1"}
 
 @dataclass(frozen=True)
 class Blinded(Question):
-    """Ask helpers the usual question with nothing in sight, in scene graphs and in pictures."""
+    """Ask helpers the usual question with nothing in sight, in scene graphs and in pictures.
+
+    Its fields are explained at `Question`.
+    """
 
     name: str = BLIND
     words: str = "are shown nothing, which messages=blind needs"
@@ -42,9 +45,10 @@ def _others(holds: frozenset[str]) -> list[str]:
 
 
 class Controlled(Part, frozen=True, kw_only=True):
-    """Hold a condition's setting of what the ego hears in place of its helpers' messages.
+    """Hold the setting `messages`: what the ego hears in place of its helpers' messages.
 
-    A gain that remains under a control does not come from what helpers see.
+    A condition with another value than `own` is a control: a gain that remains under it does not
+    come from what helpers see.
     """
 
     behind: ClassVar[str] = "on_demand"
@@ -85,9 +89,10 @@ class Controlled(Part, frozen=True, kw_only=True):
         return self.messages == SHUFFLED
 
     def sources(self, episodes: Ints, seeds: Ints) -> Ints:
-        """Return the index of the decision whose helpers each decision hears, (n,), if shuffled.
+        """Return, for n decisions, the index of the one whose helpers each hears if shuffled, (n,).
 
-        It is that of the next layout which has a decision under the same seed.
+        `episodes`, (n,), and `seeds`, (n,), have each decision's episode number and channel seed.
+        It is that of the next layout (start situation) which has a decision under the same seed.
         """
         order = np.lexsort((episodes, seeds))
         following = np.roll(order, -1)

@@ -22,19 +22,19 @@ from harness.prompts.decision import Question
 class Text(Struct, tag_field="type", tag="input_text"):
     """Hold a part of a message or of instructions that is text."""
 
-    text: str
+    text: str  # the text
 
 
 class Json(Struct, tag_field="type", tag="input_json"):
     """Hold a part of a message or of instructions that is JSON data."""
 
-    data: dict[str, Any] | list[Any]
+    data: dict[str, Any] | list[Any]  # what JSON states; the model reads it as JSON
 
 
 class Picture(Struct, tag_field="type", tag="input_image"):
     """Hold a part of a message that is a picture, by its URL."""
 
-    image_url: str
+    image_url: str  # a data URL, which holds the picture
 
 
 Part = Text | Json | Picture
@@ -43,55 +43,56 @@ Part = Text | Json | Picture
 class Message(Struct):
     """Hold a message of the request's input; other roles than `user` are refused."""
 
-    content: str | list[Part]
-    role: str
+    content: str | list[Part]  # a part of the state that the questions are about
+    role: str  # who says it
 
 
 class Option(Struct):
     """Hold one option of a `Choice`."""
 
-    value: str | bool
-    description: str | None = None
+    value: str | bool  # the option, as the answer names it
+    description: str | None = None  # its meaning
 
 
 class Choice(Struct, tag_field="type", tag="choice"):
     """Ask which of several options is right."""
 
-    instructions: str | list[Part]
-    choices: list[Option]
-    name: str | None = None
+    instructions: str | list[Part]  # what is asked; no pictures
+    choices: list[Option]  # the options, in their order
+    name: str | None = None  # the question's name, which the answer repeats
 
 
 class Level(Struct):
     """Hold one level of a `Score`."""
 
-    label: str
-    description: str | None = None
+    label: str  # the level's name, as the answer states it
+    description: str | None = None  # its meaning
 
 
 class Score(Struct, tag_field="type", tag="score"):
     """Ask for a level on a scale, whose levels are listed from the lowest."""
 
-    instructions: str | list[Part]
-    levels: list[Level]
-    name: str | None = None
+    instructions: str | list[Part]  # what is asked; no pictures
+    levels: list[Level]  # the levels, the lowest first
+    name: str | None = None  # the question's name, which the answer repeats
 
 
 class Predicate(Struct, tag_field="type", tag="predicate"):
     """Ask whether a statement is true."""
 
-    instructions: str | list[Part]
-    name: str | None = None
+    instructions: str | list[Part]  # the statement; no pictures
+    name: str | None = None  # the question's name, which the answer repeats
 
 
 class Body(Struct):
     """Hold the JSON of a request; fields that are not listed are ignored."""
 
-    input: str | list[Message]
+    input: str | list[Message]  # the state that all questions are about
+    # what is asked, each by itself
     questions: Annotated[
         list[Choice | Score | Predicate], Meta(min_length=1, max_length=MOST_QUESTIONS)
     ]
-    model: str | None = None
+    model: str | None = None  # name of the model that is asked; None takes the served one
 
 
 def read(body: Body) -> Enquiry:
@@ -152,7 +153,10 @@ def _question_of(question: Choice | Score | Predicate, state: str) -> Asked:
 
 
 def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
-    """Return the JSON of the response. Token counts are 0 where nobody counts them."""
+    """Return the JSON of the response, with the answers in the order of the questions.
+
+    `model` is the served model's name. Token counts are 0 where nobody counts them.
+    """
     read = sum(each.tokens or 0 for each in answers)
     usage = {
         "input_tokens": read,

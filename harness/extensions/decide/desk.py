@@ -18,7 +18,10 @@ AGAIN_S = 1  # after which a client that found no place may ask again
 
 
 class Desk:
-    """Queue requests of one event loop; a thread answers them in batches, in their order."""
+    """Queue requests to a served model; a thread answers them in batches, in their order.
+
+    Clients of one asyncio event loop wait for their answers with `ask`.
+    """
 
     def __init__(self, backend: Backend, batch_size: int, places: int = PLACES) -> None:
         self._backend, self._batch_size = backend, batch_size

@@ -21,36 +21,38 @@ Content = str | dict[str, Any] | list[Any]
 
 
 class Choice(Struct, tag_field="type", tag="choice"):
-    """Ask which of several options is right; `criteria` has each option's meaning."""
+    """Ask which of several options is right."""
 
-    criteria: dict[str, Content | None]
-    instructions: Content | None = None
+    criteria: dict[str, Content | None]  # the meaning of each option, by the option
+    instructions: Content | None = None  # what is asked
 
 
 class Score(Struct, tag_field="type", tag="score"):
-    """Ask for a level on a scale; `criteria` has the levels' meanings, from the lowest."""
+    """Ask for a level on a scale; the answer counts levels from 0."""
 
+    # the meaning of each level, the lowest first
     criteria: Annotated[list[Content], Meta(min_length=2, max_length=10)]
-    instructions: Content | None = None
+    instructions: Content | None = None  # what is asked
 
 
 class Noul(Struct, tag_field="type", tag="noul"):
-    """Ask whether something is true; `criteria` may say what true and false mean."""
+    """Ask whether something is true."""
 
-    instructions: Content | None = None
-    criteria: dict[str, Content | None] | None = None
+    instructions: Content | None = None  # what is to be true
+    criteria: dict[str, Content | None] | None = None  # what `true` and `false` mean
 
 
 class Body(Struct):
     """Hold the JSON of a request; fields that are not listed are ignored."""
 
-    state: Content
+    state: Content  # what all questions are about, a text or JSON
+    # what is asked, each by itself, by the question's name
     questions: Annotated[
         dict[str, Choice | Score | Noul], Meta(min_length=1, max_length=MOST_QUESTIONS)
     ]
-    model: str | None = None
-    images: list[str] = []
-    files: list[str] = []
+    model: str | None = None  # name of the model that is asked; None takes the served one
+    images: list[str] = []  # data URLs of pictures, which stand before the state
+    files: list[str] = []  # more of these; they come first
 
 
 def read(body: Body) -> Enquiry:
@@ -81,7 +83,10 @@ def _meaning(content: Content | None) -> str | None:
 
 
 def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
-    """Return the JSON of the response. `input_tokens` is 0 where nobody counts them."""
+    """Return the JSON of the response, with each answer under its question's name.
+
+    `model` is the served model's name. `input_tokens` is 0 where nobody counts them.
+    """
     written = {each.asked.name: _answer(each) for each in answers}
     usage = {"input_tokens": sum(each.tokens or 0 for each in answers), "output_tokens": 0}
     return {"model": model, "answers": written, "usage": usage}

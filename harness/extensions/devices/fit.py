@@ -24,18 +24,17 @@ READOUT, WRITTEN, DECISION = "readout", "written", "decision"
 class Fit:
     """Hold the time and energy of a model's answer on a device at batch size 1; NaN if unknown.
 
-    For a run's answers, tokens and `seconds` are medians, `joules` is the mean, and `in_time` the
-    share within the decision window.
+    It is one assumed answer, or the answers of a run.
     """
 
-    row: DeviceRow  # the model's
+    row: DeviceRow  # the device's speed, energy and memory with the model
     answer: str  # `readout`, which is one token, `decision`, which is none, or how it is written
-    prompt_tokens: float  # read; of a run, the median
-    output_tokens: float  # written; of a run, the median
-    seconds: float  # that it takes; of a run, the median
-    # share of answers that are there within the window; of declared tokens 0 or 1, of one answer
+    prompt_tokens: float  # number of tokens read; of a run, the median
+    output_tokens: float  # number of tokens written; of a run, the median
+    seconds: float  # how long it takes; of a run, the median
+    # share of answers that are there within the decision window; of one assumed answer 0 or 1
     in_time: Estimate
-    joules: Estimate  # that it takes; of a run, the mean
+    joules: Estimate  # energy of an answer; of a run, the mean
 
 
 def fits(
@@ -55,15 +54,12 @@ def fits(
 
 @dataclass(frozen=True)
 class Answers:
-    """Hold the token counts of n answers whose time and energy on a device are asked for.
+    """Hold the token counts of n answers whose time and energy on a device are asked for."""
 
-    `prompt` has the tokens read, (n,), `output` those written by kind of answer, (n,) each;
-    `episodes` is the episode of each, None for one assumed answer.
-    """
-
-    prompt: Floats  # tokens read, (n,)
-    output: dict[str, Floats]  # tokens written by kind of answer, each (n,)
-    episodes: Ints | None = None  # the episode of each, (n,); None for one declared answer
+    prompt: Floats  # number of tokens read for each answer, (n,)
+    output: dict[str, Floats]  # number of tokens written, by kind of answer, (n,) each
+    # number of each answer's episode, (n,); None for one assumed answer
+    episodes: Ints | None = None
     who: str = ""  # the model that wrote them
 
 
@@ -117,14 +113,11 @@ def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold a measured time or token rate of a run beside what a device profile states for it.
+    """Hold a measured time or token rate of a run beside what a device profile states for it."""
 
-    `what` names it: `seconds` of an answer, or a rate in tokens a second. `role` is whose answers
-    were measured.
-    """
-
-    what: str  # `seconds` of an answer, or a rate by its name in a profile
-    role: str  # whose answers
+    # `seconds` of an answer, or a rate in tokens a second, by its name in a profile
+    what: str
+    role: str  # whose answers were measured, the ego's or a helper's
     measured: Estimate  # median with its 95 % interval over episodes; n is how many answers
     stated: float  # what the profile says: of seconds the median over the same answers
 

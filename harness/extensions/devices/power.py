@@ -24,17 +24,13 @@ WINDOWS = 5  # of asking; the intervals are over them
 
 @dataclass(frozen=True)
 class Power:
-    """Hold the power and energy that one meter measured while a model answered.
+    """Hold the power and energy that one energy meter measured while a model answered."""
 
-    `idle_watts` was measured before. `answer_j` is joules an answer, `more_j` the part of it above
-    idle power.
-    """
-
-    meter: str  # its name
-    idle_watts: float  # before, while nothing is asked
-    watts: Estimate  # while answers are asked one by one
-    answer_j: Estimate  # of an answer, all that the meter counts
-    more_j: Estimate  # of that, what is above idling
+    meter: str  # the meter's name
+    idle_watts: float  # power before, while nothing is asked
+    watts: Estimate  # power while answers are asked one by one
+    answer_j: Estimate  # joules of an answer, all that the meter counts
+    more_j: Estimate  # the joules of that above idle power
 
 
 def measure(
@@ -96,7 +92,11 @@ def measure_agent(
     device: str | None,
     progress: Callable[[int], None],
 ) -> tuple[list[Power], int]:
-    """Load an agent's model on a device and `measure` it with scenes of the default dataset."""
+    """Load an agent's model on a device and `measure` it with scenes of the default dataset.
+
+    `agent` is a model with a prompt and an answer mode, and `device` where it is loaded, such as
+    `cuda`; None lets the engine choose. The other arguments and the result are those of `measure`.
+    """
     data = load.load(load.find(DATASET), 10)
     spec = Spec(agent, FrozenSource(data), (), (0,), settings=Settings(batch_size=1, device=device))
     sample = list(requests(spec, data.scenes(data.forest.ids[:10])))

@@ -44,13 +44,11 @@ class Speed(Struct, frozen=True):
 
 
 class Constant(Struct, frozen=True):
-    """Hold a number of a device profile, whether it is measured or modelled, and its source.
+    """Hold a number of a device profile, how it was come by, and its source."""
 
-    The field that holds it says its unit.
-    """
-
-    value: Annotated[float, between(1e-9, 1e9)]
-    status: Status
+    value: Annotated[float, between(1e-9, 1e9)]  # in the unit that the field which holds it says
+    status: Status  # whether it was measured here, cited, modelled from others, or assumed
+    # a text that says where it comes from
     source: Annotated[str, Meta(min_length=1, description="where the number comes from")]
 
 
@@ -213,9 +211,10 @@ def speed(device: Device, row: DeviceRow) -> Speed:
 
 
 def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Return the seconds of one answer: prompt and output tokens, each divided by its rate.
+    """Return the seconds of one answer: tokens read and tokens written, each divided by its rate.
 
-    A model with a fixed answer time has that; NaN if unknown.
+    `speed` has the device's rates with the model. A model with a fixed answer time has that; NaN if
+    unknown.
     """
     if speed.answer_s is not None:
         return speed.answer_s

@@ -39,7 +39,11 @@ PROFILE, MODEL = "device_profile", "device_model"  # settings of a run
 
 @dataclass(frozen=True)
 class Computer(Timer):
-    """A computer in every vehicle, which times each answer by its tokens."""
+    """Time each answer by its tokens, as a computer in every vehicle would take for it.
+
+    A device profile states how many tokens a second the computer reads and writes with a model, and
+    how many joules a token takes. It is a `Timer`, chosen by `--device-profile`.
+    """
 
     option: ClassVar[str] = "--device-profile"
     chosen_by: ClassVar[tuple[str, ...]] = (PROFILE, MODEL)

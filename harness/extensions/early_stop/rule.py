@@ -33,16 +33,17 @@ WIDTH, DECIDED = "until_width", "until_decided"  # settings of a run
 
 
 class LooksRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Hold the rule of a run that may stop and its interim looks, as `run.json` has them.
+    """Hold the rule of a run that may stop early and its interim looks, as `run.json` has them.
 
-    The rule is a width of intervals, or another run from which success is to differ.
+    The rule is a width of intervals, or another run from which success is to differ. At a look the
+    run checks, between layouts (start situations), whether it knows enough.
     """
 
-    layouts: int  # how many there were
+    layouts: int  # how many layouts there were in all
     width: float | None = None  # of each condition's interval of success, as a share
     against: str | None = None  # the name of the run from which every condition is to differ
-    against_sha256: str | None = None  # digest of that run's episodes.csv
-    at: tuple[int, ...] = ()  # after how many layouts it was looked; empty while it runs
+    against_sha256: str | None = None  # hex SHA-256 of that run's episodes.csv
+    at: tuple[int, ...] = ()  # numbers of layouts after which it looked; empty while it runs
     enough: bool = False  # whether the last look was enough
 
 

@@ -30,9 +30,10 @@ OF_EGO = ("target_speeds", "target_speed", "speed_index", "route")
 
 
 def named(env: str, config: Any = None) -> str:
-    """Return the scenario name of a gymnasium id such as `merge-v0`, with changes of its config.
+    """Return the scenario name of an environment, such as `env:merge-v0`.
 
-    `config` are the changed keys with their values; None for none.
+    `env` is its gymnasium id, and `config` the changed keys of its configuration with their values,
+    plain values of JSON, which become part of the name; None for none.
     """
     return f"{PREFIX}{env}" + (f"{CHANGES}{canonical_json(config)}" if config else "")
 
@@ -113,9 +114,10 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def reset(name: str, seed: int) -> Any:
-    """Return a new environment, reset to a seed.
+    """Return a new environment of highway-env (an `AbstractEnv`), reset to a seed.
 
-    Raises UserError if there is none, it fails, or its ego cannot be driven by meta-actions.
+    `name` is its scenario name, as `named` makes it. Raises UserError if there is none, it fails,
+    or its ego cannot be driven by meta-actions (SLOWER, IDLE, FASTER and changes of lane).
     """
     env = _create(name)
     _constants().restore()
@@ -156,7 +158,7 @@ def _only_drivable(name: str, env: Any) -> None:
 
 
 def hittable(thing: Any) -> bool:
-    """Return whether a vehicle or object of highway-env can collide with others."""
+    """Return whether a highway-env `Vehicle` or `RoadObject` can collide with others."""
     return bool(thing.collidable and thing.solid)
 
 
@@ -230,16 +232,20 @@ def _merged(default: Any, value: Any) -> Any:
 
 
 def config(name: str) -> dict[str, Any]:
-    """Return an environment's whole configuration, with changes, as JSON-like values."""
+    """Return the whole configuration of an environment, by its scenario name, with changes.
+
+    Keys are highway-env's, and values are plain values of JSON.
+    """
     text = json.dumps(_create(name).config, default=str)
     whole: dict[str, Any] = json.loads(text, parse_constant=str)
     return whole
 
 
 def meta_actions(name: str, env: Any) -> Any:
-    """Return the action type of the ego of `env`; `name` is for messages.
+    """Return the action type of the ego of `env`, a `DiscreteMetaAction` of highway-env.
 
-    Raises UserError unless it is `DiscreteMetaAction` with at least SLOWER, IDLE and FASTER.
+    `env` is highway-env's environment, and `name` its scenario name for messages. Raises UserError
+    for another type, or one without SLOWER, IDLE or FASTER.
     """
     from highway_env.envs.common.action import DiscreteMetaAction, MultiAgentAction
 
@@ -261,9 +267,10 @@ def meta_actions(name: str, env: Any) -> Any:
 
 
 def numbered(env: Any, kind: Any, action: str) -> Any:
-    """Return the value that stands for an action in `env.step`; other agents of `env` take IDLE.
+    """Return the number, or tuple of numbers, that stands for an action of the ego in `env.step`.
 
-    `kind` is the ego's action type, as `meta_actions` returns it.
+    `env` is highway-env's environment; other agents that it controls take IDLE. `kind` is the ego's
+    action type, as `meta_actions` returns it, and `action` a name such as `FASTER`.
     """
     if kind is env.action_type:
         return kind.actions_indexes[action]
@@ -272,9 +279,10 @@ def numbered(env: Any, kind: Any, action: str) -> Any:
 
 
 def lane_of(v: Any) -> Lane:
-    """Return the index of the lane that a highway-env vehicle steers for: two nodes and a number.
+    """Return the index of the lane that a highway-env `Vehicle` steers for.
 
-    Raises UserError if it has none.
+    It is the two nodes of its road, and the lane's number from the left, from 0. Raises UserError
+    if the vehicle has none.
     """
     try:
         begin, end, number = getattr(v, "target_lane_index", v.lane_index)
@@ -292,10 +300,10 @@ def lane_of(v: Any) -> Lane:
 class Constants:
     """Hold the class constants of highway-env's vehicles, which some environments overwrite.
 
-    `values` is keyed by class and name.
+    They are kept apart so that environments in one process do not change each other's.
     """
 
-    values: Mapping[tuple[type, str], Any]
+    values: Mapping[tuple[type, str], Any]  # by class and name of the constant
 
     @classmethod
     def now(cls) -> "Constants":

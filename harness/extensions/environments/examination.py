@@ -16,6 +16,8 @@ Places = list[tuple[float, ...]]  # x, y, heading and speed of each vehicle
 def examine(scenario: Scenario, seed: int) -> None:
     """Raise UserError unless a highway-env environment simulates a seed reproducibly.
 
+    `scenario` is one that is made of such an environment, and `seed` its layout seed.
+
     Drives IDLE, FASTER and SLOWER twice by the environment's own `step`, and once frame by frame in
     deep copies; the poses and speeds of all vehicles must agree at every decision.
     """

@@ -30,13 +30,13 @@ HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the midd
 class Parameters(Common):
     """Hold the parameters of a highway-env environment as a scenario.
 
-    `helpers` is the number of vehicles beside the ego that can be asked: other controlled ones
-    first, then the nearest. Raises UserError if `decisions` or `helpers` is not from 1 to 9.
+    Raises UserError if `decisions` or `helpers` is not from 1 to 9.
     """
 
-    braking_mps2: float = 20.0  # hardest braking; highway-env's own controller has no limit
-    acceleration_mps2: float = 20.0
-    # number of helpers: other controlled vehicles first, then those nearest to the ego
+    braking_mps2: float = 20.0  # hardest braking, m/s^2; highway-env's own controller has no limit
+    acceleration_mps2: float = 20.0  # hardest acceleration, m/s^2
+    # number of helpers, the vehicles that the ego can ask: others that the environment lets agents
+    # control first, then those nearest to the ego
     helpers: int = 3
 
     def __post_init__(self) -> None:
@@ -49,34 +49,39 @@ class Parameters(Common):
 
     @property
     def goal_s(self) -> float:
-        """Time (s) that the ego needs to its goal at its first target speed; it fixes the goal."""
+        """Return the time, s, that the ego needs to its goal at its first target speed.
+
+        It says how far away the goal is.
+        """
         return (self.decisions + AFTER) * self.decision_period_s
 
 
 @dataclass(frozen=True)
 class Place:
-    """Hold what is the same for every seed of a highway-env environment: paths, road, actions.
-
-    `routes` are the paths through its network, `road` describes them and the ego's goal for the
-    harness, and `actions` are the ego's. `ends` has the x, y, x, y (m) of each lane's ends, and
-    `kind` is the environment's class name.
-    """
+    """Hold what is the same for every seed of a highway-env environment: paths, road, actions."""
 
     routes: Routes  # the paths of its network
-    ends: Mapping[Lane, tuple[float, ...]]  # where the network's lanes begin and end, m
-    road: Road  # the harness's road
-    actions: tuple[str, ...]  # the ego's actions
+    # where each of the network's lanes begins and ends: x, y, x, y in m
+    ends: Mapping[Lane, tuple[float, ...]]
+    road: Road  # these paths and the ego's goal, as the harness describes them
+    actions: tuple[str, ...]  # the ego's meta-actions, such as `SLOWER`
     parameters: Parameters  # the scenario's parameters
     kind: str  # name of the environment's class
 
 
 def first_target_mps(ego: Any) -> float:
-    """Return the initial target speed of a highway-env ego (m/s), or its highest if that is 0."""
+    """Return the initial target speed of an ego, m/s, or its highest target speed if that is 0.
+
+    `ego` is a vehicle of highway-env that is driven by meta-actions (`MDPVehicle`).
+    """
     return float(ego.target_speed) or float(max(ego.target_speeds))
 
 
 def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
-    """Return where each lane of a network begins and ends: x, y, x, y in m, by lane index."""
+    """Return where each lane of a highway-env `RoadNetwork` begins and ends, by its index.
+
+    Values are x, y, x, y in m of highway-env's frame.
+    """
     ends = {}
     for index, lane in lanes_of(network).items():
         points = np.round([lane.position(0, 0), lane.position(lane.length, 0)], 3)
@@ -88,7 +93,8 @@ def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
 def place(name: str) -> Place:
     """Return what is the same for every seed of an environment, found by resetting it to seed 0.
 
-    Raises UserError if there is no such environment, or its frequencies do not fit.
+    `name` is its scenario name, such as `env:merge-v0`. Raises UserError if there is no such
+    environment, or its frequencies of frames and decisions do not fit.
     """
     env = reset(name, 0)
     ego, network = env.vehicle, env.road.network

@@ -27,22 +27,23 @@ TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the ri
 
 @dataclass(frozen=True)
 class Routes:
-    """Hold all paths through a highway-env network, by key (start node, name of the route).
+    """Hold all paths through a highway-env network: the lines that vehicles can follow.
 
-    A route is the sequence of roads that a path takes; `ways` has, for each, the keys of its
-    parallel paths, from left to right.
+    A road joins two nodes of the network and has one or more lanes. A route is the roads that a
+    path takes, one after another; a route has several parallel paths where its roads have several
+    lanes. A path's key is the node where it begins, and a name that says where it goes and, of
+    parallel ones, on which lane.
     """
 
-    network: Any  # highway-env's network
-    # paths by approach (the node where they begin) and route (where they go, and on which lane)
-    paths: dict[PathKey, Path]
+    network: Any  # highway-env's `RoadNetwork`
+    paths: dict[PathKey, Path]  # every path by its key
     ways: dict[Route, tuple[PathKey, ...]]  # the paths of each route from left to right
 
     def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
         """Return the roads that a vehicle in `lane` will take, from its present one on.
 
-        It follows highway-env's rule for the next lane; `plan` is the vehicle's planned route, or
-        None.
+        A lane is two nodes and a number from the left. It follows highway-env's rule for the next
+        lane; `plan` has the lanes that highway-env planned for the vehicle, or is None.
         """
         streets, plan = [lane[:2]], list(plan or ())
         while lane[1] in self.network.graph:
@@ -55,10 +56,10 @@ class Routes:
         return tuple(streets)
 
     def keys(self, lane: Lane, plan: Sequence[Lane] | None) -> list[PathKey]:
-        """Return the keys of the paths that contain `lane`, best match first.
+        """Return the keys of the paths that contain a vehicle's `lane`, the best match first.
 
-        The best match shares most roads with the vehicle's route. `plan` is its planned route, or
-        None.
+        The best match shares most roads with those that the vehicle will take. `plan` has the lanes
+        that highway-env planned for it, or is None.
         """
         ahead = self.ahead(lane, plan)
         on_lane = [key for key, path in self.paths.items() if lane in path.lanes]
@@ -78,10 +79,17 @@ def routes(
     origin_m: tuple[float, float] = (0.0, 0.0),
     reach_m: float = math.inf,
 ) -> Routes:
-    """Build every path through a network, cut to within `reach_m` of `origin_m`, the new origin.
+    """Build every path that vehicles can follow through a road network of highway-env.
 
-    A route on a ring begins at the road `begin`. Raises UserError, with the environment's `name`,
-    if there are more than `MOST_ROUTES` routes.
+    Args:
+        name: the environment's name, for the error's text.
+        network: highway-env's `RoadNetwork`.
+        begin: the road, as its two nodes, at which a route begins that goes round in a ring.
+        origin_m: the point, x and y in m of highway-env's frame, that becomes the origin of the
+            paths' coordinates.
+        reach_m: distance from there, in m, beyond which paths are cut off.
+
+    Raises UserError if there are more than `MOST_ROUTES` routes.
     """
     every = list(_routes(name, network, begin))
     labels = _labels(network, every)

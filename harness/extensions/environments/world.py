@@ -43,27 +43,23 @@ MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
 @dataclass
 class EnvironmentWorld(OwnWorld):
-    """Simulate one episode in an environment of highway-env.
+    """Simulate one episode in an environment of highway-env, frame by frame."""
 
-    `everybody` are its vehicles in the order of their ids, the ego first. `taken` has the frame and
-    the name of each action so far, and `failed` says whether the environment has ended the episode
-    without success.
-    """
-
-    env: Any = None  # highway-env's environment
+    env: Any = None  # highway-env's environment, an `AbstractEnv`
     # highway-env's class constants as this environment wants them
     constants: Constants = field(default_factory=lambda: Constants({}))
-    here: Any = None  # properties that are the same for every seed
-    # its vehicles in the order of their ids, the ego first
+    here: Any = None  # what is the same for every seed, a `Place`
+    # highway-env's vehicles that can be hit, in the order of their ids, the ego first
     everybody: list[Any] = field(default_factory=list)
     born: int = 0  # number of vehicles that have entered so far
     action: str = "IDLE"  # the action that was taken last
-    taken: tuple[tuple[int, str], ...] = ()  # the frame and the name of each action
+    # the number of the frame in which each action was taken, from the episode's start, and its name
+    taken: tuple[tuple[int, str], ...] = ()
     failed: bool = False  # whether the environment has ended the episode without success
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
-        """Start a seed's episode.
+        """Start the episode of a layout seed, in the environment that `scenario` is made of.
 
         Raises UserError if its road, or the path on which the ego starts, differs from seed 0's.
         """
@@ -114,7 +110,7 @@ class EnvironmentWorld(OwnWorld):
 
     @property
     def period(self) -> int:
-        """Number of frames between two decisions of the environment."""
+        """Return the number of frames between two decisions of the environment."""
         p = self.scenario.parameters
         return round(p.decision_period_s * p.simulation_hz)
 

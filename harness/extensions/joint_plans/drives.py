@@ -13,7 +13,11 @@ Row = Sequence[str]  # of a table
 
 
 def show(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
-    """Print how agents fare under each policy, and what it costs against the plan for all."""
+    """Print how agents fare under each policy, and what it costs against the plan for all.
+
+    `outcomes` is what `policies.check` returns for `episodes` layouts, start situations, with
+    layout seeds from `seed` on.
+    """
     seconds, ratio, driver = Unit("s", 2), Unit(decimals=3), "driver of all agents"
     outcome_rows, time_rows, decision_rows = list[Row](), list[Row](), list[Row]()
     for policy, of in outcomes["policies"].items():

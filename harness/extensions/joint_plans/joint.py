@@ -38,16 +38,17 @@ MOST_PLANS = 8  # that are driven for a layout until one keeps its promise
 class Rehearsal(World):
     """Simulate one agent alone with the other traffic, and record where all vehicles were.
 
-    `agent` is its index in the layout, `script` the actions that it takes (None for all that are
-    possible), and `taken` those that it took. `record` has poses after each frame, (frames, V, 4)
-    each, of V vehicles. `arrives_s` is inf before the agent reached its goal.
+    An agent is a vehicle that decides for itself.
     """
 
-    agent: int = 0  # the agent's place in the layout
-    script: Sequence[str] | None = None  # the actions that it takes; None for all that there are
-    record: tuple[Floats, ...] = ()  # poses after each frame, (frames, V, 4) each
-    taken: tuple[str, ...] = ()  # the agent's actions
-    arrives_s: float = np.inf  # when the agent reached its goal, after which it drove on
+    agent: int = 0  # the agent's index among the agents of the layout (start situation)
+    # the meta-actions that it is to take; None for all that are possible
+    script: Sequence[str] | None = None
+    # x, y (m), heading (rad) and speed (m/s) of V vehicles after each frame, (frames, V, 4) each
+    record: tuple[Floats, ...] = ()
+    taken: tuple[str, ...] = ()  # the meta-actions that the agent took
+    # when the agent reached its goal, after which it drove on; inf before
+    arrives_s: float = np.inf
 
     def passed(self, poses: Floats) -> None:
         self.record = (*self.record, poses.copy())
@@ -81,18 +82,16 @@ class Rehearsal(World):
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Hold the action sequences by which an agent touches no other traffic, soonest first.
+    """Hold the n action sequences by which an agent touches no other traffic, soonest first.
 
-    `actions` has n sequences of meta-actions, and `arrives_s`, (n,), when each reaches the goal;
-    inf for never. `poses` are x, y and heading of the agent and then of the other traffic in F
-    frames, (n, F, V, 3), `sizes_m` their lengths and widths, (V, 2), and `hz` frames a second.
+    Each was simulated for F frames with V vehicles: the agent, then the other traffic.
     """
 
     actions: Sequence[tuple[str, ...]]  # the meta-actions of each of the n sequences
-    arrives_s: Floats  # when it reaches its goal, (n,); inf for never
-    # x, y and heading after each frame, of it and then of other traffic, (n, F, V, 3)
+    arrives_s: Floats  # when the agent reaches its goal by each, (n,); inf for never
+    # x (m), y (m) and heading (rad) of each vehicle after each frame, (n, F, V, 3)
     poses: Floats
-    sizes_m: Floats  # length and width of these, (V, 2)
+    sizes_m: Floats  # length and width of each vehicle, (V, 2)
     hz: int  # frames a second
 
     @cached_property
@@ -102,17 +101,15 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """Hold an action sequence for every agent of a layout.
+    """Hold an action sequence for every agent of a layout, a drawn start situation.
 
-    `actions` and `arrives_s` (inf for never) are keyed by an agent's index. No plan has a smaller
-    sum of arrival times than `bound_s`; `nodes` counts the partial choices that the search looked
-    at.
+    Agents are numbered by their index in the layout.
     """
 
-    actions: Mapping[int, tuple[str, ...]]  # of each agent, by its place
-    arrives_s: Mapping[int, float]  # when each reaches its goal; inf for never
+    actions: Mapping[int, tuple[str, ...]]  # each agent's meta-actions, by its index
+    arrives_s: Mapping[int, float]  # when each reaches its goal, by its index; inf for never
     bound_s: float  # no plan has a smaller sum of times, `NEVER_S` for who never arrives
-    nodes: int  # how many nodes the search looked at
+    nodes: int  # number of partial choices of sequences that the search looked at
 
     @property
     def sum_s(self) -> float:
@@ -124,12 +121,15 @@ class Plan:
 
     @property
     def exact(self) -> bool:
-        """Whether it is proven that no plan has a smaller sum of arrival times."""
+        """Return whether it is proven that no plan has a smaller sum of arrival times."""
         return self.bound_s >= self.sum_s - 1e-9
 
 
 def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Options]]:
-    """Return what each agent can do without touching traffic, by layout seed, then agent index."""
+    """Return what each agent can do without touching traffic, by layout seed, then agent index.
+
+    A layout seed draws a start situation of `scenario`.
+    """
     starts = [world for seed in seeds for world in rehearsals(scenario, seed)]
     unharmed: list[Rehearsal] = []
     for group in by_scenario(starts):
@@ -278,7 +278,7 @@ class Search:
 
     @property
     def ended(self) -> bool:
-        """Whether the search was completed, so that `best` is optimal."""
+        """Return whether the search was completed, so that `best` is optimal."""
         return self.open_s >= self.cost_s
 
     def _choose(self, chosen: tuple[int, ...], cost_s: float, left: Sequence[Bools]) -> None:
@@ -338,10 +338,11 @@ def near(
     margin_m: float,
     counts: Bools,
 ) -> Bools:
-    """Return whether any of A vehicles comes within a margin of any of B others, (n,).
+    """Return in which of n cases any of A vehicles comes near any of B others, (n,).
 
-    `some` are poses x, y, heading (1, F, A, 3), `others` (n, F, B, 3), and the sizes length and
-    width, (A, 2) and (B, 2). Only frames where `counts`, (n, F), is true are compared.
+    Near means within `margin_m` metres. `some`, (1, F, A, 3), and `others`, (n, F, B, 3), are x
+    (m), y (m) and heading (rad) in F frames; `sizes_m`, (A, 2), and `their_sizes_m`, (B, 2), are
+    lengths and widths. Only frames where `counts`, (n, F), is true are compared.
     """
     reach_m = (np.hypot(*sizes_m.T)[:, None] + np.hypot(*their_sizes_m.T)) / 2 + margin_m
     dx, dy = np.moveaxis(some[:, :, :, None, :2] - others[:, :, None, :, :2], -1, 0)

@@ -42,9 +42,8 @@ UNKNOWN = Regret(np.nan, np.nan, np.nan)
 class Fate:
     """Describe how the agents of one layout fared under one policy that all of them follow.
 
-    `arrived` is the share of agents that reached their goals, `sum_s` the sum of their arrival
-    times, and `lost_s` how much later that is than alone on the road (NaN unless all arrived).
-    `exact` says of a joint plan whether it was searched to the end and no driver does better.
+    Agents are vehicles that decide for themselves, a layout is a drawn start situation, and a
+    policy is a rule driver or a plan for all agents together. Times are in s.
     """
 
     arrived: float  # share of agents that reached their goals
@@ -63,7 +62,10 @@ class Fate:
 
     @property
     def trips_s(self) -> float:
-        """Sum of the times (s) at which agents reached their goals; NaN unless all of them did."""
+        """Return the sum of the times, s, at which agents reached their goals.
+
+        It is NaN unless all of them did.
+        """
         return self.sum_s if self.success else np.nan
 
 

@@ -43,7 +43,10 @@ GAPS_PT = (3.5, 13.0, 23.0, 35.0)  # between a vehicle and its name
 
 
 class Canvas:
-    """Draw the stills of one episode on a figure, whose fixed parts are drawn only once."""
+    """Draw the stills of one episode, the pictures of its video, on one figure.
+
+    Parts that do not change are drawn only once.
+    """
 
     def __init__(
         self, played: ReplayedEpisode, buildings: Sequence[Building], agents: Sequence[str]

@@ -26,31 +26,27 @@ STILLS_HZ = 10  # while no decision is open
 
 @dataclass(frozen=True)
 class Turn:
-    """Hold the latest decision of one agent, at the time of a still.
+    """Hold the latest decision of one agent, at the time of a still (a picture of a video).
 
-    `since_s` is the seconds since it began, `open` whether it has not acted yet, and `outcome` how
-    the agent's journey ended, empty until it has.
+    An agent is a vehicle that decides for itself, such as the ego.
     """
 
     decision: Decision  # the decision, open or taken
-    since_s: float  # seconds since it began
-    open: bool  # whether it has not acted yet
+    since_s: float  # seconds since the decision began
+    open: bool  # whether the agent has not acted on it yet
     outcome: str  # how the agent's journey ended; empty until it has
 
 
 @dataclass(frozen=True)
 class Still:
-    """Hold the state of an episode at the time of one picture of its video.
-
-    `seen` is the state when the last decision began, `turns` the latest decision of each agent by
-    its id, and `danger` the id of the dangerous vehicle, None without one.
-    """
+    """Hold the state of an episode at the time of one picture of its video."""
 
     state: WorldState  # the state of the world
     seen: WorldState  # the state when the last decision began
     turns: Mapping[str, Turn]  # latest decision of each agent, by its id, the ego first
     outcome: str  # how the episode ended; empty until it has
-    danger: str | None  # id of the dangerous vehicle, or None
+    # id of the vehicle that the ego would meet if it drove on; None without one
+    danger: str | None
 
     @property
     def since_s(self) -> float:

@@ -15,7 +15,10 @@ from harness.runs.settings import Settings
 
 
 class Helpers(RoleAgents):
-    """The agents of the helpers, each of another model, prompt or answer mode than the ego's."""
+    """Choose who answers for helpers, where that is another agent than the ego's.
+
+    An agent is a model with a prompt version and an answer mode.
+    """
 
     chosen_by = ("helper_model", "helper_prompt", "helper_answer", "helper_thinking")
 

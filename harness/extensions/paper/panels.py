@@ -26,10 +26,10 @@ VEHICLES = 4  # the ego and the cooperative neighbourhood of three
 
 @dataclass(frozen=True)
 class Panel:
-    """Hold one panel of the paper's study: its grid points and number of episodes."""
+    """Hold one panel of the paper's study: what is varied, and over how many episodes."""
 
     name: str  # the panel's name in `paper_numbers.csv`
-    settings: tuple[Setting, ...]  # its grid points
+    settings: tuple[Setting, ...]  # its grid points: operating points with numbers of vehicles
     episodes: int  # number of episodes per seed
 
 
@@ -63,7 +63,11 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
 def run_paper(
     panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[[int], None]
 ) -> Study:
-    """Play the panels with the calibrated proxy, and compare with the paper's numbers."""
+    """Play the panels with the calibrated proxy, and compare with the paper's numbers.
+
+    The proxy is a rule that draws intents in place of a model. `seeds` are those of episodes and
+    channel; `progress` is called with 1 after each grid point.
+    """
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
     results = [play(sources[p.episodes], p.name, p.settings, seeds, progress) for p in panels]
     whole = joined(results)

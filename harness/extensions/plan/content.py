@@ -18,7 +18,10 @@ NO_AGENTS = (
 
 
 class OfPlan(Content):
-    """The content `plan` of messages: the action probabilities by which an agent acts itself."""
+    """Describe a message that holds what its sender will do: the content `plan`.
+
+    It is the probabilities of actions by which an agent, a vehicle that decides for itself, acts.
+    """
 
     holds = frozenset((PLANS,))
     needs = (PLANS,)

@@ -18,15 +18,16 @@ from harness.core.arrays import Floats
 
 @dataclass(frozen=True)
 class Precedence:
-    """A consensus rule in which an agent waits for a near one of lower rank that plans to go on.
+    """Decide by precedence: an agent waits for a near one of lower rank that plans to go on.
 
-    `rank` returns the rank of the ego and its H helpers, `(..., 1+H)`; two are near if they reach
-    the conflict less than `apart_s` seconds apart. To wait is to take action 0, the most careful
-    one; else the agent acts by its own intent. An agent that itself plans action 0, stands, or has
-    passed the conflict makes nobody wait. Equal ranks go by the vehicles' numbers in the world.
+    It is a consensus rule for agents, vehicles that each decide for themselves. To wait is to take
+    action 0, the most careful one; else the agent acts by its own intent, its probabilities of
+    actions. An agent that itself plans action 0, stands, or has passed the conflict (where paths
+    meet) makes nobody wait. Equal ranks go by the vehicles' numbers in the world.
     """
 
-    rank: Callable[[Plans], Floats]  # of each vehicle, `(..., 1+H)`; the lowest goes first
+    # returns the rank of the agent and of its H helpers, `(..., 1+H)`; the lowest goes first
+    rank: Callable[[Plans], Floats]
     # two agents are near if they reach the conflict at times less than this apart. Declared: the
     # headway of the two-second rule
     apart_s: float = 2.0

@@ -31,7 +31,10 @@ MOST_ROUNDS = 3
 
 
 class Negotiated(Part, frozen=True, kw_only=True):
-    """How often agents tell each other their plans before they act: `rounds`, 1 for once."""
+    """Hold the setting `rounds`: how often agents tell each other their plans before they act.
+
+    Agents are vehicles that each decide for themselves; 1 is once.
+    """
 
     behind: ClassVar[str] = "fallback"
 

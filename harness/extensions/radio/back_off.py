@@ -20,9 +20,10 @@ SATURATED = 0.6  # above this busy ratio, vehicles that all hear each other neve
 
 
 def begin_per_s(busy: Floats | float, packet_s: float) -> Floats | float:
-    """Return the number of packets that begin in a second of idle time, at a channel busy ratio.
+    """Return the number of packets that begin in a second of idle time, of the shape of `busy`.
 
-    `packet_s` is a packet's time on air.
+    `busy` is the channel busy ratio, the share of time, from 0 to below 1, in which the medium is
+    sensed as busy, and `packet_s` a packet's time on air, s.
     """
     return busy / (1 - busy) / packet_s
 
@@ -30,9 +31,10 @@ def begin_per_s(busy: Floats | float, packet_s: float) -> Floats | float:
 def free_share(busy: Floats | float, packet_s: float, aifs_s: float) -> Floats:
     """Return the share of time in which a vehicle that hears this busy ratio may begin to send.
 
-    It is the idle time without the first `aifs_s` of each gap, for which the medium must be idle
-    (AIFS); the lengths of gaps are assumed to be exponential. `packet_s` is a packet's time on air;
-    the shape is that of `busy`.
+    `busy` is the share of time in which the medium is sensed as busy, and `packet_s` a packet's
+    time on air, s. It is the idle time without the first `aifs_s` seconds of each gap, for which
+    the medium must be idle (AIFS); the lengths of gaps are assumed to be exponential. The shape is
+    that of `busy`.
     """
     return (1 - np.asarray(busy)) * np.exp(-aifs_s * begin_per_s(busy, packet_s))
 
@@ -61,10 +63,11 @@ def _idle_s(needed_s: float, per_s: float, cost_s: float) -> float:
 
 @lru_cache(maxsize=64)
 def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Floats, Floats]:
-    """Return the distribution of the access delay: probabilities (n,) and seconds (n,).
+    """Return the distribution of the access delay: n probabilities, (n,), and n delays in s, (n,).
 
-    With each probability the delay, from the wish to send until the medium is taken, is no longer
-    than the seconds. The arguments are those of `mean_access_s`, its mean.
+    The access delay is the time from the wish to send until the medium is taken. With each
+    probability it is no longer than the delay at the same index. The arguments are those of
+    `mean_access_s`, its mean.
     """
     packet, aifs, slot = (round(s / TICK_S) for s in (packet_s, aifs_s, SLOT_S))
     starts = -math.expm1(-float(begin_per_s(busy, packet_s)) * TICK_S)  # in a tick of idle time

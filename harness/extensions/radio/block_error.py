@@ -27,10 +27,11 @@ BlockError = Callable[[Floats], Floats]
 
 @cache
 def block_error(curve: str) -> BlockError:
-    """Return the function from SINR in dB to block error rate of a published curve, by its name.
+    """Return a published curve by its name, such as `11p-goubet`: a function of the SINR.
 
-    Points are interpolated linearly, and the end values hold beyond them. Raises UserError for an
-    unknown name.
+    It takes signal-to-interference-and-noise ratios in dB and returns the probabilities that a
+    block is lost, of the same shape. Points are interpolated linearly, and the end values hold
+    beyond them. Raises UserError for an unknown name.
     """
     points = [row for row in _rows("block_error_points.csv") if row["curve"] == curve]
     if points:
@@ -48,9 +49,10 @@ def block_error(curve: str) -> BlockError:
 def threshold(bits_per_s_per_hz: float, efficiency: float) -> BlockError:
     """Return a step function from SINR in dB to block error rate, 1 below a threshold and 0 above.
 
-    Blocks are lost below the SINR 2^(spectral efficiency / efficiency) - 1. It is for codings
-    without a curve (Wu et al., arXiv 2203.17114). `efficiency` is the share of Shannon's bound that
-    an implementation reaches: 0.37 for LTE and 802.11p, 0.4 for NR.
+    Blocks are lost below the SINR 2^(`bits_per_s_per_hz` / `efficiency`) - 1. The first is the
+    coding's data rate by bandwidth, the second the share of Shannon's bound that an implementation
+    reaches: 0.37 for LTE and 802.11p, 0.4 for NR. It is for codings without a curve (Wu et al.,
+    arXiv 2203.17114).
     """
     least_db = 10 * np.log10(2 ** (bits_per_s_per_hz / efficiency) - 1)
     return lambda sinr_db: np.where(sinr_db < least_db, 1.0, 0.0)

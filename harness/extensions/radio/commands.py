@@ -298,9 +298,10 @@ def _refuse_format(out: Path | None) -> None:
 
 
 def channel_of(text: str) -> "tuple[str, Channel]":
-    """Return the profile's name and the channel of a condition such as `mode4:power_dbm=20`.
+    """Return a channel profile's name and its channel, with changed settings if any.
 
-    Raises UserError if there is no such condition, or it has no channel.
+    `text` is a condition, as --condition takes it, such as `mode4:power_dbm=20`. Raises UserError
+    if there is no such condition, or it has no channel.
     """
     from harness.coordination.named_points import named_point
     from harness.radio.wrapped import innermost

@@ -21,14 +21,15 @@ PAPER_LOSS = ((2, 0.6), (4, 6.6), (8, 18.6))  # vehicles, % lost: the paper's pa
 def reception(
     name: str, channel: Physical, messages: Sequence[Drawn], against: Sequence[Compared]
 ) -> Figure:
-    """Draw a radio's reception against distance, and beside it, if there are any,
-    against others' curves.
+    """Draw a radio's reception against distance, and beside it against others' curves, if any.
+
+    Reception is the share of messages received, in line of sight and behind obstacles.
 
     Args:
-        name: of the condition.
+        name: the condition's name, the picture's title.
         channel: the radio.
-        messages: what was drawn in sight.
-        against: others' curves.
+        messages: how its messages were received, simulated in line of sight, by distance.
+        against: published curves, each with the radio's reception at the same distances.
     """
     distances_m = np.linspace(1, messages[-1].distance_m, 250)
     curves = by_sight(channel, distances_m)
@@ -83,12 +84,12 @@ def reception(
 
 @styled
 def crowds(vehicles: Sequence[int], losses: Mapping[str, Floats], title: str) -> Figure:
-    """Draw the loss of one transmission against vehicles in the radius: radios beside the paper's
-    line.
+    """Draw the loss of one transmission against the number of vehicles in the radius.
 
     Args:
-        vehicles: numbers of vehicles, `(n,)`, sender and receiver included.
-        losses: losses by the name of a radio, `(n,)`, and the paper's line as `paper`.
+        vehicles: n numbers of vehicles, sender and receiver included.
+        losses: shares of transmissions lost, `(n,)`, by the name of a radio, and the paper's line
+            as `paper`.
         title: what the losses are of.
     """
     figure = Figure(figsize=(4.6, 3.2), layout=ConstrainedLayoutEngine(w_pad=0.1))

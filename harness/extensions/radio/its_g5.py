@@ -58,10 +58,10 @@ IMPLEMENTATION = 0.37  # share of Shannon's rate that is reached: Wu et al., arX
 
 
 class Hazards(NamedTuple):
-    """Hold the mean number of packets that spoil one, as tables of D distances by P powers, (D, P).
+    """Hold the mean number of others' packets that spoil one, by its distance and received power.
 
-    Rows are distances in steps of `STEP_M`, columns received powers in steps of `STEP_DB`. `before`
-    counts packets on air earlier, `during` later ones for each second of airtime.
+    Both tables are (D, P): D distances from sender to receiver in steps of `STEP_M`, and P received
+    powers in steps of `STEP_DB`.
     """
 
     # packets that began earlier or at the same time and that the receiver is locked to, or that
@@ -74,10 +74,9 @@ class Hazards(NamedTuple):
 class ItsG5(Transceiver):
     """Model 802.11p (ITS-G5) under background traffic of packets of one size and rate.
 
-    It is the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022); fields are its settings.
-    `aifs_slots` are the slots in which the medium must be idle before a back-off, which is uniform
-    from 0 to `contention_window` slots; `sensing_dbm` is the least power that is sensed, and
-    `curve` the name of a curve of block errors.
+    Vehicles listen before they send, and wait a random number of slots (the back-off) once the
+    medium is idle. It is the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022); fields are
+    its settings, with those of `Transceiver` and `Propagation`.
     """
 
     # carrier frequency, here the control channel's
@@ -85,12 +84,14 @@ class ItsG5(Transceiver):
     # see `Propagation`; the source's 0.5 m leaves effective antennas of 1 m
     environment_height_m: Annotated[float, between(0, 100)] = 0.5
     antenna_m: Annotated[float, between(0, 10)] = 1.5  # height of every antenna
+    # background vehicles on one kilometre of road
     density_per_km: Annotated[float, between(0, 10000)] = 60.0
+    # least power at which a packet is sensed
     sensing_dbm: Annotated[float, between(-200, 50)] = -85.0
     packet_bytes: Annotated[int, between(1, 2304)] = 190  # size of a background packet
     # bytes that the layers below add to a packet and to a message
     header_bytes: Annotated[int, between(0, 2304)] = 30
-    # one of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27
+    # Mb/s, one of 802.11p's 3, 4.5, 6, 9, 12, 18, 24 and 27
     data_rate_mbps: Annotated[float, between(1, 100)] = 6.0
     # slots after SIFS in which nobody begins; 6 is that of best effort (EN 302 663)
     aifs_slots: Annotated[int, between(0, 15)] = 6
@@ -122,7 +123,7 @@ class ItsG5(Transceiver):
         return SIFS_S + self.aifs_slots * SLOT_S
 
     def airtime_s(self, size_bytes: Floats | float) -> Floats:
-        """Return the time on air of frames of this size with headers, s.
+        """Return the time on air of frames of `size_bytes`, headers included, s, of its shape.
 
         It is by IEEE 802.11-2012, 18.4.3.
         """
@@ -162,10 +163,11 @@ class ItsG5(Transceiver):
         return block_error(self.curve)(sinr_db - more_db)
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the packet reception ratio at distances `(n,)` for background packets.
+        """Return the packet reception ratio, the share of packets received, at n distances, (n,).
 
-        It is averaged over shadowing, and without `sight` (the obstacle) also over clear and
-        blocked links by the environment's shares.
+        `distance_m` is `(n,)`. It is that of background packets, averaged over shadowing; without
+        `sight` (what stands between, such as `CLEAR`) also over clear and blocked links by the
+        environment's shares.
         """
         shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         distance_m = np.asarray(distance_m, dtype=float)[:, None]

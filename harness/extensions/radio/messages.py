@@ -53,9 +53,9 @@ LENGTHS = {"open": (0, 128), "opaque": (0, 128, 256)}
 class Counts(NamedTuple):
     """Hold how much a message lists; numbers or arrays, which broadcast.
 
-    A message uses those that apply to it: `objects` of a CPM or SDSM, `points` of the path behind
-    of a CAM or BSM, `actions` and `text_bytes` of an intent, and `helpers` whom a request asks.
-    `optional` says whether objects have what their standard leaves open.
+    A message uses those that apply to it. CAM and BSM are beacons, CPM and SDSM lists of objects
+    that a vehicle sees, each by ETSI and by SAE; an intent states probabilities of actions, and a
+    request asks helpers for theirs.
     """
 
     objects: Count = 0  # listed in a CPM or SDSM
@@ -64,54 +64,47 @@ class Counts(NamedTuple):
     optional: Count = True
     points: Count = 0  # of the path behind, in a CAM's low-frequency container or a BSM's part II
     actions: Count = 0  # whose probabilities are in an intent
-    text_bytes: Count = 0  # of an intent's evidence
+    text_bytes: Count = 0  # of an intent's evidence, the words beside its probabilities
     helpers: Count = 1  # whom a request asks
 
 
 class Member(NamedTuple):
-    """Hold a row of `messages.csv`: a member of a message by its standard, and its bits.
-
-    `values` says what it may hold, `each` names the field of `Counts` it is repeated by, and `bits`
-    is None for a member of another sequence type.
-    """
+    """Hold a row of `messages.csv`: a member (field) of a message by its standard, and its bits."""
 
     type: str  # the message or sequence that it is a member of
-    member: str
+    member: str  # name of the member
     # what it may be; or its type, `open` or `opaque` if that is in octets behind their number
     values: str
-    bits: int | None  # None where a type says it
-    each: str  # what there is one of it for, such as a field of `Counts`; empty if nothing
-    source: str
+    bits: int | None  # its size; None where that follows from its type
+    # what there is one of it for, such as a field of `Counts`; empty if there is one in all
+    each: str
+    source: str  # where the standard defines it
 
 
 class Share(NamedTuple):
-    """Hold the bits of a member in a message, all its occurrences together.
-
-    `path` names the member and those that contain it, the outermost first.
-    """
+    """Hold the bits of a member (field) in a message, all its occurrences together."""
 
     path: tuple[str, ...]  # names of the member and of those that it is in, the outermost first
-    bits: Floats
-    source: str
+    bits: Floats  # their sum; an array where a count that it depends on is one
+    source: str  # where the standard defines it
 
 
 class Size(NamedTuple):
-    """Hold the sizes of a message in bits, each as an array.
+    """Hold the sizes of a message in bits: arrays where a count that it depends on is one."""
 
-    `packet` is the sum of message, signed envelope and network headers; `with_certificate` is a
-    packet that has the certificate instead of its digest.
-    """
-
-    message: Floats
-    envelope: Floats  # with the digest of the certificate
+    message: Floats  # the message alone
+    envelope: Floats  # its signed envelope, with the digest of the sender's certificate
     headers: Floats  # of network and transport
     packet: Floats  # all three
-    with_certificate: Floats  # the packet that has the certificate
+    with_certificate: Floats  # the packet with the whole certificate instead of its digest
 
 
 @cache
 def table() -> Mapping[str, tuple[Member, ...]]:
-    """Return the members of each message and sequence type, in their order."""
+    """Return the rows of `messages.csv`: the members of each message or sequence type, by its name.
+
+    They are in the order of the file.
+    """
     members: dict[str, tuple[Member, ...]] = {}
     for row in csv.DictReader(text_of(Path(__file__).with_name("messages.csv")).splitlines()):
         bits = int(row.pop("bits") or -1)
@@ -123,8 +116,8 @@ def table() -> Mapping[str, tuple[Member, ...]]:
 def message_bits(name: str, content: Counts) -> Floats:
     """Return the size of a message in bits, whole octets; 0 where none is sent.
 
-    `name` is one of `NAMES`, such as CPM. An SDSM lists at least one object, so a vehicle that sees
-    none sends none.
+    `name` is one of `NAMES`, such as CPM, and `content` what it lists, which gives the shape. An
+    SDSM lists at least one object, so a vehicle that sees none sends none.
 
     Raises:
         ValueError: more objects than the message may list.
@@ -200,10 +193,10 @@ def size(name: str, content: Counts) -> Size:
 
 
 def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
-    """Return the mean size of a vehicle's beacons (CAM or BSM), bytes, rounded up.
+    """Return the mean size of a vehicle's beacons, by which it tells its pose, bytes, rounded up.
 
-    `encoding` names the standard, and `rate_hz` is beacons a second. They have no path history. Now
-    and then one has the certificate, by `CERTIFICATE_EVERY_S`.
+    `encoding` names the standard (its beacon is a CAM or a BSM), and `rate_hz` is beacons a second.
+    They have no path history. Now and then one has the certificate, by `CERTIFICATE_EVERY_S`.
     """
     beacon = size(NAMES[encoding]["beacon"], Counts())
     every = max(1, math.ceil(CERTIFICATE_EVERY_S[encoding] * rate_hz))
@@ -212,9 +205,12 @@ def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
 
 @dataclass(frozen=True)
 class Standard:
-    """A standard's messages, for the value of a condition's setting `encoding` that names it."""
+    """Compute the sizes of a standard's messages; see `harness.coordination.encodings.Encoding`.
 
-    encoding: Encoding
+    A condition has it by its setting `encoding`.
+    """
+
+    encoding: Encoding  # the standard's name
 
     def packet_bits(self, holds: str, headers: bool, **counts: Count) -> Floats:
         name = NAMES[self.encoding][holds]

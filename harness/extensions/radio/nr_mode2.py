@@ -44,17 +44,18 @@ CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
 class NrMode2(Sidelink):
     """Model NR-V2X Mode 2 in one resource pool, where vehicles choose resources by sensing.
 
-    A packet takes as many sub-channels of `subchannel_blocks` resource blocks as it needs, in a
-    slot of 1 ms / 2^`numerology`. A message takes a slot from `t1_slots` to `t2_slots` after it is
-    ready; `mcs` is its modulation and coding, and `efficiency` the share of Shannon's bound of a
-    coding without a curve.
+    A resource is one or more sub-channels, each some resource blocks (of frequency) wide, in one
+    slot: what one packet takes. Fields are settings, with those of `Sidelink`, `Transceiver` and
+    `Propagation`.
     """
 
+    # law of links without a building between; see `Propagation`
     environment: Environment = "tr37885-highway"
-    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89
+    frequency_ghz: Annotated[float, between(0.1, 100)] = 5.89  # carrier frequency
+    # first slot, counted from when a message is ready, in which it may be sent
     t1_slots: Annotated[int, between(0, 10000)] = 2
-    t2_slots: Annotated[int, between(0, 10000)] = 33
-    bandwidth_mhz: Literal[10, 20, 30, 40] = 40  # 10, 20, 30 or 40
+    t2_slots: Annotated[int, between(0, 10000)] = 33  # the last one
+    bandwidth_mhz: Literal[10, 20, 30, 40] = 40  # width of the channel
     # 0, 1 or 2: slots of 1, 0.5 or 0.25 ms, subcarriers of 15, 30 or 60 kHz
     numerology: Literal[0, 1, 2] = 0
     # resource blocks of a sub-channel. A packet takes as many of these as it needs

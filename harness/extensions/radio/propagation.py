@@ -25,11 +25,10 @@ NEAREST_M = 3.0
 
 @dataclass(frozen=True)
 class Propagation:
-    """Define path loss, blockage and shadowing, with heights and widths as settings of a radio.
+    """Define how strongly signals are received: path loss, blockage, shadowing.
 
-    `environment` is the law of links without a building between. `environment_height_m` is taken
-    from `antenna_m` for the effective height, `blocker_m` is the height of a blocking vehicle that
-    no scene gives, and `street_m` and `wall_m` describe the street at a corner.
+    Blockage is the further loss behind a vehicle, and shadowing the slow change of power by what
+    stands around. Fields are settings of a radio.
     """
 
     # law of links without a building between, with its LOS probabilities and decorrelation
@@ -84,9 +83,9 @@ class Propagation:
         )
 
     def clear_db(self, distance_m: Floats, first_m: float | None = None) -> Floats:
-        """Return the path loss `(...)` in line of sight, dB.
+        """Return the path loss `(...)` in line of sight, dB, at distances `(...)`, m.
 
-        `first_m` is the height of one antenna, if it is not `antenna_m`.
+        `first_m` is the height of one antenna, m, if it is not `antenna_m`.
         """
         if self.environment == "winner-b1":
             effective_m = self._mean_height_m(first_m, self.environment_height_m)
@@ -128,8 +127,9 @@ class Propagation:
     def corner_db(self, corner_m: Floats, first_m: float | None = None) -> Floats:
         """Return the path loss `(...)` round a corner, dB (Mangel et al.).
 
-        `corner_m` are the distances of both ends to the crossing's centre, `(..., 2)`. The law is
-        not quite reciprocal, but a radio link is, so the mean of both directions in dB is taken.
+        `corner_m` are the distances of both ends to the crossing's centre, m, `(..., 2)`, and
+        `first_m` is the height of one antenna, m, if it is not `antenna_m`. The law is not quite
+        reciprocal, but a radio link is, so the mean of both directions in dB is taken.
         """
         one_m, other_m = np.moveaxis(np.maximum(corner_m, NEAREST_M), -1, 0)
         height_m = self._mean_height_m(first_m)
@@ -169,11 +169,11 @@ class Propagation:
 
     @property
     def decorrelation_m(self) -> float:
-        """Return where shadowing's correlation is 1/e: at 25 m on a highway, else at 10 m.
+        """Return the distance, m, over which a vehicle moves until shadowing's correlation is 1/e.
 
-        It is by TR 37.885, 6.2.1, and by TR 36.885 for `winner-b1`. In a town TR 37.885 has 13 m
-        for links without line of sight; here these have 10 m as well, so that shadowing does not
-        jump when sight is lost.
+        It is 25 m on a highway, else 10 m, by TR 37.885, 6.2.1, and by TR 36.885 for `winner-b1`.
+        In a town TR 37.885 has 13 m for links without line of sight; here these have 10 m as well,
+        so that shadowing does not jump when sight is lost.
         """
         return 25.0 if self.environment == "tr37885-highway" else 10.0
 
@@ -206,7 +206,8 @@ _BLOCKAGE_DB = [_clipped(5.0, 4.0), _clipped(9.0, 4.5), (0.0, 0.0)]
 def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -> Floats:
     """Return the path loss of WINNER+ B1 in line of sight, dB, at least that of free space.
 
-    `effective_m` is the effective antenna height.
+    `distance_m` is `(...)`, as is the result, `frequency_ghz` the carrier frequency, and
+    `effective_m` the effective antenna height, m.
     """
     far = distance_m >= 4 * effective_m**2 * frequency_ghz * 1e9 / LIGHT_M_PER_S
     log_m, log_ghz = np.log10(distance_m), math.log10(frequency_ghz)
@@ -217,10 +218,16 @@ def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -
 
 
 def nlos_db(distance_m: Floats, frequency_ghz: float) -> Floats:
-    """Return the path loss behind a building, dB (TR 37.885, table 6.2.1-1)."""
+    """Return the path loss behind a building at distances `(...)`, dB, `(...)`.
+
+    It is that of TR 37.885, table 6.2.1-1.
+    """
     return 36.85 + 30 * np.log10(distance_m) + 18.9 * math.log10(frequency_ghz)
 
 
 def noise_dbm(bandwidth_hz: float, noise_figure_db: float) -> float:
-    """Return the noise power of a receiver at 290 K: -95 dBm in 10 MHz with a figure of 9 dB."""
+    """Return the noise power, dBm, of a receiver at 290 K: -95 dBm in 10 MHz with a figure of 9 dB.
+
+    `bandwidth_hz` is the width of what it receives, and `noise_figure_db` what its circuits add.
+    """
     return -174 + 10 * math.log10(bandwidth_hz) + noise_figure_db

@@ -36,8 +36,7 @@ COLUMNS = ("distance_m", "reception", "configuration", "source")  # of somebody 
 class Drawn:
     """Hold how messages of a channel, simulated at one distance, were received.
 
-    `crossing` is the share of single transmissions received, `model` the same by the channel's
-    formula, `round_trip` the share of requests with a reply, and `delay_s` the mean time until it.
+    The ego sends a request, and a helper replies; each is one transmission.
     """
 
     distance_m: float  # between ego and helper
@@ -62,8 +61,8 @@ def latencies_ms(
 ) -> dict[str, dict[str, list[float]]]:
     """Return a message's median and 95th percentile latency, ms, by obstacle and distance.
 
-    The keys are those of `SIGHTS`, then `p50` and `p95`, with one value for each distance. It is
-    empty unless the channel is a table that has both.
+    The keys are those of `SIGHTS` (what stands between), then `p50` and `p95`, with one value for
+    each distance. It is empty unless the channel is a user's table that has both.
     """
     if not (isinstance(channel, Trace) and channel.spread):
         return {}
@@ -78,7 +77,7 @@ def latencies_ms(
 def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
     """Simulate `n` requests and replies to one helper at each distance, in line of sight.
 
-    The vehicles are on one road; each message has its own shadowing.
+    The vehicles are on one road; each message has its own shadowing, drawn by `seed`.
     """
     result = []
     curve = by_sight(channel, distances_m)["clear"].tolist()
@@ -117,12 +116,11 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
 class Gap:
     """Hold the inter-packet gap at one distance: the time between two received packets.
 
-    They are packets of one vehicle; estimates are over trips. `independent_s` is the mean gap if
-    losses were independent.
+    They are packets of one vehicle, received by another on the same trip.
     """
 
-    distance_m: float  # between the two
-    mean_s: Estimate  # over trips
+    distance_m: float  # between the two vehicles
+    mean_s: Estimate  # the mean gap, with an interval over trips
     p95_s: Estimate  # 95th percentile, with an interval over trips
     independent_s: float  # the mean if each packet were lost by itself: 1 / (rate x reception)
 
@@ -173,22 +171,22 @@ def _p95(values: Floats, trips: Ints) -> Estimate:
 
 @dataclass(frozen=True)
 class Curve:
-    """Hold a published or simulated curve of packet reception ratio over distance, (n,) each.
+    """Hold a published or simulated curve of reception over distance, as n points."""
 
-    `configuration` has the channel settings it was made with, as a condition states them.
-    """
-
-    configuration: str  # settings of a channel that are theirs, as a condition has them
-    source: str  # whose it is; else the file
-    distance_m: Floats  # `(n,)`
-    reception: Floats  # `(n,)` shares
+    # the channel settings that it was made with, as a condition states them: `rate_hz=10`; empty
+    # for those of the channel that it is compared with
+    configuration: str
+    source: str  # who published it; else the file's name
+    distance_m: Floats  # between sender and receiver, `(n,)`
+    reception: Floats  # share of packets received there, `(n,)`
 
 
 def curves_of(path: Path) -> list[Curve]:
-    """Return the curves in a CSV file with `distance_m` and `reception`.
+    """Return the curves in a CSV file with the columns `distance_m` and `reception`.
 
-    It may also have `configuration` and `source`, each pair of which is a curve. Raises UserError,
-    with file, line and value, if it is no such table or a value is not allowed.
+    It may also have the columns `configuration` and `source` (see `Curve`); rows with the same pair
+    of these are one curve. Raises UserError, with file, line and value, if it is no such table or a
+    value is not allowed.
     """
     file = printable(path)
     _, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
@@ -211,10 +209,10 @@ def curves_of(path: Path) -> list[Curve]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Hold a curve beside the channel model's reception at the same distances."""
+    """Hold a published curve beside the channel model's reception at the same n distances."""
 
     curve: Curve  # the curve
-    reception: Floats  # the model's at its distances, `(n,)`
+    reception: Floats  # share of packets received by the model, `(n,)`
 
     @property
     def mean_difference(self) -> float:
@@ -240,16 +238,15 @@ def compared(channel: Channel, curve: Curve, where: str) -> Compared:
 
 @dataclass(frozen=True)
 class Check:
-    """Hold a channel's comparison with its own simulated messages and with published curves.
-
-    `n` is the number of messages at each distance, and `busy_ratio` the share of time in which its
-    channel is sensed as busy; None if it has none. `waits` are the gaps between packets of a
-    vehicle, none for a radio that sends none.
-    """
+    """Hold a channel's comparison with its own simulated messages and with published curves."""
 
     n: int  # messages at each distance
-    busy_ratio: float | None  # of its channel, under the background load
-    waits: list[Gap]  # between packets of a vehicle; of a radio that sends none, empty
+    # share of time in which its channel is sensed as busy, under the background load; None if the
+    # model has no load
+    busy_ratio: float | None
+    # times between received packets of a vehicle, by distance; empty of a radio without packets of
+    # background traffic
+    waits: list[Gap]
     messages: list[Drawn]  # what was simulated
     curves: list[Compared]  # others' curves
 
@@ -283,11 +280,12 @@ def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check
 def crowds(
     channels: Mapping[str, Channel], radius_m: float, distance_m: float, sight: str
 ) -> dict[str, Floats]:
-    """Return the loss of one transmission by channel, for each number in `VEHICLES`, `(n,)`.
+    """Return the loss of one transmission for each of the n numbers in `VEHICLES`, `(n,)`.
 
-    Vehicles are within `radius_m`; sender and receiver, `distance_m` apart with the obstacle
-    `sight` between, are two of them, and the others are background load, evenly along one road. The
-    key `paper` has the paper's line.
+    The keys are those of `channels`, and `paper` for the paper's line; values are shares of
+    transmissions. Vehicles are within `radius_m` metres; sender and receiver, `distance_m` metres
+    apart with `sight` between (a key of `SIGHTS`), are two of them, and the others are background
+    load, evenly along one road.
     """
     losses = {"paper": density_coupled_loss(np.array(VEHICLES))}
     for name, channel in channels.items():

@@ -40,9 +40,9 @@ CELLS = 160
 class Sidelink(Transceiver):
     """Model the common part of the sidelink radios LTE Mode 4 and NR Mode 2.
 
-    Its fields and those of `Transceiver` are settings of both. `keep` is the probability that a
-    vehicle keeps its resource when it might choose another, and `transmissions` how often it sends
-    each block. A message takes a random slot from `t1_slots` to `t2_slots` after it is ready.
+    Vehicles divide the channel into slots of time and sub-channels of frequency. A resource is what
+    one packet takes, a block is what is sent in it, and each vehicle chooses its resources itself.
+    Fields, and those of `Transceiver`, are settings of both.
     """
 
     rate_hz: Annotated[float, between(0.1, 1000)] = 10.0  # packets that each vehicle sends a second
@@ -51,9 +51,10 @@ class Sidelink(Transceiver):
     # how often every vehicle sends each block (blind repetition). Given the link's shadowing,
     # copies are received independently, and not combined
     transmissions: Annotated[int, between(1, 100)] = 1
-    t1_slots: Annotated[int, between(0, 10000)] = 1  # first slot of the selection window
-    # last slot. A message takes a random slot of the window (one-shot), since a triggered message
-    # has no reservation
+    # first slot of the selection window, counted from when the message is ready
+    t1_slots: Annotated[int, between(0, 10000)] = 1
+    # last slot of it. A message takes a random slot of the window (one-shot), since a triggered
+    # message has no reservation
     t2_slots: Annotated[int, between(0, 10000)] = 100
 
     # Whether vehicles rank the remaining resources by received power (Step 3 of Mode 4).
@@ -67,7 +68,7 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def slot_s(self) -> float:
-        """Return the length of a slot, s: the time on air of one block."""
+        """Return the length of a slot, s: the time on air of one block, a vehicle's packet."""
 
     @property
     @abstractmethod
@@ -86,22 +87,22 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def noise_dbm(self) -> float:
-        """Return the noise power in the bandwidth of a block."""
+        """Return the noise power of a receiver in the bandwidth of a block, dBm."""
 
     @property
     @abstractmethod
     def block_error(self) -> BlockError:
-        """Return the function from SINR in dB to block error rate."""
+        """Return the function from SINR in dB to the probability that a block is lost."""
 
     def busy_ratio(self) -> float:
         return self._scheduling().busy_ratio
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the packet reception ratio at distances `(n,)` for background packets.
+        """Return the packet reception ratio, the share of packets received, at n distances, (n,).
 
-        It is equation 6 of Gonzalez-Martin et al. (2019), averaged over shadowing. Without `sight`
-        (the obstacle), no building stands between, and vehicles do with the environment's
-        probability.
+        `distance_m` is `(n,)`, and packets are those of background traffic. It is equation 6 of
+        Gonzalez-Martin et al. (2019), averaged over shadowing. `sight` is what stands between, such
+        as `CLEAR`; without it no building does, and vehicles with the environment's probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
         success = np.array(

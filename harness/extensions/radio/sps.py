@@ -28,11 +28,9 @@ STEP_DB = 0.1  # step by which Step 3 raises the threshold until enough resource
 class Scheduling:
     """Hold what a vehicle's choice of a resource depends on in semi-persistent scheduling.
 
-    A period is the time from one packet of a vehicle to its next; `resources` counts those in it,
-    and `per_m` the packets of one metre of road. `forgotten` is the share of choices in which a
-    vehicle cannot know another's, since both were made anew within one period. `sensed` maps
-    distances in m and a threshold in dBm to the share of packets received above it. Equations are
-    numbered as in Gonzalez-Martin et al. (IEEE TVT 68(2), 2019).
+    A resource is what one packet takes of the channel: some frequency in one slot of time. A period
+    is the time from one packet of a vehicle to its next. Numbers in brackets are equations of
+    Gonzalez-Martin et al. (IEEE TVT 68(2), 2019).
     """
 
     per_m: float  # packets that the vehicles on one metre of road send in a period
@@ -50,21 +48,21 @@ class Scheduling:
         return self._taken(self.threshold_dbm, 1) / self.resources
 
     def same_by_exclusion(self, apart_m: Floats) -> Floats:
-        """Return the probability that a vehicle `apart_m` away takes the same resource by Step 2.
+        """Return the probability that a vehicle `apart_m` metres away takes the same resource.
 
-        In that step both exclude the resources that they sense as taken (Gonzalez-Martin et al.
-        2019, equation 23). The source does not limit them; at most 80 % can be excluded. The shape
-        is that of `apart_m`.
+        The shape is that of `apart_m`. It is by Step 2 of a vehicle's choice, in which both exclude
+        the resources that they sense as taken (Gonzalez-Martin et al. 2019, equation 23). The
+        source does not limit them; at most 80 % can be excluded.
         """
         taken = min(self._taken(self.threshold_dbm, 1), (1 - LEAST_SHARE) * self.resources)
         return self._same(apart_m, taken, self.threshold_dbm)
 
     def same_by_ranking(self, apart_m: Floats) -> Floats:
-        """Return the probability that a vehicle `apart_m` away takes the same resource by Step 3.
+        """Return the probability that a vehicle `apart_m` metres away takes the same resource.
 
-        In that step both keep the fifth of the resources with the least power (Gonzalez-Martin et
-        al. 2019, equations 31 to 33), as if the threshold had been raised until only these were
-        left.
+        The shape is that of `apart_m`. It is by Step 3 of a vehicle's choice, in which both keep
+        the fifth of the resources with the least power (Gonzalez-Martin et al. 2019, equations 31
+        to 33), as if the threshold had been raised until only these were left.
         """
         threshold_dbm = self.threshold_dbm
         while (taken := self._taken(threshold_dbm, 2)) > (1 - LEAST_SHARE) * self.resources:
@@ -99,11 +97,11 @@ class Scheduling:
 
 
 def taken(packets: float, resources: float) -> float:
-    """Return the number of resources that packets take in a period, at most `resources`.
+    """Return how many of `resources` resources `packets` packets take in a period.
 
-    By equation 29 of Gonzalez-Martin et al. (2019), half of the packets do not overlap and the
-    others fall at random. The equation does not state the limit `resources`, but it holds in its
-    range.
+    A period is the time from one packet of a vehicle to its next. By equation 29 of Gonzalez-Martin
+    et al. (2019), half of the packets do not overlap and the others fall at random. The equation
+    does not state the limit `resources`, but it holds in its range.
     """
     half = packets / 2
     free = resources - half

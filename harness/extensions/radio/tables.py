@@ -44,7 +44,8 @@ def number_of(
 ) -> float:
     """Return the number in a column of a row, between `least` and `most`.
 
-    Raises UserError for any other, with `where` and the text `allowed`.
+    `row` has the cells as texts by column. Raises UserError for any other; `where` says in which
+    file and line, and `allowed` in words what is allowed.
     """
     try:
         value = float(row[column])
@@ -56,6 +57,9 @@ def number_of(
 
 
 def refuse_ragged(where: str, row: dict[str, str]) -> None:
-    """Raise UserError for a row that has more or fewer cells than there are columns."""
+    """Raise UserError for a row that has more or fewer cells than there are columns.
+
+    `row` is one of a `csv.DictReader`, and `where` says in which file and line it is.
+    """
     if None in row or None in row.values():
         raise UserError(f"{where}: has other columns than the first line")

@@ -43,7 +43,10 @@ P95 = 0.95
 
 
 class Spread(NamedTuple):
-    """Hold the median and 95th percentile of a latency that each message draws."""
+    """Hold the median and 95th percentile of a latency that is drawn anew for each message.
+
+    A latency is the time from the wish to send until reception.
+    """
 
     p50_s: float  # the median
     p95_s: float  # 95th percentile
@@ -53,15 +56,12 @@ What = Literal["reception", "p50_s", "p95_s"]
 
 
 class Point(NamedTuple):
-    """Hold a row of a table of reception: distance, reception, obstacle and latency.
-
-    `reception` is the share of packets received at `distance_m`. `sight` is one of `SIGHTS`, and
-    `latency_s` the time from the wish to send until reception; each is None in a table without it.
-    """
+    """Hold a row of a user's table of reception: distance, reception, obstacle and latency."""
 
     distance_m: float  # distance between sender and receiver
     reception: float  # share of packets received
-    sight: str | None  # one of `SIGHTS`; None in a table without this column
+    # what stands between them, one of `SIGHTS`; None in a table without this column
+    sight: str | None
     # time from the wish to send until reception; None in a table without latencies
     latency_s: float | Spread | None
 
@@ -125,9 +125,10 @@ class Trace:
         return any(isinstance(point.latency_s, Spread) for point in self.receptions.points)
 
     def percentiles_s(self, distance_m: Floats, sight: Ints | int) -> tuple[Floats, Floats]:
-        """Return the median and 95th percentile of a message's latency at these distances, s.
+        """Return the median and the 95th percentile, s, of messages' latency, `(...)` each.
 
-        `sight` is the obstacle, such as `CLEAR`.
+        `distance_m` has the distances of sender and receiver, `(...)`, and `sight` is what stands
+        between, such as `CLEAR`.
         """
         return self._at(distance_m, sight, "p50_s"), self._at(distance_m, sight, "p95_s")
 
@@ -169,7 +170,8 @@ class Trace:
 def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
     """Return the channel of a profile whose parameter `file` names a table in the same folder.
 
-    Raises UserError if the table is missing, elsewhere or wrong.
+    `parameters` has the profile's settings by name, `folder` is where its file lies, and `where`
+    names it in messages. Raises UserError if the table is missing, elsewhere or wrong.
     """
     if not isinstance(parameters.get("file"), str):
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")

@@ -22,9 +22,8 @@ STEP_M, STEP_DB = 10.0, 0.5
 class Transceiver(Propagation, Physical):
     """Model the radio of all vehicles under background traffic of one packet size and rate.
 
-    `density_per_km` is the number of background vehicles on a kilometre of road, each of which
-    sends `rate_hz` packets a second. `sensing_dbm` is the least power of a packet that is received
-    or sensed.
+    Background traffic is other vehicles' packets, which compete for the channel with the messages
+    of the ego and its helpers. Fields, and those of `Propagation`, are settings of a radio.
     """
 
     # background vehicles on one kilometre of road, all lanes and both directions together
@@ -45,14 +44,15 @@ class Transceiver(Propagation, Physical):
 
     @abstractmethod
     def wait_s(self, uniforms: Floats) -> Floats:
-        """Return the seconds from the wish to send until sending begins, for uniform draws.
+        """Return the seconds from the wish to send until sending begins, one for each draw.
 
-        They are the quantiles of the wait at these draws, of the same shape.
+        `uniforms`, `(...)`, are draws in [0, 1): the result, `(...)`, is the quantiles of the wait
+        at these.
         """
 
     @abstractmethod
     def message_s(self, bits: Floats | float) -> Floats:
-        """Return the time on air of a message of so many bits, s."""
+        """Return the time on air of messages of so many bits, s, of the shape of `bits`."""
 
     @property
     @abstractmethod
@@ -85,13 +85,18 @@ class Transceiver(Propagation, Physical):
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
         """Return the probability that a message is lost on each of H links, `(..., H)`.
 
-        `site` has the positions, `bits` is the message's size, and `shadow` the link's shadowing,
-        standard normal. Values for absent helpers mean nothing.
+        `site` has the positions, `bits` is the message's size, one number or `(..., H)`, and
+        `shadow` each link's shadowing, `(..., H)`, standard normal. Values for absent helpers mean
+        nothing.
         """
         return self._lost(self._fate_at(site, shadow), bits)
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when all helpers have the request: after its wait for the medium and airtime."""
+        """Return when all helpers have a request of so many bits, and its airtime, s.
+
+        They have it after its wait for the medium, of which `draws` has the random numbers, and its
+        airtime.
+        """
         airtime_s = self.message_s(bits)
         return Broadcast(self.wait_s(draws.wait) + airtime_s, airtime_s)
 

@@ -38,18 +38,23 @@ PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 
 @dataclass(frozen=True)
 class Level:
-    """Hold all choices at N decision points of one step, for S seeds and K sets of helpers.
+    """Hold what the ego does, and what it costs, by whom it asks at the decision points of a step.
 
-    `action` is what the ego does if it asks a set, and `costs` what that costs, NaN where unknown.
+    A step has N decision points: all that are as many decisions from the start. The other axes are
+    S channel seeds, K sets of helpers that could be asked, and C costs (`COSTS`). Where an axis is
+    S x N, the first seed's N points come first.
     """
 
-    at: Ints  # indices of the decision points in the forest, ascending, (N,)
-    action: Ints  # index of the ego's action if it asks a set, (S, N, K)
+    # indices of the decision points in the forest, the dataset's decision trees, ascending, (N,)
+    at: Ints
+    action: Ints  # index of the meta-action that the ego takes if it asks a set, (S, N, K)
     costs: Floats  # costs of asking a set, in the order of `COSTS`, (S, N, K, C); NaN where unknown
-    intents: Intents  # intents of all vehicles in each decision, with the outlook, (S x N, ...)
+    # all vehicles' intents (probabilities of actions), and what the ego sees, (S x N, ...)
+    intents: Intents
     draws: Draws  # the channel's random numbers, (S x N, ...)
 
 
+# A rule of whom to ask, as `Choices.backwards` calls it.
 Choose = Callable[[Level, Floats, Floats], Ints]
 
 
@@ -57,20 +62,22 @@ Choose = Callable[[Level, Floats, Floats], Ints]
 class Choices:
     """Hold what follows at each decision point of a dataset if the ego asks each set of helpers.
 
-    `sets` (K, H) has the H helpers' membership in each of K sets, the empty one first; `levels` has
-    the decision points by step, the first step's first.
+    There are K sets of some of H helpers; the empty one, of nobody, is the first.
     """
 
-    forest: Forest  # of the run's dataset
-    sets: Bools  # which helpers each has, the empty one first, (K, H)
-    levels: tuple[Level, ...]  # of decision points, the first step's first
+    # the dataset's decision trees: every decision point that actions can lead to, and how each
+    # course ends
+    forest: Forest
+    sets: Bools  # whether a set has a helper, (K, H)
+    levels: tuple[Level, ...]  # the decision points by step, the first step's first
 
     def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
         """Yield each level, the last first, with what its sets lead to and the chosen sets.
 
         A level has the decision points of one step. The axes are S channel seeds, N decision
-        points, K sets of helpers and C costs. A tuple has the level, success (S, N, K), costs (S,
-        N, K, C) until the episode's end, and the chosen sets' indices (S, N).
+        points, K sets of helpers and C costs. A tuple has the level, success (S, N, K), 1 or 0,
+        and costs (S, N, K, C) from there to the episode's end, and the indices in `sets` of the
+        chosen sets, (S, N).
 
         Args:
             choose: returns the index of the set asked in each decision, (S, N), given the level,
@@ -98,18 +105,19 @@ class Choices:
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
         """Return success, (S, E), and costs, (S, E, C), of every episode under the rule `choose`.
 
-        The axes are S channel seeds, E episodes and C costs (`COSTS`). The rule is as in
-        `backwards`: it returns the set to ask in each decision.
+        The axes are S channel seeds, E episodes and C costs (`COSTS`). Success is 1 or 0. The rule
+        is as in `backwards`: it returns the index of the set to ask in each decision.
         """
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
         return _values_of(ends, k)[:, root], _values_of(spent, k)[:, root]
 
     def oracle(self) -> tuple[Floats, Floats]:
-        """Return success, (S, E), and costs, (S, E, C), of the best sets of helpers to ask.
+        """Return success, (S, E), and costs, (S, E, C), if the ego always asked the best set.
 
-        The axes are S channel seeds, E episodes and C costs (`COSTS`). Of equally good sets, those
-        with the fewest messages are taken.
+        That is a bound: only who knows how each course ends could ask so. The axes are S channel
+        seeds, E episodes and C costs (`COSTS`). Of equally good sets, those with the fewest
+        messages are taken.
         """
 
         def best(level: Level, ends: Floats, spent: Floats) -> Ints:
@@ -119,9 +127,9 @@ class Choices:
         return self.played(best)
 
     def index(self, mask: Bools) -> Ints:
-        """Return the index in `sets` of each set of helpers, given as a mask `(..., H)`.
+        """Return the index in `sets` of each set of helpers, `(...)`.
 
-        The last axis has the H helpers.
+        `mask`, `(..., H)`, says which of the H helpers are in it; it may leave out the last ones.
         """
         helpers = self.sets.shape[1]
         bits = 1 << np.arange(helpers)
@@ -135,8 +143,9 @@ class Choices:
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
         """Return the rule that asks the helpers whom an operating point's schedule asks.
 
-        A schedule says whom the ego asks in a decision. `worths` has what asking is worth at each
-        level, if it is known, as the method `worths` returns it.
+        A schedule says what asking each helper is worth, and the operating point above which worth,
+        and how many at most, the ego asks. `worths` is what the method `worths` returned for the
+        point; without it the worth is computed.
         """
         lookup = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
@@ -170,8 +179,10 @@ def _values_of(values: Floats, k: Ints) -> Floats:
 def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     """Raise UserError if decisions depend on more than whom the ego hears now.
 
-    Then the oracle is not exact: with a fusion call, a rule with memory, another content, or parts
-    that change messages. `helpers` and `actions` are their numbers.
+    Then the oracle is not exact. It is so with a fusion call (the model is asked again with the
+    messages), a consensus rule with memory, another content of messages than intents, or settings
+    by which extensions change messages. `helpers` and `actions` are the numbers of helpers and of
+    meta-actions.
     """
     name, consensus = printable(point.name), point.fusion.consensus
     if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
@@ -199,8 +210,11 @@ def choices(
 ) -> Choices:
     """Compute what each set of helpers leads to, at every decision point that any choice leads to.
 
-    The run's model is asked for answers that the run lacks. The schedule of `point` does not
-    matter. `progress` is called with 1 for each step.
+    Args:
+        stored: the run whose answers are used; its model is asked for those that it lacks.
+        point: the operating point; its limit of helpers counts, and its schedule does not.
+        seeds: the channel seeds that draws are made from.
+        progress: called with 1 for each step.
 
     Raises:
         UserError: decisions depend on more than whom the ego hears now, or there are too many sets.

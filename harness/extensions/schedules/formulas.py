@@ -1,4 +1,9 @@
-"""Define schedules beside the paper's: by doubt, by what helpers would add, by lot."""
+"""Define schedules beside the paper's: by doubt, by what helpers would add, by lot.
+
+A schedule decides whom the ego asks. Each function here returns what asking each of H helpers is
+worth, `(..., H)` with an axis for each leading one of its inputs (such as decisions), or `(..., 1)`
+where it is the same for all helpers. Those worth more than the schedule's threshold are asked.
+"""
 
 import numpy as np
 
@@ -7,18 +12,19 @@ from harness.core.arrays import Floats
 
 
 def always(inputs: ScheduleInputs) -> Floats:
-    """Return infinite worth for every helper, so that all are always asked: `(..., 1)`.
+    """Return an infinite worth of asking, the same for every helper, `(..., 1)`.
 
-    `inputs` has what a schedule may use, with leading axes `(...)`; what is worth the same of each
-    helper has one column.
+    So all helpers are always asked, as far as the operating point's limit allows. `inputs` has what
+    the ego knows before it asks, with leading axes `(...)`.
     """
     return np.full((*inputs.entropy_nats.shape, 1), np.inf)
 
 
 def margin(inputs: ScheduleInputs) -> Floats:
-    """Return 1 minus the lead of the likeliest action's probability over the next, `(..., 1)`.
+    """Return as the worth of asking how undecided the ego is between its two likeliest actions.
 
-    It is 0 for a certain intent, and 1 for one undecided between two actions.
+    It is 1 minus the lead of the likeliest action's probability over the next, `(..., 1)`, the same
+    for every helper: 0 for an ego that is certain, 1 for one undecided between two actions.
     """
     ranked = np.sort(inputs.own, axis=-1)
     difference: Floats = ranked[..., -1] - (ranked[..., -2] if ranked.shape[-1] > 1 else 0.0)
@@ -26,26 +32,34 @@ def margin(inputs: ScheduleInputs) -> Floats:
 
 
 def risk(inputs: ScheduleInputs) -> Floats:
-    """Return the entropy in nats times the unseen share of the least visible region, `(..., 1)`."""
+    """Return as the worth of asking the ego's doubt times how much it does not see, `(..., 1)`.
+
+    Doubt is the entropy in nats of the ego's intent, its probabilities of actions; the other factor
+    is the unseen share, 0 to 1, of the region that it sees least of. Regions are where a danger may
+    come from: left, right, oncoming. The worth is the same for every helper.
+    """
     assert inputs.outlook is not None
     unseen: Floats = np.max(inputs.outlook.unseen, axis=-1, initial=0.0)
     return (inputs.entropy_nats * unseen)[..., None]
 
 
 def deadline(inputs: ScheduleInputs) -> Floats:
-    """Return the entropy in nats times the probability that a reply comes in time, `(..., H)`.
+    """Return as the worth of asking the ego's doubt times the chance of a timely reply, `(..., H)`.
 
-    It is NaN for one of the H helpers that may not be asked.
+    Doubt is the entropy in nats of the ego's intent, its probabilities of actions. The chance is
+    the probability that the request reaches the helper, and its reply the ego, before the ego
+    decides. The worth is NaN for one of the H helpers that may not be asked.
     """
     assert inputs.in_time is not None
     return np.where(inputs.may_ask, inputs.entropy_nats[..., None] * inputs.in_time, np.nan)
 
 
 def coverage(inputs: ScheduleInputs) -> Floats:
-    """Return the mean share of the regions that a helper sees and the ego does not, `(..., H)`.
+    """Return as the worth of asking how much a helper sees that the ego does not, `(..., H)`.
 
-    It is NaN for one of the H helpers that may not be asked. This is need times supply at each
-    point of a region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
+    It is a share, 0 to 1, of each region where a danger may come from (left, right, oncoming),
+    averaged over regions; NaN for one of the H helpers that may not be asked. This is need times
+    supply at each point of a region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
     """
     assert inputs.outlook is not None
     regions = max(inputs.outlook.added.shape[-1], 1)
@@ -53,9 +67,10 @@ def coverage(inputs: ScheduleInputs) -> Floats:
 
 
 def random(inputs: ScheduleInputs) -> Floats:
-    """Return a uniform draw in [0, 1), `(..., 1)`, as what asking is worth.
+    """Return a uniform draw in [0, 1) as the worth of asking, the same of every helper, `(..., 1)`.
 
-    So the ego asks in a share of 1 minus the threshold of its decisions.
+    It is new at each decision. So the ego asks in a share of 1 minus the threshold of its
+    decisions.
     """
     assert inputs.lot is not None
     return inputs.lot[..., None]

@@ -38,10 +38,10 @@ THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 
 
 def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun] = ()) -> str:
-    """Return a run's name with its dataset and layout seeds, in words.
+    """Return a run's name, its dataset and the seeds of its layouts (start situations), in words.
 
-    Raises UserError unless all seeds are for the purpose `wanted`, the layouts are those of the
-    seeds, and none of them is in one of the `reported` runs.
+    Raises UserError unless all seeds are for the purpose `wanted`, such as `train`, the layouts are
+    those that the seeds give, and none of them is in one of the `reported` runs.
     """
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
@@ -58,11 +58,12 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
 
 
 def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
-    """Return training data: inputs (n, F), and gains (n,) in success from asking one helper alone.
+    """Return what a network learns from: inputs (n, F), and the gains (n,) that it should predict.
 
-    It has a row for each of n cases, a helper that may be asked at a decision point of the tree,
-    with the F inputs of a learnt schedule. `choose` decides whom the ego asks in the rest of the
-    episode.
+    A gain is success if one helper alone is asked, less success if nobody is, -1 to 1, averaged
+    over the seeds of the channel. Each of the n rows is a helper that may be asked at a decision
+    point of `tree`, with the F inputs of a learnt schedule (`learnt.INPUTS`). `choose` decides whom
+    the ego asks in the rest of the episode.
     """
     alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
@@ -77,9 +78,9 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
 
 
 def fit(x: Floats, y: Floats) -> Network:
-    """Fit a network that predicts y (n,) from F inputs x (n, F), by least squares.
+    """Fit a network that predicts n gains `y`, (n,), from F inputs `x`, (n, F), by least squares.
 
-    The optimiser is Adam on whole batches, with weight decay.
+    The optimiser is Adam, in each step on all rows, with weight decay.
     """
     draws = noise.generator("schedule", "weights")
     centre, scale = x.mean(axis=0), np.maximum(x.std(axis=0), LEAST)
@@ -113,11 +114,12 @@ def fit(x: Floats, y: Floats) -> Network:
 def learn(
     train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
 ) -> Network:
-    """Learn a network that predicts the gain from asking each helper, from runs on train layouts.
+    """Learn a network that predicts the gain in success from asking each helper.
 
-    `point` is the operating point: its limit of helpers holds, and its schedule decides the rest of
-    an episode in the first round, the network in later ones. `progress` is called with 1 for each
-    step and round.
+    `train` are runs on layouts (start situations) that are for learning. `point` is the operating
+    point: its limit of helpers holds, and its schedule decides whom the ego asks in the rest of an
+    episode in the first round, the network in later ones. `progress` is called with 1 for each step
+    and round.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rules = None, [tree.scheduled(point) for tree in trees]
@@ -137,9 +139,9 @@ def learn(
 
 
 def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
-    """Return the rule that asks the helpers whose predicted gain is above the threshold.
+    """Return the rule that asks the helpers whose predicted gain in success is above `threshold`.
 
-    It is for the decision points of `tree`, under the operating point's limit of helpers.
+    It is for the decision points of `tree`, and asks as many helpers as the operating point allows.
     """
     schedule = Learnt(network, threshold)
     worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in tree.levels]
@@ -152,10 +154,10 @@ def tuned(
     point: OperatingPoint,
     progress: Callable[[int], None],
 ) -> float:
-    """Return the threshold with the most success on tune layouts; of equal ones the highest.
+    """Return the threshold of predicted gain with the most success; of equal ones the highest.
 
-    Success is by each run's success rule, averaged over runs. `progress` is called with 1 for each
-    step of a run.
+    `tune` are runs on layouts (start situations) that are for choosing settings. Success is by each
+    run's success rule, averaged over runs. `progress` is called with 1 for each step of a run.
     """
     success = np.zeros(len(THRESHOLDS))
     with_outlook = point.changed(schedule="coverage", threshold=None)
@@ -186,6 +188,14 @@ def run_learn(
     progress: Callable[[int], None],
 ) -> Stated:
     """Learn a schedule, choose its threshold, write its file `out`, and return the file's content.
+
+    Args:
+        train: runs on train layouts (start situations), from which the network is learnt.
+        tune: runs on tune layouts, on which the threshold is chosen.
+        point: the operating point: its limit of helpers, and the schedule of the first round.
+        out: the TOML file to write.
+        command: the command line that makes the file, which the file states.
+        progress: called with 1 for each step and round.
 
     Raises:
         UserError: a run is on layouts for another purpose,

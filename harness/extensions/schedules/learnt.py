@@ -18,26 +18,29 @@ from harness.core.files import read_once
 
 FAR_S, FAR_M = 6.0, 100.0  # scales of times and distances; a longer time counts as FAR_S
 INPUTS = (
-    "entropy",
-    "margin",
-    "most careful",
-    "least careful",
-    "unseen, most",
-    "unseen, mean",
-    "added, most",
-    "added, mean",
-    "range",
-    "helper to zone",
-    "ego to zone",
-    "seconds to zone",
-    "others nearer",
-    "others",
+    "entropy",  # of the ego's intent, its probabilities of actions, nats
+    "margin",  # 1 less the lead of its likeliest action's probability over the next
+    "most careful",  # the probability of its first action
+    "least careful",  # that of its last
+    "unseen, most",  # share of the region that the ego sees least of which it does not see
+    "unseen, mean",  # the mean of such shares over regions: where a danger may come from
+    "added, most",  # largest share of a region that the helper sees and the ego does not
+    "added, mean",  # the mean of such shares over regions
+    "range",  # distance from helper to ego, in units of `FAR_M`
+    "helper to zone",  # the helper's distance to the conflict zone, in the same unit
+    "ego to zone",  # the ego's
+    "seconds to zone",  # until the ego is there at its speed, `FAR_S` at most, in units of it
+    "others nearer",  # number of helpers that may be asked and are nearer to the ego
+    "others",  # number of other helpers that may be asked
 )
 
 
 @dataclass(frozen=True)
 class Network:
-    """Hold a network with one hidden layer of tanh units: F inputs, J units, one output."""
+    """Hold a network with one hidden layer of tanh units: F inputs, J units, one output.
+
+    The inputs are `INPUTS`, the output the expected gain in success from asking one helper.
+    """
 
     centre: Floats  # what is subtracted from each input, (F,)
     scale: Floats  # what each input is then divided by, (F,)
@@ -54,9 +57,9 @@ class Network:
 
 @dataclass(frozen=True)
 class Learnt:
-    """Schedule requests by a network: the expected gain in success from asking one helper alone.
+    """Decide whom the ego asks by the gain in success that a network expects of each helper alone.
 
-    A helper is asked if its gain is above `threshold`, unless a condition has its own.
+    A helper is asked if its gain is above `threshold`, or above the condition's own threshold.
     """
 
     network: Network  # from `inputs` to the gain in success probability
@@ -66,29 +69,30 @@ class Learnt:
     def worth(self, known: ScheduleInputs) -> Floats:
         """Return the expected gain in success from asking each of H helpers, `(..., H)`.
 
-        `known` has what a schedule may use. It is NaN for a helper that may not be asked.
+        `known` has what the ego knows before it asks, with leading axes `(...)`. The gain is a
+        difference of shares, -1 to 1, and NaN for a helper that may not be asked.
         """
         return np.where(known.may_ask, self.network(inputs(known)), np.nan)
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Hold the numbers of a `Network` as a schedule's file states them, unchecked."""
+    """Hold the numbers of a `Network` as a schedule's file states them; sizes are not checked yet.
 
-    centre: tuple[float, ...]
-    scale: tuple[Annotated[float, between(1e-6, 1e6)], ...]
-    into: tuple[tuple[float, ...], ...]
-    bias: tuple[float, ...]
-    out: tuple[float, ...]
-    base: float
+    The network has F inputs and J hidden units.
+    """
+
+    centre: tuple[float, ...]  # what is subtracted from each input, F numbers
+    scale: tuple[Annotated[float, between(1e-6, 1e6)], ...]  # what each is then divided by, F
+    into: tuple[tuple[float, ...], ...]  # weights from the inputs to the units, F rows of J
+    bias: tuple[float, ...]  # bias of each unit, J numbers
+    out: tuple[float, ...]  # weights from the units to the output, J numbers
+    base: float  # bias of the output
 
 
 @dataclass(frozen=True)
 class Stated:
-    """Hold the content of a schedule's file in `schedules/`: a learnt rule of whom the ego asks.
-
-    `learnt_from` and `tuned_on` name runs with their layout seeds; `network` has the weights.
-    """
+    """Hold the content of a schedule's file in `schedules/`: a learnt rule of whom the ego asks."""
 
     description: str  # one sentence
     command: str  # the command that made the file
@@ -129,7 +133,8 @@ class Stated:
 def inputs(facts: ScheduleInputs) -> Floats:
     """Return the network's F inputs for each of H helpers, `(..., H, F)`, in the order of `INPUTS`.
 
-    `facts` has what a schedule may use. Inputs are arbitrary for a helper that may not be asked.
+    `facts` has what the ego knows before it asks, with leading axes `(...)`. Inputs are arbitrary
+    for a helper that may not be asked.
     """
     outlook, may_ask = facts.outlook, facts.may_ask
     assert outlook is not None

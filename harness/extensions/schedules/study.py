@@ -53,16 +53,17 @@ FIRST = (PAPER, NEVER, ALWAYS, "margin", "risk", "deadline", "coverage", RANDOM)
 class Candidate:
     """Describe one setting of a schedule: its threshold and how many helpers it asks at most.
 
-    A schedule says whom the ego asks in a decision. The threshold is what asking must be worth;
-    None for a schedule without one.
+    A schedule says what asking each helper is worth in a decision; those worth more than the
+    threshold are asked.
     """
 
     schedule: str  # its name
-    threshold: float | None  # what asking must be worth; None for a schedule without threshold
+    # what asking must be worth more than, in the schedule's own unit; None for a schedule without
+    threshold: float | None
     most: int  # most helpers asked in a decision
 
     def at(self, point: OperatingPoint) -> OperatingPoint:
-        """Return an operating point with this schedule and setting."""
+        """Return a copy of an operating point that asks by this schedule and setting."""
         if self.schedule == PAPER and self.threshold is not None:
             changed = point.changed(schedule=PAPER, threshold=None, tau_nats=self.threshold)
         else:
@@ -77,22 +78,21 @@ class Candidate:
 class Play:
     """Hold the outcome of one setting of a schedule for S channel seeds and E episodes.
 
-    `success` is (S, E), and `costs` (S, E, C) has the C costs `COSTS`: messages, air time, latency,
-    energy and so on.
+    There are C costs, `COSTS`: messages, air time, latency, energy and so on.
     """
 
-    candidate: Candidate
-    success: Floats  # which episodes succeed, (S, E)
+    candidate: Candidate  # the schedule and its setting
+    success: Floats  # which episodes succeed, 1 or 0, (S, E)
     costs: Floats  # costs of each episode, in the order of `COSTS`, (S, E, C)
     success_rule: Success  # how success is averaged, such as balanced by danger
 
     @property
     def rate(self) -> float:
-        """Return the mean success, by `success_rule`."""
+        """Return the mean success of all episodes, 0 to 1, by `success_rule`."""
         return self.success_rule.mean(self.success)
 
     def of(self, cost: str) -> Floats:
-        """Return one of `COSTS`, by its name, of E episodes under S channel seeds, (S, E)."""
+        """Return one of `COSTS` by its name, summed over each of E episodes, (S, E), S seeds."""
         return np.asarray(self.costs[..., COSTS.index(cost)])
 
     @property
@@ -114,7 +114,8 @@ def plays(
 ) -> list[Play]:
     """Play settings of one schedule, which differ in threshold or limit; return their outcomes.
 
-    What asking is worth to the schedule is computed once for all.
+    `choices` has what follows from asking each set of helpers, under `point`; `success_rule` says
+    how success is averaged over episodes. What asking is worth is computed once for all settings.
     """
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
@@ -125,7 +126,8 @@ def plays(
 def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[Candidate]:
     """Return the settings of a schedule to try: thresholds, each with every limit of helpers.
 
-    The thresholds are deciles of what asking is worth, the schedule's own, and 0.
+    `choices` are those of a dataset under `point`. The thresholds are deciles of what asking is
+    worth there, the schedule's own, and 0.
     """
     most = range(1, point.ask.max_helpers + 1)
     usual = point.changed(schedule=schedule, threshold=None)
@@ -141,10 +143,9 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
 class Chosen:
     """Compare a schedule, at its chosen setting, with the paper's schedule and the oracle.
 
-    The paper's schedule asks by the entropy of the ego's intent; the oracle knows how each episode
-    ends. It has success, its difference to the paper's schedule and to random asking, the share of
-    the gap to the oracle that it closes, messages as a share of the paper's, and success averaged
-    over budgets.
+    The paper's schedule asks by the entropy of the ego's intent; the oracle is the best that an ego
+    could do which knows how each episode ends. Success is a share of episodes, 0 to 1; every
+    estimate has an interval over episodes. A budget is how much of a cost an episode may take.
     """
 
     play: Play  # the setting, with success and costs of every episode
@@ -167,16 +168,16 @@ class Chosen:
 class Compared:
     """Hold all schedules that were compared on one run, with the outcome of every setting.
 
-    `tune` has the same settings on tune layouts, on which settings are chosen; `oracle` is the
-    bound of an ego that knows how each episode ends.
+    All played the same episodes with the same draws of the channel.
     """
 
     name: str  # the run's model, prompt and answer mode
-    point: OperatingPoint  # the operating point
+    point: OperatingPoint  # the operating point; each play has a schedule of its own in it
     names: tuple[str, ...]  # names of the schedules that are compared
     plays: Mapping[str, Sequence[Play]]  # of every candidate, by schedule
-    tune: Mapping[str, Sequence[Play]]  # the same on tune layouts; empty without
-    oracle: Play  # the bound
+    # the same on tune layouts, start situations on which settings are chosen; empty without
+    tune: Mapping[str, Sequence[Play]]
+    oracle: Play  # the bound: of an ego that knows how each episode ends
     budget: float  # share of the paper's messages within which settings are chosen
 
     @property
@@ -274,8 +275,8 @@ class Compared:
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
         """Return a schedule's success averaged over budgets of a cost, with a bootstrap interval.
 
-        Budgets go from the cost of never asking to that of always asking all; `cost` is one of
-        `COSTS`.
+        A budget is how much of the cost an episode may take on average, from the cost of never
+        asking to that of always asking all; `cost` is one of `COSTS`.
         """
         of_bound = [(play, play.rate) for play in self.oracle_front()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
@@ -331,8 +332,8 @@ class Compared:
     def random_like(self, play: Play) -> Floats:
         """Return the success of asking at random with as many messages as `play`, (S, E).
 
-        The axes are S channel seeds and E episodes. It is interpolated between the two nearest
-        random shares.
+        The axes are S channel seeds and E episodes. It is interpolated, 0 to 1, between the two
+        random schedules whose mean numbers of messages are next to that of `play`.
         """
         most = self.point.ask.max_helpers
         every = [play for play in self.plays[RANDOM] if play.candidate.most == most]
@@ -358,9 +359,16 @@ def compare(
 ) -> Compared:
     """Play every schedule on a run, and on a run on tune layouts if there is one.
 
-    Settings are tried as the tune run suggests, and chosen within `budget`, a share of the messages
-    that the paper's schedule takes. `success_rules` has how success of each run is averaged;
-    `progress` is called with 1 for each step and schedule.
+    Args:
+        stored: the run whose answers are used; schedules are reported on it.
+        tune: a run on layouts (start situations) for choosing settings, which suggests the settings
+            that are tried; None if there is none.
+        point: the operating point: everything else that a decision depends on.
+        names: names of the schedules.
+        seeds: the channel's seeds.
+        budget: share of the messages of the paper's schedule that a chosen setting may take.
+        success_rules: how success of each run is averaged over its episodes.
+        progress: called with 1 for each step and schedule.
 
     Raises:
         UserError: no schedule can change anything at the operating point.
@@ -394,8 +402,15 @@ def run_schedules(
 ) -> list[Compared]:
     """Compare schedules on runs, each with its run on tune layouts, or without any.
 
-    `names` are the schedules, `seeds` those of the channel, and `budget` the share of the paper's
-    messages within which settings are chosen.
+    Args:
+        runs: the runs whose answers are used.
+        tune: a run on tune layouts for each of `runs`, in their order; or none.
+        condition: the operating point, as it is typed, such as `6g:max_helpers=1`.
+        names: names of the schedules.
+        seeds: the channel's seeds.
+        budget: share of the messages of the paper's schedule that a chosen setting may take.
+        out: the folder to write.
+        progress: told how many steps there are, and called with 1 for each.
 
     Raises:
         UserError: as `compare` does, or the folder `out` has another comparison,
@@ -491,7 +506,11 @@ JOULES, IF_BALANCED = ("J", "area over joules, %"), ("balanced %",)
 def schedule_study(
     compared: Sequence[Compared], runs: Sequence[ReplayedRun], seeds: Sequence[int]
 ) -> Study:
-    """Return the study of compared schedules; `runs` are all runs that were played."""
+    """Return the study (tables, pictures and sentences) of schedules that were compared.
+
+    `compared` has an item for each model's run, `runs` are all runs that were played, those on tune
+    layouts included, and `seeds` the channel's seeds.
+    """
     first, data = compared[0], tables(compared)
     words = first.success_rule.words
     tuned = bool(first.tune)

@@ -13,7 +13,7 @@ from harness.dataset.select import NONE, Choice, Selection, drawn
 
 @dataclass(frozen=True)
 class Episodes(Selection):
-    """Selects the episodes that meet all conditions that are set; None sets no condition."""
+    """Select the episodes of a run that meet all conditions that are set; None sets none."""
 
     chosen_by: ClassVar[tuple[str, ...]] = ("only", "danger", "sample", "sample_seed")
 

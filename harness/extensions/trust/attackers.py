@@ -26,7 +26,11 @@ from harness.radio.fading import Trips
 
 
 class Attackers:
-    """Play the attackers of one condition; remember what helpers intended at past steps."""
+    """Play the attackers of one condition: helpers that send something else than they intend.
+
+    It remembers what helpers intended at past steps, which some attacks repeat. It is a `Speaker`,
+    the part of a condition that says what helpers send.
+    """
 
     def __init__(self, attacks: Sequence[Attack]) -> None:
         self._attacks = attacks
@@ -34,11 +38,16 @@ class Attackers:
         self._intended: dict[tuple[int, int], list[Floats]] = {}
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
-        """Return what every vehicle sends in n decisions, after the attacks; a `Speaker` method.
+        """Return what every vehicle sends in n decisions of one step, after the attacks.
 
-        `truth` has what they intend, `draws` the channel's random numbers, and `episode` and `seed`
-        (n,) say whose decision each is. Raises UserError if the world has no layouts, by which
-        attackers are drawn.
+        Args:
+            truth: what the vehicles truly intend, for n decisions.
+            draws: the channel's random numbers, for the same decisions.
+            episode: number of each decision's episode, `(n,)`.
+            seed: channel seed of each decision, `(n,)`.
+
+        Raises UserError if the world has no layouts (drawn start situations), by which attackers
+        are drawn.
         """
         episodes = list(zip(episode.tolist(), seed.tolist(), strict=True))
         if draws.trips is None:

@@ -37,12 +37,12 @@ Share = Annotated[
 class Turn:
     """Hold what an attack may use in one step: n decisions, each with H helpers and A actions.
 
-    That is who attacks, what every vehicle truly intends now, at the first step and K steps back,
-    and random draws.
+    A helper's intent is its probabilities of the ego's A actions; an attack says another one. K is
+    the number of past steps that the condition's attacks need.
     """
 
-    truth: Intents  # what every vehicle intends and knows
-    attackers: Bools  # who attacks, `(n, H)`
+    truth: Intents  # what every vehicle truly intends now, and where it is
+    attackers: Bools  # which helpers attack, `(n, H)`
     first: Floats  # each helper's intent at the episode's first step, `(n, H, A)`
     # what each helper intended one step ago, two, ..., `(n, K, H, A)`; NaN if there was no such
     # step
@@ -52,10 +52,11 @@ class Turn:
 
 @dataclass(frozen=True)
 class Attack:
-    """Describe an attack by some helpers: a base class of pure functions of arrays.
+    """Describe an attack: how some helpers, the attackers, change what they send to the ego.
 
-    A subclass overrides `act`, `rewritten` or `listed`, and sets the class variables that say what
-    it changes. `share` is the share of the helpers that attack.
+    This base class has pure functions of arrays that change nothing. A subclass overrides `act`
+    (probabilities and positions), `rewritten` (words) or `listed` (objects), and sets the class
+    variables that say what it changes.
     """
 
     # the share of the helpers present that attack, to the nearest whole number of helpers
@@ -92,7 +93,7 @@ class Attack:
         return 0
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
-        """Return what vehicles send and claim after this attack.
+        """Return what vehicles send and claim after this attack, for the n decisions of `turn`.
 
         `sent` is what they would send without it: the truth, as earlier attacks changed it. By
         default it is returned unchanged.
@@ -102,22 +103,27 @@ class Attack:
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return an attacker's message as a fusion prompt shows it, except for its intent.
 
-        It is used if `in_text`. By default free text is left out where the attack states a `risk`.
+        A fusion prompt shows the ego's model the helpers' messages. `message` has the message's
+        fields by name, such as `evidence` (free text), `risk` and `intent`; `actions` has the
+        names of the actions, the most careful first. It is used if `in_text`. By default free text
+        is left out where the attack states a `risk`.
         """
         return {**message, "evidence": "", "risk": self.risk} if self.risk else dict(message)
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
         """Return the scene graph whose objects an attacker's message lists; used if `in_objects`.
 
-        `graph` is what the attacker sees; `invented` is a car in the ego's way that does not exist,
-        in the attacker's frame.
+        `graph` is what the attacker knows of the scene: vehicles and other objects. `invented` is a
+        car in the ego's way that does not exist, as an object of such a graph, in the attacker's
+        frame.
         """
         return graph
 
     def intend(self, sent: Intents, turn: Turn, intents: Floats) -> Intents:
         """Return `sent` with the attackers' intents replaced by `intents` `(n, H, A)`.
 
-        The axes are n decisions, H helpers and A actions. A row with NaN changes nothing.
+        The axes are n decisions, H helpers and A actions; an intent is probabilities of actions. A
+        row with NaN changes nothing.
         """
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
         return replace(sent, helpers=np.where(lies, intents, sent.helpers))
@@ -133,8 +139,8 @@ class Attack:
         """Return `sent` with false positions of the attackers, in metres.
 
         `to_zone_m` (a number or `(n, H)`, for n decisions and H helpers) is the claimed distance to
-        the conflict zone, and `to_ego_m` `(n, H)` that to the ego; `claims` has the claimed
-        coordinates, or is None without.
+        the conflict zone, where paths meet, and `to_ego_m` `(n, H)` that to the ego; `claims` has
+        the claimed coordinates, or is None where nothing needs them.
         """
         ego_m, helpers_m = np.split(sent.distance_m, [1], axis=1)
         return replace(
@@ -149,7 +155,10 @@ class Attack:
 
 @dataclass(frozen=True)
 class Liar(Attack):
-    """Attack by stating the opposite of one's intent, from one's true position."""
+    """Attack by stating the opposite of one's intent, from one's true position.
+
+    An intent is a vehicle's probabilities of actions.
+    """
 
     # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution
     # with the largest probability where the smallest was, and so on
@@ -178,9 +187,9 @@ class Stuck(Attack):
 
 @dataclass(frozen=True)
 class Stale(Attack):
-    """Attack by stating the intent of some decisions ago as if it were new.
+    """Attack by stating the intent (probabilities of actions) of some decisions ago as if new.
 
-    In the first decisions it is the oldest intent that there is.
+    In an episode's first decisions it is the intent of the first.
     """
 
     decisions: Annotated[int, Meta(ge=1, le=16)] = 1  # how many decisions ago
@@ -196,9 +205,10 @@ class Stale(Attack):
 
 @dataclass(frozen=True)
 class Replay(Attack):
-    """Attack by stating as one's own what the next helper intended at the last step.
+    """Attack by stating as one's own the intent of another helper at the last step.
 
-    At the first step it states its own intent.
+    That is the next helper in their order, after the last one the first. At an episode's first step
+    it states its own intent.
     """
 
     @property
@@ -249,8 +259,9 @@ class Overconfident(Attack):
 class Spoof(Attack):
     """Attack by claiming a position on the ego's way, just before the conflict zone.
 
-    Eq. 2 weighs a helper by that position. Alone, the attack states the true intent; with `liar`,
-    it is the worst case for a rule with weights.
+    The paper's consensus rule (Eq. 2) gives helpers weight by their distance to that zone, where
+    paths meet. Alone, the attack states the true intent; with `liar`, it is the worst case for a
+    rule with weights.
     """
 
     # claimed distance to the centroid of the conflict zone, m
@@ -269,7 +280,7 @@ class Spoof(Attack):
 
 @dataclass(frozen=True)
 class Jump(Attack):
-    """Attack by claiming a position some way off, in a new random direction at each step."""
+    """Attack by claiming a position off the true one, in a new random direction at each step."""
 
     offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # distance from the true position, m
     needs: ClassVar[tuple[str, ...]] = ("claims",)
@@ -286,7 +297,10 @@ class Jump(Attack):
 
 @dataclass(frozen=True)
 class Silent(Attack):
-    """Attack by not replying if one's likeliest action is not the ego's; the slot stays empty."""
+    """Attack by not replying if one's likeliest action is not the ego's.
+
+    The slot of the channel in which the reply would be sent stays empty.
+    """
 
     by_scene: ClassVar[bool] = True
 
@@ -298,7 +312,10 @@ class Silent(Attack):
 
 @dataclass(frozen=True)
 class Absent(Attack):
-    """Remove the attackers: no attack, but the bound of a rule that knows who attacks."""
+    """Leave the attackers out, so that they send nothing: no attack, but a bound for others.
+
+    It is what a consensus rule could reach that knows who attacks.
+    """
 
     by_scene: ClassVar[bool] = True
 
@@ -326,7 +343,7 @@ class Sybil(Attack):
 
 @dataclass(frozen=True)
 class Flood(Sybil):
-    """Attack under several identities that send an empty message: a uniform intent.
+    """Attack under several identities that send an empty message: all actions equally probable.
 
     They take slots of the channel and displace other helpers.
     """
@@ -338,9 +355,9 @@ class Flood(Sybil):
 
 @dataclass(frozen=True)
 class Injection(Attack):
-    """Attack by prompt injection: write instructions to the reading model into the evidence.
+    """Attack by prompt injection: write instructions to the ego's model into a message's words.
 
-    The intent stays true.
+    The intent, the message's probabilities of actions, stays true.
     """
 
     language: str = "english"  # language of the instructions, a key of `INSTRUCTIONS`
@@ -368,9 +385,9 @@ class _OfObjects(Attack):
 
 @dataclass(frozen=True)
 class Ghost(_OfObjects):
-    """Attack by listing a car that does not exist and that the ego would meet.
+    """Attack by listing, among the objects that one sees, a car that does not exist.
 
-    See `harness.world.perception.shared.invented`.
+    The ego would meet it; see `harness.world.perception.shared.invented`.
     """
 
     adds: ClassVar[bool] = True
@@ -451,8 +468,9 @@ def attacks_of(text: str) -> tuple[Attack, ...]:
 def in_question(text: str, words: bool, objects: bool) -> str:
     """Return those attacks of a text that change a fusion prompt, joined by `&`, without shares.
 
-    These change the helpers' words, if the prompt shows `words`, or their lists of objects, if it
-    shows `objects`. They are in the order in which they act. The result is part of an answer's key.
+    A fusion prompt shows the ego's model the helpers' messages. The attacks change their words, if
+    the prompt shows `words`, or their lists of objects, if it shows `objects`. They are in the
+    order in which they act. The result is part of the key by which an answer is stored.
     """
     named = sorted(
         (part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds
@@ -492,10 +510,10 @@ def _decimal(text: str) -> str:
 
 
 def attackers(share: float, present: Bools, draws: Floats) -> Bools:
-    """Draw which helpers attack, `(n, H)`: those with the smallest draws among the present ones.
+    """Draw which of H helpers attack in n decisions, `(n, H)`: those with the smallest draws.
 
     Args:
-        share: the share of the present helpers that attack; their number is rounded.
+        share: the share, 0 to 1, of the present helpers that attack; their number is rounded.
         present: which of H helpers are present in n decisions, `(n, H)`.
         draws: draws in [0, 1), `(n, H)`.
     """
@@ -507,8 +525,8 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
 def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:
     """Return `sent` with `voices` - 1 more identities (voices) of each of the `talkers`, `(n, H)`.
 
-    `talkers` is a mask of H helpers in n decisions. The voices follow all helpers, 2 m apart;
-    `voice_of` says which helper each voice belongs to.
+    `talkers` is a mask of H helpers in n decisions. The voices follow all helpers and claim places
+    2 m apart; `voice_of` of the result has the index of the helper behind each voice.
     """
     n, helpers = talkers.shape
     places = np.argsort(~talkers, axis=-1, kind="stable")[

@@ -16,7 +16,11 @@ if TYPE_CHECKING:
 
 
 class Schema:
-    """Remove free text from helpers' messages: the defence `schema` of a fusion call."""
+    """Remove free text from helpers' messages: the defence `schema` of a fusion call.
+
+    In a fusion call the ego's model reads the messages, so that words in them could give it orders.
+    It is a `Change` of messages.
+    """
 
     adds = False
 
@@ -39,9 +43,12 @@ MESSAGES: dict[str, Change] = {"quoted": Quoted(), "schema": Schema()}
 
 @dataclass(frozen=True)
 class AttackersMessage:
-    """Change an attacker's message in a fusion prompt as its attacks do."""
+    """Change an attacker's message in a fusion prompt, where the ego's model reads it.
 
-    attacks: Sequence[Attack]
+    It is a `Change` of messages.
+    """
+
+    attacks: Sequence[Attack]  # the attacks on what it says, in the order in which they act
 
     @property
     def adds(self) -> bool:

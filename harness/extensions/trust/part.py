@@ -57,7 +57,11 @@ def _defences_on(holds: frozenset[str]) -> list[str]:
 
 
 class Guard(Part, frozen=True, kw_only=True):
-    """Hold a condition's settings of attacks by helpers and of defences of a fusion call."""
+    """Hold a condition's settings `attack` and `defence`.
+
+    Attacks are by helpers that lie or fail. Defences are of a fusion call, in which the ego's model
+    reads the helpers' messages.
+    """
 
     behind: ClassVar[str] = "fallback"
     named: ClassVar = {"attack": lambda: ATTACKS}
@@ -149,5 +153,8 @@ class Guard(Part, frozen=True, kw_only=True):
 
 
 def setting_of(attacks: str) -> str:
-    """Return the setting of a condition under attacks, such as `attack=liar:share=1/3`."""
+    """Return the setting of a condition under attacks, such as `attack=liar:share=1/3`.
+
+    `attacks` names them: `liar:share=1/3+spoof`.
+    """
     return f"attack={attacks}"

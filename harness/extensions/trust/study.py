@@ -56,30 +56,32 @@ LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, 
 class Cell:
     """Hold the result of one consensus rule under one attack: S channel seeds, E episodes.
 
-    Success, unsafe ends, and the negative log-likelihood of safe actions, in nats, are (S, E);
-    `flagged` (4, E) counts messages of attackers that the rule suspected and did not, then of
-    honest helpers. It is None if the rule judges no helper.
+    A consensus rule makes the ego's policy, its probabilities of actions, of its own intent and of
+    the messages that it heard. Some rules also judge helpers: whom they trust little they suspect.
     """
 
     rule: str  # the consensus rule, such as `linear:weight_cap=0.3`
     attack: str  # without its share; empty where nobody attacks
     share: float  # share of the helpers that attack, 0 to 1
     success: Floats  # which episodes succeed, 1 or 0, (S, E)
-    unsafe: Floats  # which episodes end unsafely, (S, E)
-    # mean -ln of the probability that the policy gives to safe actions, over decisions with one;
-    # NaN without
-    nats: Floats  # (S, E)
-    # messages heard, by episode: attackers' that were suspected, and not; honest ones that were,
-    # and not
-    flagged: Floats | None  # (4, E); None of a rule that judges nobody
+    unsafe: Floats  # which episodes end unsafely, 1 or 0, (S, E)
+    # mean -ln of the probability that the policy gives to safe actions, over decisions with one,
+    # (S, E); NaN without
+    nats: Floats
+    # number of messages heard in each episode, (4, E): attackers' that the rule suspected, and
+    # others of attackers; honest helpers' that it suspected, and others of theirs. None of a rule
+    # that judges nobody
+    flagged: Floats | None
     # messages until an attacker was suspected, by attacker, episode and seed; 0: never
     first: Sequence[int]
 
     def detection(self) -> dict[str, Estimate]:
-        """Return `precision`, `recall`, `f1` and `false_alarms` of messages that the rule suspects.
+        """Return how well a rule tells attackers' messages from honest ones, as shares by name.
 
-        The last is the share of honest messages that it suspects. Intervals resample episodes. The
-        dict is empty if the rule judges no helper.
+        `precision` is the share of suspected messages that are attackers', `recall` the share of
+        attackers' messages that are suspected, `f1` the harmonic mean of both, and `false_alarms`
+        the share of honest messages that are suspected. Intervals resample episodes. The dict is
+        empty if the rule judges no helper.
         """
         if self.flagged is None:
             return {}
@@ -125,9 +127,10 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
 
 
 def names_of(option: str, text: str, allowed: Sequence[str]) -> tuple[str, ...]:
-    """Return the names in a list such as `liar,brake`; none for `all`.
+    """Return the names in the value of a command-line option, such as `liar,brake`; none for `all`.
 
-    Raises UserError for a name that is not among the `allowed`.
+    `option` is the option's name, for messages. Raises UserError for a name that is not among the
+    `allowed`.
     """
     if text == "all":
         return ()
@@ -141,7 +144,7 @@ def names_of(option: str, text: str, allowed: Sequence[str]) -> tuple[str, ...]:
 
 
 def shares_of(text: str) -> tuple[float, ...]:
-    """Return the shares above 0 of a list such as `0,1/3,2/3`; 0 is always played.
+    """Return the shares of attackers above 0 in a list such as `0,1/3,2/3`; 0 is always played.
 
     Raises UserError if it has no share above 0, or one that is not from 0 to 1.
     """
@@ -159,7 +162,11 @@ def shares_of(text: str) -> tuple[float, ...]:
 
 
 def cell_of(key: Key, result: WalkResult) -> Cell:
-    """Return a cell from the decisions that were played under `key`: rule, attack and share."""
+    """Return the cell of the decisions that were played under `key`.
+
+    `key` is the consensus rule, the attack and the share of attackers; `result` has the decisions
+    and how their episodes ended.
+    """
     success = result.ends[SUCCESS]
     nats = mean_by_place(result.columns["nats"], result.places, success.size).reshape(success.shape)
     nats[np.isnan(success)] = np.nan  # left out
@@ -201,8 +208,8 @@ def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
 class Bench:
     """Hold a study of trust: a cell for every consensus rule, attack and share of attackers.
 
-    `cells` has them by these three. `alone` (S, E) is the success of an ego that never asks, by S
-    channel seeds and E episodes; `success_rule` says how success is averaged.
+    The linear pool, the weighted mean of intents, is the paper's rule, with which others are
+    compared. The axes are S channel seeds and E episodes.
     """
 
     name: str  # name of the run that is played again
@@ -210,7 +217,7 @@ class Bench:
     condition: str  # the operating point that is attacked
     seeds: tuple[int, ...]  # of the channel
     cells: Mapping[Key, Cell]  # by rule, attack and share
-    alone: Floats  # success of an ego that never asks, (S, E)
+    alone: Floats  # success of an ego that never asks, 1 or 0, (S, E)
     success_rule: Success  # how success of every cell is averaged, such as balanced by danger
     caveats: tuple[str, ...] = ()  # what the run lacks
     # why no rule fuses here, where the only one is the linear pool in name
@@ -236,7 +243,10 @@ class Bench:
         return self.cells[rule, attack, share]
 
     def success(self, *key: Any) -> Estimate:
-        """Return the headline success of a cell, averaged over episodes; `key` is as of `at`."""
+        """Return the success of a cell, averaged over episodes by `success_rule`.
+
+        `key` has the arguments of `at`: rule, attack and share.
+        """
         return self.success_rule.estimate(self.at(*key).success)
 
     def price(self, rule: str) -> Estimate:
@@ -275,11 +285,11 @@ class Bench:
         return (self.holm.get(key) or 1.0) <= LEVEL
 
     def worst(self, rule: str, share: float) -> str:
-        """Return the attack under which a rule succeeds least, at a share of attackers."""
+        """Return the attack, by name, under which a rule succeeds least at a share of attackers."""
         return min(self.attacks, key=lambda attack: self.success(rule, attack, share).value)
 
     def mean(self, rule: str, share: float) -> Estimate:
-        """Return a rule's headline success as a mean over all attacks, at a share of attackers."""
+        """Return a rule's success as a mean over all attacks, at a share of attackers, 0 to 1."""
         return self.success_rule.estimate(self.over_attacks(rule, share))
 
     def over_attacks(self, rule: str, share: float) -> Floats:
@@ -303,9 +313,16 @@ def run_bench(
 ) -> Bench:
     """Play every rule under every attack and share on a run's stored answers.
 
-    Cells that the folder `out` has already are read. Without rules or attacks the usual ones are
-    played, as far as the condition allows them; the linear pool is always among the rules. Attacks
-    have no shares of their own; `shares` are above 0, and `seeds` those of the channel.
+    Args:
+        run: the run whose answers are used; its model is asked for those that it lacks.
+        condition: the operating point that is attacked, as it is typed.
+        rules: consensus rules, such as `linear:weight_cap=0.3`. The linear pool is always among
+            them; without any, the usual ones are played, as far as the condition allows them.
+        attacks: attacks without shares, such as `liar+spoof`; without any, the usual ones.
+        shares: shares of the helpers that attack, above 0 to 1; nobody is always played as well.
+        seeds: the channel's seeds.
+        out: the study's folder; cells that it has already are read.
+        progress: told how much there is to do, and called with what is done.
 
     Raises:
         UserError: the condition has no channel, or asks nobody, or its rule is a fusion call,

@@ -72,7 +72,10 @@ OF_RUNS = {  # in the place of those above, for what a run's folder holds
 
 
 def app(folder: Path, token: str) -> ASGIApp:
-    """Return the web application for one folder of runs; requests need the token."""
+    """Return the web application that `harness view` serves for one folder of runs.
+
+    Requests need the secret `token`, in the address or in a cookie.
+    """
     view = View(folder)
     routes = {
         "/": view.index,

@@ -13,7 +13,8 @@ from harness.report.runs import Runs
 def with_decision(page: str, runs: Runs, scene: str) -> str:
     """Return the HTML page of some runs with all details of one decision point put in.
 
-    The details are prompts, answers and pictures, which the page itself has for few points.
+    `page` is the HTML, and `scene` the point's id. The details are prompts, answers and pictures,
+    which the page itself has for few points. Raises UserError if no run has the point.
     """
     detail = library.packed({scene: everything(runs, scene)})
     return page.replace(

@@ -19,7 +19,9 @@ MAYBE = (NOTES, DIFFICULTY)  # what it may have besides
 def own_file(root: Path, run: str, name: str) -> Path | None:
     """Return the real path of a file in a listed run's folder, with links resolved.
 
-    It is None if there is no such regular file, or if it lies outside `root` or in a hidden folder.
+    `root` is the folder of all runs, `run` the run's name in the list, and `name` the file's path
+    in the run's folder. It is None if there is no such regular file, or if it lies outside `root`
+    or in a hidden folder.
     """
     base = os.path.realpath(root)
     file = Path(os.path.realpath(os.path.join(base, run, name)))
@@ -34,7 +36,9 @@ def own_file(root: Path, run: str, name: str) -> Path | None:
 
 
 def whole(root: Path, run: str) -> Path:
-    """Return the folder of a listed run, all of whose files may be read.
+    """Return the folder of a listed run, after a check that all of its files may be read.
+
+    `root` is the folder of all runs, and `run` the run's name in the list.
 
     Raises:
         UserError: a file is missing, is no regular file, or is a link that leads out of the folder.
@@ -49,7 +53,10 @@ def whole(root: Path, run: str) -> Path:
 
 
 def pictures(root: Path, run: str) -> list[str]:
-    """Return the file names of a listed study's pictures; of one in two formats only the SVG."""
+    """Return the file names of a listed study's pictures; of one in two formats only the SVG.
+
+    `root` is the folder of all runs, and `run` the study's name in the list.
+    """
     names = sorted(os.listdir(root / run))
     scaled = {Path(name).stem for name in names if name.endswith(".svg")}
     return [

@@ -23,19 +23,21 @@ from harness.runs.records import Score
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one run in a history: its name, its start, and its value of the metric."""
+    """Hold one run in a history: a list of runs on the same scenes, with one metric, by date."""
 
     name: str  # its folder, relative to the folder of all runs
-    date: datetime  # when it began
-    run: Run  # as it was read
-    score: Score | None  # its value in the group's condition; None where it has none
+    date: datetime  # when it began, UTC
+    run: Run  # the run as it was read
+    # its value of the metric in the group's condition (operating point); None where it has none
+    score: Score | None
 
 
 @dataclass(frozen=True)
 class Group:
     """Hold the runs of the same scenes, by date, and the metric and condition of their values.
 
-    `of` names the scenes, for people; `lines` has the runs, the oldest first.
+    A condition is an operating point by its name: everything that a decision depends on besides
+    scene and model, such as the radio.
     """
 
     of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
@@ -119,7 +121,10 @@ def _group(lines: Sequence[Line], metric: str | None, condition: str | None) -> 
 
 
 def write(groups: Sequence[Group], out: Path) -> None:
-    """Write a history as an HTML page. Raises UserError if `out` cannot be written."""
+    """Write a history, as `history` returns it, to `out` as an HTML page.
+
+    Raises UserError if the file cannot be written.
+    """
     place, labels = beside(out), dict.fromkeys(entry(group.metric).label for group in groups)
     about = (
         "Runs by date, the oldest first, with 95 % intervals; n is the number of episodes or "

@@ -16,9 +16,9 @@ MOST, LONGEST = 1000, 4000  # notes of a run, and characters of one
 
 
 class Note(msgspec.Struct, frozen=True, kw_only=True):
-    """Hold a user's note on a decision point, which has one at most."""
+    """Hold a user's note on a decision point, one situation of a run in which the ego decided."""
 
-    scene: str  # id of the decision point
+    scene: str  # id of the decision point, which has one note at most
     text: str  # what the user wrote
     date: str  # when it was written, UTC, ISO 8601
 

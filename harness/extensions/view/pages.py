@@ -40,9 +40,10 @@ COLUMNS = ("name", "kind", "model", "prompt", "success", "date")
 
 
 def report(folders: Sequence[Path], written: Path | None = None, scene: str | None = None) -> str:
-    """Return the HTML report of one or several runs: the file `written`, or a new one.
+    """Return the HTML report of the runs in these folders: the content of `written`, or a new one.
 
-    With `scene`, it has all details of that decision point.
+    `written` is a report that lies in the run's folder; None makes a new one. `scene` is the id of
+    a decision point, all details of which are put in; None for none.
     """
     runs = gather(folders)
     page = render(runs) if written is None else whole_text(written)
@@ -52,7 +53,7 @@ def report(folders: Sequence[Path], written: Path | None = None, scene: str | No
 def with_way_back(page: str, links: Sequence[tuple[str, str]] = (), home: str = "/") -> str:
     """Return a run's HTML page with links put in at its top: to the list, and others.
 
-    Each of `links` is a text and an address.
+    `page` is the HTML, each of `links` a text and an address, and `home` the address of the list.
     """
     more = "".join(Markup(' · <a href="{}">{}</a>').format(href, text) for text, href in links)
     way_back = WAY_BACK.replace('"/"', f'"{home}"').replace("</p>", f"{more}</p>")
@@ -65,12 +66,15 @@ def whole_text(page: Path) -> str:
 
 
 def compared(folder: Path, a: Path, b: Path) -> str:
-    """Return the HTML page that compares run B with run A, both in `folder`."""
+    """Return the HTML page that compares run B with run A.
+
+    `a` and `b` are their folders, and `folder` the one of all runs, in which they lie.
+    """
     return comparison.render(compare(pair(a, b)), (), LISTED_OF_EACH, partial(_place, folder))
 
 
 def around(a: str, b: str) -> list[tuple[str, str]]:
-    """Return the links of a comparison's page, each a text and an address.
+    """Return the links of the page that compares runs named `a` and `b`: texts and addresses.
 
     They lead to the comparison with A and B swapped, and to all answers of both.
     """
@@ -83,7 +87,10 @@ def around(a: str, b: str) -> list[tuple[str, str]]:
 
 
 def suite_of(folder: Path, name: str) -> SuiteRun:
-    """Read a listed suite. Raises UserError if a file of it may not be read."""
+    """Read a suite, one model's runs on several scenarios, by its name in the list of `folder`.
+
+    Raises UserError if a file of it is missing, or may not be read since it lies elsewhere.
+    """
     for family in contents_of(folder / name).families.values():
         whole(folder, f"{name}/{family}")
     if own_file(folder, name, SUMMARY) is None:
@@ -92,7 +99,7 @@ def suite_of(folder: Path, name: str) -> SuiteRun:
 
 
 def suite(folder: Path, name: str) -> str:
-    """Return the HTML page of a listed suite of runs."""
+    """Return the HTML page of a suite of runs, by its name in the list of `folder`."""
     done = suite_of(folder, name)
     return suites.render([(done, suites.lines(done))], partial(_place, folder))
 
@@ -102,10 +109,11 @@ def _place(folder: Path, run: Run) -> str:
 
 
 def listed(folder: Path, words: str, order: str) -> str:
-    """Return the HTML list of the runs that contain all of these words, sorted by a column.
+    """Return the HTML list of the runs in `folder` that match, sorted by a column.
 
-    `-` before the column's name reverses the order. While a run goes on, the page has a script,
-    allowed by its digest.
+    `words` are separated by spaces; a run matches if its name, kind, state, model, prompt, answer
+    mode, condition and tags contain each of them. `order` is one of `COLUMNS`, with `-` before it
+    for the reverse order. While a run goes on, the page has a script, allowed by its digest.
     """
     every = runs(folder)
     how_far = extents(folder, every)
@@ -131,12 +139,14 @@ def listed(folder: Path, words: str, order: str) -> str:
 
 
 def extents(folder: Path, every: Sequence[Listed]) -> dict[str, Extent]:
-    """Return how far each unfinished run is, by the run's name."""
+    """Return how far each unfinished run is, by its name; `every` are all runs in `folder`."""
     return {run.name: extent(folder / run.name) for run in every if run.state == "unfinished"}
 
 
 def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any]:
     """Return what changes in the list while runs go on.
+
+    `every` are all runs listed, and `how_far` is what `extents` returned.
 
     Returns:
         `listed`, a digest that changes once a run begins or ends; `going`, whether one goes on;
@@ -164,7 +174,10 @@ def progress(run: Listed, extent: Extent) -> str:
 
 
 def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
-    """Return listed runs sorted by a column; those without a value are last."""
+    """Return listed runs sorted by a column; those without a value are last.
+
+    `order` is the column's name, with `-` before it for the reverse order.
+    """
     column = attrgetter(order.removeprefix("-"))
     with_value = [run for run in runs if column(run) is not None]
     unknown = [run for run in runs if column(run) is None]
@@ -172,7 +185,10 @@ def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
 
 
 def study(run: Listed, pictures: Sequence[str]) -> str:
-    """Return an HTML page of a study's pictures, for a study without a page of its own."""
+    """Return an HTML page of a study's pictures, for a study without a page of its own.
+
+    `run` is the study in the list, and `pictures` has the file names in its folder.
+    """
     return _page("study.html.j2", run=run, pictures=pictures)
 
 
@@ -187,7 +203,11 @@ def style() -> str:
 
 
 def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
-    """Return a link, as text and address, to a run's notes, or to that on a decision point."""
+    """Return a link, as text and address, to the notes on a run.
+
+    `run` is its name in the list. `scene` is the id of the decision point whose note is to be
+    written; None for none.
+    """
     where = {"path": run}
     if scene is not None:
         where["scene"] = scene
@@ -195,16 +215,33 @@ def to_notes(run: str, scene: str | None = None) -> tuple[str, str]:
 
 
 def notes(path: Path, name: str, scene: str) -> str:
-    """Return the HTML page of a run's notes, with a form for the note on `scene`."""
+    """Return the HTML page of what users noted on a run's decisions, with a form for one note.
+
+    Args:
+        path: the run's folder, which holds the notes.
+        name: the run's name in the list, which the page shows.
+        scene: id of the decision point that the form is for, filled in with its note if it has one;
+            empty for an empty form, into which the user types the id.
+
+    Raises UserError if the file of notes is broken.
+    """
     every = run_notes.notes(path)
     here = run_notes.note_on(every, scene)
     return _page("notes.html.j2", run=name, notes=every, here=here, longest=run_notes.LONGEST)
 
 
 def note(path: Path, scene: str, text: str, before: str) -> None:
-    """Write a note on a decision point of a run, in place of the one with the date `before`.
+    """Write the note `text` on a decision of a run, as the form of `notes` sends it.
 
-    Raises UserError if the run has no such point, or if the note there has another date.
+    Args:
+        path: the run's folder.
+        scene: id of the decision point.
+        text: the note; empty to delete it.
+        before: the date of the note that is replaced, as the form showed it; empty if there was
+            none.
+
+    Raises UserError if the run has no such point, if the note there has another date by now, or as
+    `harness.extensions.view.notes.write` does.
     """
     if scene not in read_run(path).decisions.labels("scene"):
         raise UserError(

@@ -26,24 +26,26 @@ SYSTEM = re.compile(r"(\{%-?\s*block\s+system\s*-?%\})(.*?)(\{%-?\s*endblock\b)"
 class Candidate:
     """Hold one wording of a prompt that a search tries.
 
-    It has the wording as a prompt version, its difference from the original in words, and, by role,
-    system texts that a model rewrote.
+    A prompt version is a folder of templates, one for each role: the ego that decides, a helper
+    that is asked, and so on. The search begins with one, the base.
     """
 
     prompt: Prompt  # the wording as a prompt version, under the name of the one searched
     what: str  # how it differs from the base, in a line
-    rewritten: Mapping[str, str] = field(default_factory=dict)  # texts of blocks `system`, by role
+    # system texts that a model rewrote, by role: each replaces the template's block `system`
+    rewritten: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
-        """Return the sha256 of the prompt's files, by which candidates are told apart."""
+        """Return the hex SHA-256 of the prompt's files, by which candidates are told apart."""
         return self.prompt.sha256
 
 
 def space(prompt: Prompt) -> dict[str, int]:
-    """Return how many alternative wordings a prompt's author marked at each choice, by its name.
+    """Return how many alternative wordings a prompt has at each choice, by the choice's name.
 
-    Raises UserError if a mark is malformed.
+    A choice is a place in the prompt's files at which the author marked several wordings, or the
+    sets of examples if there are several. Raises UserError if a mark is malformed.
     """
     try:
         marks = counts(prompt.texts.values())
@@ -53,7 +55,7 @@ def space(prompt: Prompt) -> dict[str, int]:
 
 
 def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
-    """Return a prompt with one alternative of each choice, as a candidate.
+    """Return a prompt with one alternative wording of each choice (see `space`), as a candidate.
 
     `choice` has the number of the alternative, from 0, by the choice's name; others take the first.
     Raises UserError if the prompt's files are wrong.
@@ -72,9 +74,9 @@ def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
 
 
 def systems(base: Prompt) -> dict[str, str]:
-    """Return the text of the Jinja block `system` of each role's template, by role.
+    """Return the system message of each role's template (its Jinja block `system`), by role.
 
-    Marked choices have their first alternatives.
+    Where the author marked several wordings, it has the first.
     """
     texts = {}
     for role in ROLES:
@@ -85,9 +87,10 @@ def systems(base: Prompt) -> dict[str, str]:
 
 
 def rewritten(base: Prompt, texts: Mapping[str, str]) -> Candidate:
-    """Return a prompt whose Jinja block `system` is replaced by `texts`, by role.
+    """Return a prompt with other system messages, as a candidate.
 
-    Raises UserError if the prompt's files are wrong.
+    `texts` has, by role, what replaces the Jinja block `system` of the role's template. Raises
+    UserError if the prompt's files are wrong.
     """
     first, system_texts = chosen(base), systems(base)
     files = dict(first.prompt.files)

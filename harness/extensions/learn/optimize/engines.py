@@ -43,10 +43,10 @@ form of the answer alone, which is asked for elsewhere. Write only the template,
 def alternatives(tuning: Tuning) -> None:
     """Search the alternatives that a prompt's author marked, by coordinate descent.
 
-    Each alternative of each choice is played with the best of the others, first on half of the
-    layouts, and on the rest if it is not worse there. The search ends when a round over all choices
-    changes nothing, or raises Spent when the budget of questions is spent. `tuning` keeps all
-    results.
+    Each alternative wording of each choice (a marked place) is played with the best of the other
+    choices, first on half of the layouts (start situations), and on the rest if it is not worse
+    there. The search ends when a round over all choices changes nothing, or raises Spent when the
+    budget of questions is spent. `tuning` plays, and keeps all results.
     """
     base = tuning.base
     sizes = space(base)
@@ -163,8 +163,9 @@ class _Adapter:
         self._still, self._spent = 0, -1
 
     def over(self, state: Any) -> bool:
-        """Return whether the search is to end:
-        the budget is spent, something failed, or nothing is new.
+        """Return whether the search is to end: it is spent or has failed, or asks nothing new.
+
+        `state` is the `GEPAState` of the package gepa, and is not read.
         """
         self._still = self._still + 1 if self._tuning.spent == self._spent else 0
         self._spent = self._tuning.spent

@@ -24,7 +24,8 @@ from harness.world.scenario import Scenario
 def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) -> None:
     """Raise UserError unless `count` layout seeds from `first` on are all for the purpose `wanted`.
 
-    `option` and `name` name the dataset in the message.
+    A layout seed draws a start situation; its number says what it is for, such as `tune`. `option`
+    and `name` name the dataset in the message.
     """
     if purposes(first, count) != [wanted]:
         raise UserError(
@@ -37,9 +38,10 @@ def only_for(wanted: Purpose, option: str, name: str, first: int, count: int) ->
 def given(names: Sequence[str], reported: Sequence[Manifest]) -> list[FrozenSource]:
     """Return the user's datasets of tune layouts, one for each dataset of report layouts.
 
-    A search chooses on tune layouts and is measured on report layouts. Raises UserError unless both
-    are of the same scenarios in the same order, share no layout, and hold the layouts of their
-    seeds.
+    A search chooses on tune layouts (start situations) and is measured on report layouts. `names`
+    are the datasets to read, and `reported` the manifests of those of report layouts. Raises
+    UserError unless both are of the same scenarios in the same order, share no layout, and hold the
+    layouts that their seeds draw.
     """
     if len(names) != len(reported):
         raise UserError(
@@ -74,7 +76,8 @@ def built(
 ) -> list[FrozenSource]:
     """Return a dataset of tune layouts for each scenario, built in the folder `place` if missing.
 
-    Each has `layouts` layouts, with seeds from `first_seed` on.
+    Each has `layouts` layouts (start situations), with seeds from `first_seed` on. `progress` is
+    told how many there are, and called with the number just built.
     """
     from harness.dataset.build import build
 

@@ -43,18 +43,18 @@ OLD, NEW = "base", "winner"  # the folders of the two runs on report layouts
 class Search:
     """Describe a search for a better wording of a prompt.
 
-    Wordings are compared by evaluations on tune layouts (`tune`), within a budget of questions; the
-    winner is measured once on report layouts, the test set (`report`), and written as a new
-    version.
+    Wordings are compared by evaluations on tune layouts, start situations for choosing, within a
+    budget of questions to the model; the winner is measured once on report layouts, the test set,
+    and written as a new version.
     """
 
     base: Prompt  # the prompt version whose wording is searched
-    # evaluations of the base on tune layouts, one a family, each of one condition
+    # evaluations of the base on tune layouts, one a scenario, each of one condition
     tune: Sequence[Spec]
     # return the same on report layouts; called after the search, if it has a winner
     report: Callable[[], Sequence[Spec]]
-    budget: int  # most questions on tune layouts
-    version: str  # name of the version that is made
+    budget: int  # most questions that may be asked on tune layouts
+    version: str  # name of the prompt version that is made
     prompts: Path  # the folder of versions that it is written to
     engine: str  # name of the engine, and of what it uses
     command: str  # the words that repeat it

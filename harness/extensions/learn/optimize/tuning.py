@@ -42,23 +42,23 @@ class Spent(Exception):
 class Decision(NamedTuple):
     """Hold one decision of an episode: its scene, the messages heard, the policy and the action.
 
-    `policy` is the distribution over A actions after fusion, (A,); `action` is the index of the one
-    taken, and `raw` the ego's own answer.
+    Fusion makes the ego's policy of its own answer and of the messages that it heard.
     """
 
-    dataset: Dataset  # the layouts that were played, with their trees
-    scene: Scene
-    policy: Floats  # the distribution after fusion, (A,)
+    # the layouts (start situations) that were played, with their trees: every course that actions
+    # can lead to
+    dataset: Dataset
+    scene: Scene  # the situation in which the ego decided
+    policy: Floats  # the probabilities of the scenario's A actions after fusion, (A,)
     action: int  # index of the action taken
     heard: tuple[Answer, ...]  # the answers of the helpers whose messages came in time
-    raw: str  # the ego's own answer
+    raw: str  # the text of the ego's own answer
 
 
 class Played(NamedTuple):
-    """Hold the result of a candidate on one layout: success and worth, and the decisions.
+    """Hold the result of a candidate wording on one layout, a start situation of a scenario.
 
-    Success is a share over channel seeds. Worth is the mean probability of success under the stated
-    policies if all later actions are drawn evenly. The decisions are those under the first seed.
+    It is one episode under each channel seed, by which messages are lost or delayed.
     """
 
     success: float  # share of successful episodes over the channel seeds
@@ -74,16 +74,20 @@ class Played(NamedTuple):
 
 @dataclass
 class Record:
-    """Hold all results of one candidate so far, by layout index, and the questions charged."""
+    """Hold all results of one candidate wording so far, and the questions that it asked."""
 
-    candidate: Candidate
-    length: int  # characters of the ego's prompt, in the first decision point of each family
-    played: dict[int, Played] = field(default_factory=dict)  # by the layout's number
+    candidate: Candidate  # the wording
+    # characters of the ego's prompt, in the first decision point of each scenario, in sum
+    length: int
+    # the results by the layout's index in `Tuning.layouts`
+    played: dict[int, Played] = field(default_factory=dict)
     asked: set[Hashable] = field(default_factory=set)  # the questions charged to it so far
 
 
 class Tuning:
-    """Score candidates on tune layouts, and stop when the budget of questions is spent.
+    """Score candidate wordings on tune layouts, and stop when the budget of questions is spent.
+
+    Tune layouts are start situations of scenarios on which settings may be chosen.
 
     Attributes:
         specs: the evaluations of the base on tune layouts, one a scenario; each has one condition.
@@ -114,7 +118,7 @@ class Tuning:
 
     @cached_property
     def layouts(self) -> list[tuple[int, int]]:
-        """Return the scenario's index and the episode number of each layout.
+        """Return all tune layouts as pairs: the index in `specs` and the episode's number.
 
         Other methods number layouts by their index in this list.
         """
@@ -244,7 +248,8 @@ class Tuning:
     def take(self, record: Record, questions: Iterable[Hashable]) -> None:
         """Charge those of these questions that the candidate has not asked before to the budget.
 
-        Raises Spent, and charges none, if the budget has too few left.
+        `record` has the candidate's, and a question is a key by which equal ones are one. Raises
+        Spent, and charges none, if the budget has too few left.
         """
         new = set(questions) - record.asked
         if self.spent + len(new) > self.budget:

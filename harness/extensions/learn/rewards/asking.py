@@ -18,7 +18,10 @@ ANY = "any"  # the viewer is drawn among all
 
 
 def read_by(asking: Asking, role: str) -> dict[str, Any]:
-    """Return how answers of a role (`ego`, `helper`) are parsed: arguments of `intent`."""
+    """Return how answers of a role (`ego`, `helper`) are parsed: keyword arguments of `intent`.
+
+    `asking` has the prompt and the answer mode.
+    """
     shape = asking.prompt.shape(role, asking.scenario.actions)
     return {
         "answer": asking.answer,
@@ -41,11 +44,18 @@ def viewer_of(scene: Scene, viewer: str | None, draw: float) -> str:
 def rows(
     data: Dataset, values: Values, constant: int, asking: Asking, viewer: str | None, at: Ints
 ) -> Iterator[dict[str, Any]]:
-    """Yield a dataset row, for a trainer of text models, for each decision point in `at`, (n,).
+    """Yield a training row, for a trainer of text models, for each decision point in `at`, (n,).
 
-    `at` has indices into the forest's decision points, repeats allowed. A row has `prompt` (chat
-    messages), and the columns that `advantage` needs: `values` (A,), `constant` (an action's
-    index), and how the answer is parsed.
+    A row has `prompt` (chat messages), and the columns that `advantage` needs: `values`, the
+    probability of success after each of A actions, (A,), `constant`, and how the answer is parsed.
+
+    Args:
+        data: the dataset with the decision points' scenes.
+        values: what each action is worth at each decision point.
+        constant: index of the action that is always taken, beside which answers are judged.
+        asking: the prompt and the answer mode.
+        viewer: who is asked, as `viewer_of` takes it.
+        at: indices of decision points in the dataset's decision trees, repeats allowed, (n,).
     """
     forest = data.forest
     names = list(dict.fromkeys(forest.ids[n] for n in at.tolist()))
@@ -79,10 +89,10 @@ def intent(
     extension: str = "",
     reasons_first: bool = False,
 ) -> tuple[float, ...] | None:
-    """Return the distribution over A actions, (A,), that an answer states; None for none.
+    """Return the distribution over A actions, (A,), that an answer's text states.
 
-    There is none if the text cannot be parsed. `answer` is the answer mode; the other arguments are
-    as `read_by` returns them.
+    It is None if the text cannot be parsed. `answer` is the answer mode, such as `json`; the other
+    arguments are as `read_by` returns them.
     """
     if answer == "readout":
         letter = readout.spelt(text)[:1]

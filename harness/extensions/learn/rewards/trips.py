@@ -153,9 +153,9 @@ class Trees:
 class TreeTrip:
     """Walk through the tree of one layout: an episode that `Trees` began."""
 
-    of: Trees
-    at: int  # index of the present decision point in the forest
-    success: bool | None = None
+    of: Trees  # where the layout's tree is
+    at: int  # index of the present decision point in the dataset's decision trees
+    success: bool | None = None  # whether the episode succeeded; None while it is under way
 
     @property
     def scene(self) -> Scene:
@@ -178,8 +178,8 @@ class TreeTrip:
 class Roads:
     """Take the environment's episodes from the simulator, so that no tree is built."""
 
-    scenario: Scenario
-    seeds: Sequence[int]
+    scenario: Scenario  # what is driven
+    seeds: Sequence[int]  # the layout seeds, which draw start situations
     # reference driver who decides after the action whose worth is asked; None: values are NaN
     then: str | None = None
 
@@ -198,18 +198,21 @@ class Roads:
 
 @dataclass
 class RoadTrip:
-    """Drive one layout in the simulator: an episode that `Roads` began."""
+    """Drive one layout, a start situation, in the simulator: an episode that `Roads` began."""
 
-    of: Roads
-    world: World
-    success: bool | None = None
+    of: Roads  # what is driven
+    world: World  # the simulated world, at the present decision point
+    success: bool | None = None  # whether the episode succeeded; None while it is under way
 
     def __post_init__(self) -> None:
         self._look()
 
     @cached_property
     def reference(self) -> Outcome:
-        """Return how the full-view driver ends here: its time says when the ego is too late."""
+        """Return how a rule driver that sees everything ends on this layout.
+
+        The time that it takes says from when on the ego is too late.
+        """
         return drive(self.of.scenario, PRIVILEGED, self.world.seed)
 
     def _look(self) -> None:

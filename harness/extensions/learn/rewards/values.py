@@ -43,10 +43,11 @@ class Values:
 
     @classmethod
     def of(cls, forest: Forest, then: str = BEST) -> "Values":
-        """Compute the worth of every action at every decision point of a forest of decision trees.
+        """Compute the worth of every action at every decision point of a forest.
 
-        `then` decides after the action: `best`, `uniform` or a reference driver. Raises UserError
-        if it is none of these.
+        A forest has a dataset's decision trees: every course that actions can lead to. `then`
+        decides after the action: `best`, `uniform` or a reference driver. Raises UserError if it is
+        none of these.
         """
         if then == BEST:
             table = forest.safe.astype(float)

@@ -33,15 +33,14 @@ FACTS = "training.json"  # written last
 class Curriculum:
     """Describe what a model is trained from: scenarios, prompts, layouts, and initial weights.
 
-    `layouts` is the number of layouts of each scenario, `seed` the layout seed of the first. `base`
-    is the model that it begins as; None begins with random weights.
+    A layout is a start situation of a scenario, drawn from a seed.
     """
 
     prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
     layouts: int  # number of layouts of each scenario
     seed: int  # layout seed of the first; the others follow
-    # folder of a model of texts that was distilled here, which it begins as, or the card of a
-    # published one; None begins with random weights
+    # folder of a model of texts that was distilled here, which it begins as, or the card (the
+    # description in a file) of a published one; None begins with random weights
     base: Path | Card | None = None
 
     def __post_init__(self) -> None:
@@ -167,7 +166,7 @@ def _described(
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
     """Return the README.md of a model trained from random weights: data, losses and limits.
 
-    `facts` is what `distill` returns.
+    `name` is the model's, and `facts` is what `distill` returns.
     """
     plan, base = facts["plan"], facts["base_sha256"]
     begins = f"from the weights with sha256 `{base}`" if base else "from random weights"

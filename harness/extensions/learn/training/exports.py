@@ -32,7 +32,13 @@ LEAST = Option(
 
 
 class Lessons:
-    """Export a run's chats with the answers that the decision trees show to be right (`--sft`)."""
+    """Export chats to fine-tune a language model on, made of a run: the format `--sft`.
+
+    Each question that the run asked becomes one line of JSON: the chat messages, and the answer
+    that the model should have given. It follows from the scene's decision tree, which has every
+    course that actions can lead to from there, and how each ends. It is an `Export` of
+    `harness run export`.
+    """
 
     help = (
         "Write chats to fine-tune on as JSON Lines; their answers are those that the decision "
@@ -51,9 +57,12 @@ class Lessons:
 
 
 class Preferences:
-    """Export pairs of answers to a run's chats (`--dpo`).
+    """Export pairs of answers, a better and a worse one, to a run's chats: the format `--dpo`.
 
-    The tree's answer is the chosen one, and the model's own, where it is worse, the rejected one.
+    Each line of JSON is a question whose answer by the model was worse than the one that follows
+    from the scene's decision tree (see `Lessons`): the chat messages, the tree's answer as the
+    chosen one, and the model's as the rejected one. `--margin` says by how much it must be worse:
+    an answer is worth the probability that it gives to actions after which success is possible.
     """
 
     help = (

@@ -48,9 +48,9 @@ PRIOR = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}
 
 
 class Point(msgspec.Struct, frozen=True):
-    """Hold one decision point to learn from: a scene, and its soft label.
+    """Hold one decision point to learn from: a scene, and what a model should answer there.
 
-    The label (A,) has the probabilities that a model should give to the A actions.
+    That is a soft label: the probabilities that it should give to the scenario's actions.
     """
 
     record: Record  # the scene: its state, and every viewer's scene graph
@@ -59,15 +59,17 @@ class Point(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Lessons:
-    """Hold the scenes of one scenario that a model learns from, and their soft labels by scene id.
+    """Hold the scenes of one scenario that a model learns from, and what it should answer there.
 
-    If `balanced`, layouts with a danger and those without weigh alike in training.
+    Scenes are decision points of layouts, drawn start situations of the scenario.
     """
 
     scenario: Scenario  # whose actions and words the prompts have
     prompts: tuple[Prompt, ...]  # versions that are learnt
     scenes: tuple[Scene, ...]  # decision points, layout by layout
-    labels: Mapping[str, Floats]  # soft label of each, (A,), by its id
+    # soft label of each, (A,), by its id: the probabilities that the model should give to the
+    # scenario's A actions
+    labels: Mapping[str, Floats]
     # whether layouts with a danger and those without weigh alike, as in balanced success
     balanced: bool = False
 
@@ -80,8 +82,8 @@ class Lessons:
     def weights(self) -> Mapping[str, float]:
         """Return the training weight of each scene, by scene id.
 
-        All scenes of one step of one layout share a weight of 1. If `balanced`, layouts with a
-        danger and those without have the same total.
+        All scenes of one step of one layout (start situation) share a weight of 1. If `balanced`,
+        layouts with a danger and those without have the same total.
         """
         levels = [(scene.record.episode, scene.record.step) for scene in self.scenes]
         points = Counter(levels)
@@ -113,7 +115,7 @@ def draw(
     workers: Workers,
     progress: Callable[[int], None],
 ) -> Lessons:
-    """Draw the decision points of `layouts` layouts, and return them as lessons.
+    """Draw decision points of `layouts` layouts (start situations), and return them as lessons.
 
     Each layout is a file in the folder `place`, and only missing ones are drawn, so that a killed
     call resumes. Layout number n has layout seed `seed + n`; `progress` is called with the number

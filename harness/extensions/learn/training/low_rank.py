@@ -42,6 +42,7 @@ class LowRank(torch.nn.Module):  # type: ignore[misc]
 def widen(model: Any, rank: int, seed: int) -> None:
     """Replace every linear layer of a model's blocks by a `LowRank` around it, and freeze all else.
 
+    `model` is a transformers model, which is changed in place, `rank` the rank of each update, and
     `seed` draws the initial matrices.
     """
     model.requires_grad_(False)

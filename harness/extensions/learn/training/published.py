@@ -32,17 +32,17 @@ _TELLING = 1e-3  # largest difference of logits that is rounding
 
 @dataclass(frozen=True)
 class Adapt:
-    """Describe how a published model is fine-tuned: its LoRA rank (None: all weights) and rate.
+    """Describe how a published model is fine-tuned: which weights, how fast, and for what.
 
-    `rate` is the learning rate, `dtype` the number format in which layers compute, and `report` the
-    weight of the loss of the words behind an answer's letter.
+    The model learns to answer with a letter for an action, followed by a report in words.
     """
 
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
     rate: float  # learning rate of AdamW
     # in which its layers compute; weights are float32
     dtype: Literal["float32", "bfloat16"] = "float32"
-    # weight of the loss of the words that follow an answer's letter, beside the letter's KL
+    # weight of the loss of the words that follow an answer's letter, beside the letter's loss, the
+    # KL divergence of its probabilities from the ones to be learnt
     report: float = 0.3
 
 
@@ -74,10 +74,10 @@ class Published:
             trunk.forward = torch.autocast(torch.device(device).type, torch.bfloat16)(trunk.forward)
 
     def read(self, messages: Sequence[Mapping[str, str]]) -> tuple[NDArray[np.int32], int, str]:
-        """Return a chat's token ids, how many of them it shares with similar chats, and a key.
+        """Return a chat's token ids, (tokens,), how many of them it shares, and with which chats.
 
-        Chats with equal keys share their first tokens, all messages but the last, which are
-        computed once.
+        The second says how many of the first tokens, those of all messages but the last, are equal
+        in all chats with the same key, the third; they are computed once.
         """
         ids = self.encode(self.chat.render(messages, thinking=False))
         kind = "\n".join(message["content"] for message in messages[:-1])
@@ -127,7 +127,10 @@ class Published:
 
 
 def base_name(card: Card) -> str:
-    """Return how `--model` names a card's model: its card file, a path or a hub id."""
+    """Return how `--model` names the model that a card, a file of its facts, describes.
+
+    That is the card's file, a path, or the model's id on the hub.
+    """
     named = argument(card)
     return named.partition(":")[0] if named == card.name else named
 
@@ -143,7 +146,7 @@ def _digest(card: Card, where: Path) -> str:
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
     """Return the README.md of a fine-tuned published model as Markdown: base, data and losses.
 
-    `facts` is what `distill` returns.
+    `name` is the new model's, and `facts` is what `distill` returns.
     """
     plan, adapt = facts["plan"], facts["plan"]["adapt"]
     loss_rows = []

@@ -27,16 +27,15 @@ ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 class Question:
     """Hold one prompt for one viewer of a scene, and the answer (soft label) that it should get.
 
-    `label` (A,) has the probabilities that a model should give to the A actions; `image` is None
-    for a prompt without a picture, and `excerpt` unless the prompt shows a part of the scene graph
-    alone.
+    A viewer is the vehicle that is asked: the ego, or a helper.
     """
 
-    key: str  # scenario, scene, viewer and prompt version, and `+m` where messages are in it
-    scenario: Scenario  # what is decided in
-    prompt: Prompt  # which version
+    # scenario, scene, viewer and prompt version, and `+m` where helpers' messages are in it
+    key: str
+    scenario: Scenario  # the scene's
+    prompt: Prompt  # the prompt version that asks
     graph: SceneGraph  # what the viewer knows of the scene
-    messages: tuple[Mapping[str, str], ...]  # chat messages
+    messages: tuple[Mapping[str, str], ...]  # the chat: each message's role and content
     label: Floats  # soft label, (A,): probabilities of the scenario's A meta-actions
     weight: float  # training weight, relative to that of other questions
     image: Sight | None = None  # what the viewer's cameras see, if the prompt shows it
@@ -64,7 +63,10 @@ class Question:
 
 
 def alone(lessons: Lessons) -> Iterator[Question]:
-    """Yield a question without helpers' messages for every scene, viewer and prompt version."""
+    """Yield a question without helpers' messages for every scene, viewer and prompt version.
+
+    `lessons` has the scenes; viewers are the ego and its helpers.
+    """
     for scene in lessons.scenes:
         for viewer in scene.viewers:
             for prompt in lessons.prompts:
@@ -74,7 +76,8 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
     """Yield shorter copies of questions, in whose scene graph only the conflicts are left.
 
-    Questions with neither conflicts nor a picture are left out.
+    A conflict is a vehicle whose path meets the ego's, with both arrival times. Questions with
+    neither conflicts nor a picture are left out.
     """
     for q in questions:
         if q.graph.conflicts or q.image:
@@ -113,9 +116,10 @@ def question(
     prompt: Prompt,
     heard: Sequence[Mapping[str, Any]] = (),
 ) -> Question:
-    """Return the question to one viewer of a scene, for a prompt version.
+    """Return the question to one viewer (a vehicle's id) of a scene, for a prompt version.
 
-    `heard` has the helpers' messages that the prompt shows, each as a dict with its `sender`.
+    `lessons` has the scene's soft label. `heard` has the helpers' messages that the prompt shows,
+    each as a dict with its `sender`.
     """
     graph, scenario = scene.graphs[viewer], lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)

@@ -97,7 +97,7 @@ class Student:
             self.taught = {_place(q): intent for q, intent in zip(texts, read, strict=True)}
 
     def reading(self, questions: Sequence[Question], seen: bool = False) -> list[Sample]:
-        """Return samples of questions whose answer is one letter, followed by a report in words.
+        """Return training samples of questions, answered by a letter and a report in words.
 
         The letter is drawn from the target: the soft label. If a base model with text prompts is
         there, a picture's target is that model's read-out of the same scene in words, which has
@@ -114,9 +114,9 @@ class Student:
         return samples
 
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
-        """Return samples of questions, answered by JSON that states these intents.
+        """Return training samples of questions, answered by JSON that states these intents.
 
-        An intent is a distribution over A actions, (A,).
+        There is one intent for each question: a distribution over A actions, (A,).
         """
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         samples = []

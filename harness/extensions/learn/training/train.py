@@ -52,16 +52,15 @@ KEEP_S = 60.0  # a killed run loses at most so much
 class Sample:
     """Hold one training sequence: token ids of a prompt and its answer, and the answer's target.
 
-    The target (A,) is a distribution over the letters of A actions; None where the answer is free
-    text. The first `shared` tokens are equal in all samples of a `kind`.
+    The target is what the model should answer: probabilities of the letters of A actions.
     """
 
-    ids: NDArray[np.int32]  # token ids, the shared beginning included
+    ids: NDArray[np.int32]  # token ids, (tokens,), the shared beginning included
     shared: int  # number of tokens of the shared beginning, equal in all samples of a `kind`
     kind: str  # key of that beginning
     answer_at: int  # index in `ids` at which the answer starts
-    # what the read-out there should be, (A,), of one length in a `kind`; None where the answer is a
-    # text from its first token
+    # what the read-out there, the probabilities of the actions' letters, should be, (A,), of one
+    # length in a `kind`; None where the answer is a text from its first token
     target: Floats | None
     weight: float = 1.0  # sampling weight, relative to that of other samples
     # the picture behind the system message, whose tokens are among `ids`; all of a `kind` have one,
@@ -71,11 +70,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Plan:
-    """Describe a training: its length, batch size, learning rates, seed and objective.
-
-    `samples` is the number of sequences by stage, `batch` that of a step. `adapt` says how a
-    published model is changed; None for a model of our own.
-    """
+    """Describe a training: its length, batch size, learning rates, seed and objective."""
 
     samples: dict[str, int]  # sequences per stage, by name
     batch: int = 16  # sequences a step
@@ -109,12 +104,12 @@ def run_stage(
     checkpoint: Path,
     watch: Callable[[], Sequence[float]] = tuple,
 ) -> Curve:
-    """Train on `count` sequences drawn from `samples`, and return the loss curve.
+    """Train `model`, a transformers model, on `count` of `samples`, and return the loss curve.
 
-    `letters` and `digits` are the ids of the tokens that state an action and an image token's
-    class. `checkpoint` is the file of this stage, from which a killed call resumes. Every 50
-    steps the curve gets the sequences seen, the mean loss since then, and what `watch` returns;
-    `progress` is called with them.
+    Samples are drawn by their weights and the seed of `plan`. `letters` and `digits` are the ids of
+    the tokens that state an action and an image token's class. `checkpoint` is the file of this
+    stage, from which a killed call resumes. Every 50 steps the curve gets the sequences seen, the
+    mean loss since then, and what `watch` returns; `progress` is called with them.
     """
     device = next(model.parameters()).device
     opts, rates = _optimizers(model, plan)
@@ -186,7 +181,7 @@ def _optimizers(model: Any, plan: Plan) -> tuple[list[Any], list[float]]:
 
 
 def learnt(model: Any) -> dict[str, Any]:
-    """Return the trainable part of a model's state dict."""
+    """Return the trainable part of a PyTorch model's state: its tensors by name."""
     # an output embedding may be the input's as well
     every = model.named_parameters(remove_duplicate=False)
     frozen = {name for name, p in every if not p.requires_grad}
@@ -194,7 +189,7 @@ def learnt(model: Any) -> dict[str, Any]:
 
 
 def restore(model: Any, state: Mapping[str, Any]) -> None:
-    """Load a trainable state, as `learnt` returns it, into a model."""
+    """Load a trainable state, as `learnt` returns it, into a PyTorch model."""
     model.load_state_dict({**model.state_dict(), **state})
 
 
@@ -223,9 +218,11 @@ def _batches(samples: Sequence[Sample], count: int, plan: Plan) -> NDArray[np.in
 
 
 def hidden_states(model: Any, batch: Sequence[Sample]) -> Any:
-    """Return the last hidden states behind a batch's shared tokens: (n, longest rest, hidden).
+    """Return the last hidden states behind a batch's shared tokens, (n, longest rest, hidden).
 
-    The samples are of one `kind`. States at padding mean nothing.
+    That is a tensor for n samples, the tokens of the longest one behind the shared ones, and the
+    features of a hidden state. `model` is a transformers model, and the samples are of one `kind`.
+    States at padding mean nothing.
     """
     from transformers import DynamicCache
 
@@ -258,7 +255,7 @@ def _pictures(model: Any, batch: Sequence[Sample], ids: Any) -> dict[str, Any]:
 
 
 def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan: Plan) -> Any:
-    """Return the training loss of a batch, a scalar tensor.
+    """Return the training loss of a batch of samples of one `kind`, a scalar tensor.
 
     It is the loss of the read-out beside its target (`fitting`), plus mean cross-entropies of
     prompt text, answer text and image tokens. `letters` and `digits` are tensors of token ids, as

@@ -67,9 +67,9 @@ class Cell:
     An agent is a model with a prompt version and an answer mode.
     """
 
-    ego: Agent
-    helper: Agent
-    run: Run
+    ego: Agent  # who answers for the ego
+    helper: Agent  # who answers for each helper
+    run: Run  # their finished run
 
     def level(self, half: str, field: str) -> str:
         """Return the cell's level of a factor, such as the model's name.
@@ -92,7 +92,10 @@ class Cell:
         return {**values, "tokens": of_episodes.reshape(run.grid.shape)}
 
     def estimate(self, metric: str, condition: str) -> Estimate:
-        """Return a metric's mean under a condition, with its interval over episodes."""
+        """Return a metric's mean under a condition, with its interval over episodes.
+
+        `metric` is its name as in `values`, and `condition` the operating point's.
+        """
         return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
 
 
@@ -172,6 +175,7 @@ def run_cells(
 ) -> "Grid":
     """Run every combination of ego and helper agents, each in a folder of its own under `out`.
 
+    `spec` has their common settings; an agent is a model with a prompt version and an answer mode.
     Finished runs there are read. All combinations share answers, and completions are kept between
     calls in the cache file, if there is one.
 
@@ -336,7 +340,10 @@ MOST_EFFECTS = 8  # that a terminal shows
 
 
 def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
-    """Return the study of a grid whose runs lie under `out`; all share the evaluation `spec`."""
+    """Return the study (tables, pictures, sentences) of a grid of ego and helper agents.
+
+    The runs lie in folders under `out`, and all share the settings of the evaluation `spec`.
+    """
     data, episodes = tables(grid), grid.cells[0].run.grid.episodes
     factors = "; ".join(f"{factor.name} ({', '.join(factor.levels)})" for factor in grid.factors)
     last = grid.conditions[-1]

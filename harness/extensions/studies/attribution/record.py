@@ -17,9 +17,8 @@ FILE = "attribution.json"
 class LeftOut(Struct, frozen=True, kw_only=True):
     """Hold what changed when one object or message was left out of a prompt or of the fusion.
 
-    `item` is what was left out, `role` of whose prompt or of the fusion; `action` is the likeliest
-    action with it. `change` is that of this action's probability, `shift` the total variation
-    distance of both answers; None if the answer without the item failed.
+    An object is a vehicle or the like that a prompt lists; the fusion makes the ego's policy of its
+    own answer and of helpers' messages. Answers and policies are probabilities of actions.
     """
 
     scene: str  # id of the decision point
@@ -33,8 +32,10 @@ class LeftOut(Struct, frozen=True, kw_only=True):
     kind: str  # one of `harness.extensions.studies.attribution.study.KINDS`
     action: str  # the likeliest action with the item
     instead: str | None  # the likeliest action without it; None if that answer failed
-    change: float | None  # change of the probability of `action`; None if that answer failed
-    shift: float | None  # total variation between both distributions; None if that answer failed
+    # the probability of `action` without the item less that with it; None if that answer failed
+    change: float | None
+    # total variation distance of both distributions, 0 to 1; None if that answer failed
+    shift: float | None
 
 
 class Attribution(Struct, frozen=True, kw_only=True):

@@ -51,13 +51,13 @@ KINDS = (
 class Row:
     """Hold how much one kind of object or message moves answers, over all that were left out.
 
-    `shift` is the mean total variation distance, `flips` the share of answers whose likeliest
-    action changed, and `failed` the share that could not be parsed without the item.
+    Answers are probabilities of actions; each was compared with that to a prompt, or of a fusion,
+    without the item.
     """
 
     role: str  # whose prompt it was left out of, `ego` or `helper`; or `fusion`, for messages
     kind: str  # kind of object or message, such as `hidden conflict vehicle`
-    shift: Estimate  # mean total variation distance of the answers with and without it
+    shift: Estimate  # mean total variation distance, 0 to 1, of the answers with and without it
     flips: Estimate  # share of answers whose likeliest action changed
     failed: Estimate  # share of answers that failed without it; the other two leave these out
 
@@ -65,8 +65,9 @@ class Row:
 def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> Attribution:
     """Measure what each listed object and each message heard changes, by leaving it out.
 
-    At most `sample` of the condition's decision points are drawn, by `seed`. Questions that the run
-    has no answer for are put to its model.
+    `stored` is the run, and `condition` the name of one of its operating points. At most `sample`
+    of its decision points, situations in which the ego decided, are drawn, by `seed`. Questions
+    that the run has no answer for are put to its model.
 
     Raises:
         UserError: the run has no such condition,
@@ -318,7 +319,10 @@ def headline(table: Sequence[Row]) -> str:
 
 
 def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
-    """Return the study of an attribution, for the terminal and `--json`."""
+    """Return the study of an attribution, for the terminal and `--json`.
+
+    `result` has what moved the answers, and `run` is the run whose answers they are.
+    """
     table, cells, plain_rows = rows(result), list[Sequence[str]](), list[dict[str, Any]]()
     for row in table:
         shift, flips = figure(row.shift, SHIFT), figure(row.flips)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     """Draw closed-loop over frozen success, a point a model and condition, with 95 % intervals.
 
+    Closed loop means driven in the simulator, frozen means decided on recorded scenes.
+
     Args:
         table: `Fidelity.table`, a row a point.
         models: names of the models, in the order of the rows.

@@ -39,8 +39,8 @@ SHOWN = 20  # ways to disagree that the page lists
 class Fidelity:
     """Hold the comparison of success on frozen scenes with success in closed loop.
 
-    `table` has a row for each model, prompt, answer mode and condition, `episodes` one for each
-    episode; `rank` is Spearman's correlation of both successes over `ranked` distinct rows.
+    On frozen scenes, models decide at recorded points; in closed loop they drive in the simulator.
+    A condition is an operating point by its name.
     """
 
     # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen

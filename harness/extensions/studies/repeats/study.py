@@ -76,23 +76,19 @@ def run_repeats(
 
 
 class Wavering(NamedTuple):
-    """Hold a decision point at which repeats take different actions.
+    """Hold a decision point at which repeats, runs that differ by chance alone, act differently."""
 
-    `flips` is the share of pairs of repeats that differ, and `actions` counts how often each action
-    was taken.
-    """
-
-    scene: str
-    condition: str
-    flips: float
-    actions: dict[str, int]
+    scene: str  # id of the decision point
+    condition: str  # name of the operating point
+    flips: float  # share of pairs of repeats that take different actions there, 0 to 1
+    actions: dict[str, int]  # how often each action was taken
 
 
 @dataclass(frozen=True)
 class Repeats:
     """Hold two or more runs that differ only in the random sampling of the model's answers."""
 
-    path: Path  # the folder that theirs lie in
+    path: Path  # the folder in which the runs' folders lie
     runs: tuple[Run, ...]  # two or more
 
     def __post_init__(self) -> None:
@@ -244,7 +240,7 @@ def stable(counts: Ints) -> Floats:
 def all_of(wins: Floats, k: int, j: int) -> Floats:
     """Return pass^j: the probability that j of k repeats, drawn without replacement, all succeed.
 
-    `wins` is the number of successes among the k repeats; the result has its shape.
+    `wins` is the number of successes among the k repeats, `(...)`; the result has its shape.
     """
     return np.asarray(_choose(wins, j) / math.comb(k, j))
 
@@ -252,7 +248,8 @@ def all_of(wins: Floats, k: int, j: int) -> Floats:
 def any_of(wins: Floats, k: int, j: int) -> Floats:
     """Return any@j: the probability that one or more of j of k repeats succeed.
 
-    It is the unbiased estimate of pass@k (Chen et al. 2021). `wins` is the number of successes.
+    It is the unbiased estimate of pass@k (Chen et al. 2021). `wins` is the number of successes
+    among the k repeats, `(...)`; the result has its shape.
     """
     return 1 - all_of(k - wins, k, j)
 

@@ -44,8 +44,9 @@ LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
 class Twin:
     """Describe one change of a question, and how the answers to both versions must agree.
 
-    A twin changes the scene graph, the text, the picture or the messages, by the function that is
-    not None. The answers must have the same action, or be `within` a total variation distance.
+    A twin changes the scene graph (what the asked vehicle knows of the scene), the text, the
+    picture or the messages, by the functions that are not None. Both answers, distributions over
+    actions, must have the same likeliest action, or be `within` a total variation distance.
     """
 
     name: str  # how commands call it

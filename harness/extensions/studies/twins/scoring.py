@@ -20,9 +20,8 @@ ROUNDING = 1e-9
 class Pair:
     """Hold the answers to a question and to its twin, the same question put another way.
 
-    `p` and `q` (A,) are their distributions over A actions, None if an answer failed. `distance` is
-    the total variation between them, and `holds` says whether they have the same likeliest action,
-    or are as near as the twin demands.
+    An answer is a distribution over A actions, (A,). The twin says how both must be related: the
+    same likeliest action, or a total variation distance of at most so much.
     """
 
     twin: str  # name of the twin
@@ -34,7 +33,7 @@ class Pair:
     p: tuple[float, ...] | None
     # the same of the twin's answer, with its actions named as the question names them
     q: tuple[float, ...] | None
-    distance: float | None  # total variation between both; None where one failed
+    distance: float | None  # total variation distance of both, 0 to 1; None where one failed
     holds: bool  # whether both answers agree as the twin demands; false where one failed
     said: tuple[str, str]  # raw text of both answers
     status: tuple[str, str]  # parsing status of both answers
@@ -45,15 +44,16 @@ class Pair:
 class Row:
     """Hold the result of one twin in one role (who was asked), over all its pairs of answers.
 
-    `invariance_rate` is the share of pairs whose answers are related as the twin demands, `broken`
-    has the other pairs, and `failed_rate` is the share in which an answer failed.
+    A twin is a question put another way. A pair holds if its two answers are related as the twin
+    demands.
     """
 
     twin: Twin  # how the questions were changed
     role: str  # `ego`, `helper`, or `fusion`
     episodes: int  # how many episodes the pairs are of
     invariance_rate: Estimate  # share of pairs that hold; n is the pairs
-    tv_distance: Estimate  # mean total variation; n is the pairs whose two answers were parsed
+    # mean total variation distance, 0 to 1; n is the pairs whose two answers were parsed
+    tv_distance: Estimate
     failed_rate: Estimate  # share of pairs in which an answer failed
     # pairs that do not hold, the farthest apart first, those that failed last
     broken: tuple[Pair, ...]
@@ -129,7 +129,9 @@ def headline(table: Sequence[Row]) -> str:
 
 
 def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
-    """Test a gate (`--fail-if`) on the rows of the twin that it names, or on all rows.
+    """Test a gate, a condition typed with `--fail-if`, on the rows of the twin that it names.
+
+    If it names none, all rows of `table` are tested.
 
     Raises:
         UserError: the named twin has no row, or the number that is tested is unknown.
