@@ -62,9 +62,10 @@ def read_config(folder: Path, subject: str) -> dict[str, Any]:
 
 
 def find_adapter(card: Card) -> Path | None:
-    """Return the folder of a card's LoRA adapter, absolute or beside the cards; else None.
+    """Return the folder of the LoRA adapter that a model card names; None if it names none.
 
-    Raises UserError if the card names a folder that is no adapter.
+    The path is absolute, or else relative to the folder of the cards. Raises UserError if the
+    folder is no adapter.
     """
     if card.adapter is None:
         return None
@@ -99,10 +100,11 @@ def foreign(subject: str, file: Path, reason: str) -> UserError:
 
 
 def merge(card: Card, model: Any) -> None:
-    """Add a card's LoRA adapter to a transformers model's weights: W + alpha / r * B A in float32.
+    """Add the LoRA adapter that a model card names to weights: W + alpha / r * B A, in float32.
 
-    Nothing is done if the card names no adapter. Raises UserError if the adapter is of another
-    model, or its file is not whole.
+    `model` is a loaded model of the package transformers, which is changed in place; A, B, alpha
+    and r are the adapter's matrices, scale and rank. Nothing is done if the card names no adapter.
+    Raises UserError if the adapter is of another model, or its file is not whole.
     """
     if (folder := find_adapter(card)) is None:
         return

@@ -38,7 +38,19 @@ AGAIN = "#2"  # suffix of the id of a repair turn's request
 
 @dataclass(frozen=True)
 class Request:
-    """Hold one question to a model: its chat messages, and how the answer is to be given."""
+    """Hold one question to a model: its chat messages, and how the answer is to be given.
+
+    It is what the program asks of a vehicle in one scene, once the prompt is rendered: the ego, or
+    a helper, as `role` says, about the ego's next action among `actions`. `answer` is the answer
+    mode: `json`, in which the model writes freely; `constrained`, in which it fills in a fixed
+    text; `readout`, in which it is asked for one letter an action; `decision`, in which it gives
+    each option of `question` a probability. `form`, `extension` and `placeholders` are those of the
+    answer's `Shape`; `orders` and `flips` are the chats of a read-out with the actions in other
+    orders. `sums` says what is done where probabilities do not sum to 1; `sample` is the answer's
+    number among several to one question. `agent` is the index of the model that is asked, 0 the
+    ego's. `view` and `truth` are what the vehicle sees and what there is, for rules, which read no
+    messages.
+    """
 
     id: str  # unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`
     role: Role  # which prompt of the version was rendered, and which schema the answer has
@@ -85,19 +97,22 @@ class Request:
 
     @property
     def shape(self) -> Shape:
-        """The form of JSON that its answer must have: a bare distribution if it is `bare`."""
+        """Return the form of its answer's JSON: a bare distribution if it is `bare`."""
         if self.bare:
             return Shape("ego", self.actions, "distribution")
         return Shape(self.role, self.actions, self.form, self.extension, self.placeholders)
 
     @property
     def bare(self) -> bool:
-        """Whether its answer is a distribution and no text: a read-out, or of a typed question."""
+        """Return whether its answer is probabilities alone, without text of the model.
+
+        It is so in the answer modes `readout` and `decision`.
+        """
         return self.answer in BARE
 
     @property
     def divides(self) -> bool:
-        """Whether the answer's probabilities are divided by their sum, whatever it is."""
+        """Return whether the answer's probabilities are divided by their sum, whatever it is."""
         return self.answer == "constrained" or self.sums == "divide"
 
     def alike(self, **changes: Any) -> "Request":
@@ -114,7 +129,10 @@ class Request:
 def by_scenario(
     requests: Sequence[Request], answer: Callable[[Sequence[Request]], Sequence[T]]
 ) -> list[T]:
-    """Return the answers to requests, in order; `answer` gets all of one scenario at a time."""
+    """Return the answers to requests, in order; `answer` is called once for each scenario.
+
+    It gets all requests whose scene is of that scenario, and returns their answers in order.
+    """
     places: dict[int, list[int]] = {}
     for n, request in enumerate(requests):
         places.setdefault(id(request.scenario), []).append(n)
@@ -126,7 +144,17 @@ def by_scenario(
 
 @dataclass(frozen=True)
 class Completion:
-    """Hold a model's answer to one request as text, with its token counts and times."""
+    """Hold a model's answer to one request as text, with its token counts and times.
+
+    The text is as the model wrote it: whether it is a valid answer, the parser decides later.
+    `finish_reason` says why it ends: `stop`, `length` (the token limit), `refusal`, or `error`,
+    with the message in `error`. `seconds` is the time of an answer that was asked alone, None if
+    not measured; `first_token_s` is that to its first token, `token_s` that of each further one.
+    `slow_s` are seconds that a rule declares to take longer. `label_mass` is the letters' total
+    probability in a read-out; `letter_share` and `follows_letter` say how far that goes by the
+    letter and not the action, and `flipped` whether it changes with the list reversed. None is
+    unknown, or does not apply.
+    """
 
     request_id: str
     # the model's text, unchanged but for lone surrogates, which are legal JSON and which no file
@@ -170,7 +198,10 @@ class Completion:
 
 
 def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:
-    """Return a completion that states an error in place of an answer."""
+    """Return the completion of a request that got no answer: its text is empty, `error` says why.
+
+    `prompt_tokens` is the number of tokens that were read, None if unknown.
+    """
     return Completion(request.id, "", prompt_tokens, None, "error", None, 1, error)
 
 
@@ -229,7 +260,7 @@ def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, A
 
 
 class Rendering(Backend, Protocol):
-    """A backend of a language model that can show the prompts as its model reads them."""
+    """Describe a backend of a language model that can show prompts as its model reads them."""
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
         """Return each request's prompt as text after the chat template.
@@ -261,23 +292,31 @@ def forget(backend: Backend) -> None:
 
 @dataclass(frozen=True)
 class Served:
-    """Hold which server answered a request, and which model the server says it runs, or None."""
+    """Hold which server answered one request, where a model is behind one or several servers.
 
-    id: str
-    server: str
-    model: str | None = None
+    `id` is the request's, `server` the base URL of the server, and `model` the model that the
+    server names in its reply, None if it names none.
+    """
+
+    id: str  # of the request (`Request.id`)
+    server: str  # the server's base URL
+    model: str | None = None  # the model that its reply names; None if it names none
 
 
 def served(backend: Backend) -> list[Served]:
-    """Return which server gave each answer since the last call; none without servers."""
+    """Return which server gave each answer since the last call of this function.
+
+    It is empty for a model in this process, which has no servers.
+    """
     taken: Callable[[], list[Served]] | None = getattr(backend, "served", None)
     return taken() if taken else []
 
 
 def doubt(backend: Backend) -> str | None:
-    """Return a line on why cached answers may come from other weights; None if they cannot.
+    """Return a sentence on why cached answers may come from other weights; None if they cannot.
 
-    A server's identity may not tell which weights it has.
+    A cached answer is one that the same model gave in an earlier run; a server's identity may not
+    tell which weights it has.
     """
     return getattr(backend, "doubt", None)
 
@@ -288,6 +327,6 @@ def several(backend: Backend) -> Sequence[str]:
 
 
 class Timed(Backend, Protocol):
-    """A backend of stored answers, whose times are known and are not measured again."""
+    """Describe a backend of stored answers, whose times are known and are not measured again."""
 
     def latency(self) -> "Latency": ...

@@ -96,9 +96,10 @@ def key(
 ) -> str:
     """Return the hex digest under which a completion is cached; it reveals no prompt, no secret.
 
-    It covers all that decides an answer: the backend's identity, the rendered prompt, the request,
-    and `batch_size` for quantised and 16-bit weights, where other requests in a batch move an
-    answer by rounding. For float32 weights that is None.
+    It covers all that decides an answer: `identity`, as `Backend.identity` returns it; `prompt`,
+    the text that the model reads; the request; and `batch_size`, the number of requests that are
+    computed together. That counts for quantised and 16-bit weights, where other requests in a batch
+    move an answer by rounding; for float32 weights it is None.
     """
     request_fields = {
         f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY
@@ -109,9 +110,10 @@ def key(
 
 
 class CompletionFile:
-    """A SQLite file of completions by key; opened for every call, so it may be deleted.
+    """Store completions in a SQLite file, by key.
 
-    Methods raise sqlite3.Error or OSError if it cannot be read or written.
+    It is opened for every call, so it may be deleted. Methods raise sqlite3.Error or OSError if it
+    cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -204,9 +206,10 @@ def _sources(servers: Sequence[str]) -> tuple[dict[str, str], Sequence[str]]:
 
 
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
-    """Return the backend with a completion cache in `file` before it.
+    """Return a backend that looks in the completion cache `file` before it asks `backend`.
 
-    The backend itself is returned if `file` is None, or its engine cannot show its prompts.
+    The completion cache keeps answers between runs. `card` is the model card of the backend, which
+    is returned itself if `file` is None, or its engine cannot show its prompts.
     """
     if file is None or not capabilities(card.engine).renders:
         return backend
@@ -214,7 +217,7 @@ def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
 
 
 class Cached:
-    """A backend that answers from a cache, and asks another backend for what is not in it.
+    """Answer requests from a cache, and ask another backend for what is not in it.
 
     Errors are not cached. A cached answer has no seconds.
     """

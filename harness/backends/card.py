@@ -63,7 +63,12 @@ _PER_ENGINE = (
 
 @dataclass(frozen=True)
 class Latency:
-    """Hold the time that a card declares for one answer of its model."""
+    """Hold the time that a model card declares for one answer of its model.
+
+    `source` says which time a run takes: `card` the declared `inference_s`, in seconds; `paper`,
+    and `cited` unless the user asks for the card's, that of the paper. `basis` says in words where
+    the number comes from.
+    """
 
     # `card` means `inference_s`, `paper` the paper's 145 ms if no time is declared; `cited` means
     # the paper's too, unless the card's is asked for: its makers' computer is not the car's
@@ -81,9 +86,12 @@ class Latency:
 class Failures:
     """Hold the shares of a rule's answers that are spoilt on purpose, drawn for each request.
 
-    For the engine `proxy`, to test parsing and repair. A text is spoilt in one way at most; any
-    answer may be slow as well. The comments say what parsing makes of such a text: an intent is
-    recovered, or it fails with a status.
+    They are for the engine `proxy`, a rule in place of a model, to test parsing and repair. A text
+    is spoilt in one way at most; any answer may be slow as well. The intent is recovered from an
+    answer in a code `fence` or among `prose`; parsing fails on one that is cut off (`truncation`),
+    has a probability NaN (`nan`) or an action that is none (`unknown_action`), or never ends its
+    thought (`unclosed_think`). The share `slow_tail` takes `slow_s` seconds longer than the card's
+    latency.
     """
 
     fence: Share = 0.0  # the answer is in a code fence. Recovered.
@@ -105,13 +113,22 @@ class Failures:
 
     @property
     def texts(self) -> dict[str, float]:
-        """The shares of spoilt texts by field name, without those of slow answers."""
+        """Return the shares of spoilt texts by field name, without those of slow answers."""
         return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 
 @dataclass(frozen=True)
 class Card:
-    """Describe one model on one engine, as a file `models/<name>.toml` does."""
+    """Describe one model on one engine, as a model card does: a TOML file `models/<name>.toml`.
+
+    An engine is the program that runs the model: transformers, llama.cpp, a server, or a rule.
+    `weights` is where the model is: a directory, a GGUF file or a hub id, of which `file`,
+    `revision` and `sha256` say more; a run's folder for the engine `replay`, the model's name at a
+    server. `latency` is the declared time of an answer, and `privileged` says that the model sees
+    behind the occlusion, as an upper reference. `thinking` says whether its template can open a
+    thought, for at most `thinking_tokens`. The other fields are those of some engines; None is
+    none, or unknown.
+    """
 
     # stem of its file, `<stem>:<engine>`, name of a directory or file, hub id, or `replay:<run>`
     name: str
@@ -157,7 +174,10 @@ class Card:
 
     @property
     def slow_s(self) -> float:
-        """Seconds that some answers take longer than its latency, by `failures`; 0 without any."""
+        """Return the seconds that some answers take longer than its latency, by `failures`.
+
+        It is 0 without any.
+        """
         return self.failures.slow_s if self.failures else 0.0
 
     @property
@@ -165,7 +185,9 @@ class Card:
         return f"model {printable(self.name)!r}"
 
     def at(self, urls: tuple[str, ...]) -> "Card":
-        """Return the card with other server addresses; unchanged if it has none or `urls` is empty.
+        """Return the model card with other server addresses.
+
+        It is unchanged if it has none or `urls` is empty.
 
         Raises ValueError if one is not a base URL, or is named twice.
         """
@@ -176,7 +198,7 @@ class Card:
         )
 
     def record(self) -> dict[str, Any]:
-        """Return the card as plain values for a run's record; `convert` makes it again."""
+        """Return the model card as plain values for a run's record; `convert` makes it again."""
         record = asdict(self)
         del record["letters"]  # the agent's settings say how its letters are read
         for name in ("adapter", "price"):
@@ -198,9 +220,9 @@ class _File(Card):
 
 
 def read_cards(path: Path) -> list[Card]:
-    """Return the cards of a file, one for each engine that it lists, the default engine first.
+    """Return the model cards of a TOML file, one for each engine that it lists.
 
-    Raises UserError for a mistake in the file.
+    The default engine's is first. Raises UserError for a mistake in the file.
     """
     where = f"model card {path}"
     table = _with_latency(toml(path, where))

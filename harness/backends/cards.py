@@ -52,20 +52,20 @@ _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 
 
 def names() -> list[str]:
-    """Return the sorted names of all card files of the project and of those that ship."""
+    """Return the sorted names of all files of model cards, the project's and those that ship."""
     return resources.names("models")
 
 
 def each_engine(stem: str) -> list[Card]:
-    """Return the cards of the file of this name, one for each engine, the default engine first.
+    """Return the model cards in the file `models/<stem>.toml`, one for each engine that it lists.
 
-    Raises UserError for a mistake in the file.
+    The default engine's is first. Raises UserError for a mistake in the file.
     """
     return read_cards(resources.find("models", f"{stem}.toml"))
 
 
 def load(name: str) -> Card:
-    """Return the card named `<name>` or `<name>:<engine>`.
+    """Return the model card named `<name>` or `<name>:<engine>`, the default engine's without one.
 
     Raises UserError if there is none, or its file has a mistake.
     """
@@ -79,13 +79,14 @@ def load(name: str) -> Card:
 
 
 def load_all() -> list[Card]:
-    """Return all cards of all files, one for each engine."""
+    """Return the model cards of all files, one for each engine that a file lists."""
     return [card for name in names() for card in each_engine(name)]
 
 
 def resolve(text: str, engine: str | None = None) -> Card:
-    """Return the card of a name, a URL, `replay:RUN_DIR`, a path or a hub id, tried in this order.
+    """Return the model card of what a user names as the model: `text`, as typed after `--model`.
 
+    It is a card's name, a server's URL, `replay:RUN_DIR`, a path or a hub id, tried in this order.
     `engine` chooses the engine if there is a choice. The server at a URL is asked what it serves.
     Raises UserError if there is no such model or engine, or the model does not run on the engine;
     Unanswered if no server answers.
@@ -111,7 +112,7 @@ def resolve(text: str, engine: str | None = None) -> Card:
 
 
 def argument(card: Card) -> str:
-    """Return the text that `--model` takes for this card, or the card's name if there is none."""
+    """Return the text after `--model` that names this model card, its name if there is none."""
     if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
     if card.server:
@@ -122,11 +123,12 @@ def argument(card: Card) -> str:
 
 
 def find_own(stated_card: Card, given: Sequence[Card], where: str, hint: str) -> Card:
-    """Return the user's own card of the model that a run states, so that the run opens nothing.
+    """Return the user's own model card of the model that a run states.
 
-    Only the stated name is looked up, first in `given`, then in the card files; all else is
-    compared. Raises UserError, with `where` and `hint` in the message, if there is no such card or
-    it differs in what decides answers.
+    So a run, which may be a stranger's, opens nothing of its own. Only the stated name is looked
+    up, first in `given`, then in the card files; all else is compared. Raises UserError, with
+    `where` and `hint` in the message, if there is no such card or it differs in what decides
+    answers.
     """
     name = printable(stated_card.name)
     card = next((card for card in given if card.name == stated_card.name), None)

@@ -27,7 +27,12 @@ _TURN = ({"role": "user", "content": "?"}, {"role": "assistant", "content": _ANS
 
 
 class Tokenizer(Protocol):
-    """Describe a model's tokenizer that has a chat template."""
+    """Describe a model's tokenizer that has a chat template.
+
+    `template` is the template's Jinja text, and `specials` the texts of special tokens by their
+    name there. `bos` is the id of the token that begins a sequence, None if there is none, and
+    `vocabulary` the number of tokens.
+    """
 
     template: str  # the template's Jinja text
     # texts of special tokens by their name in a template, such as `bos_token`
@@ -53,7 +58,10 @@ class Tokenizer(Protocol):
 
 
 class HubTokenizer:
-    """Make a `Tokenizer` of a tokenizer of the package transformers."""
+    """Make a `Tokenizer` of a tokenizer of the package transformers.
+
+    Its methods mean what those of `Tokenizer` do.
+    """
 
     def __init__(self, hub: Any) -> None:
         self.hub = hub
@@ -87,7 +95,7 @@ class HubTokenizer:
 
 
 class Chat:
-    """A tokenizer with its chat template, to render messages to prompts and encode these.
+    """Render messages to prompts by a model's chat template, and encode these by its tokenizer.
 
     The template writes `image_token` for a picture; None if the model takes none. With `system`
     `first-user`, the system text stands in the first user turn; with None in a message of its own.
@@ -120,7 +128,7 @@ class Chat:
 
     @property
     def thinking(self) -> Thinking:
-        """What its template can do: `switch` a thought on and off, `always` open one, or `none`."""
+        """Return how its template opens thoughts: `always`, by a `switch`, or `none`."""
         if self._switch:
             return "switch"
         prompt = self.render(({"role": "user", "content": "?"},), thinking=False)
@@ -128,7 +136,7 @@ class Chat:
 
     @cached_property
     def turn_end(self) -> int | None:
-        """Id of the token that the template writes after an answer; None if there is none."""
+        """Return the id of the token that the template writes after an answer, or None."""
         with suppress(UserError):
             text = self._apply(
                 self._template_messages(_TURN), thinking=False, add_generation_prompt=False
@@ -197,7 +205,10 @@ class Chat:
         return self._compiled.render(messages, **self.tokenizer.specials, **switch, **values)
 
     def spellings(self, letters: str) -> dict[str, list[int]]:
-        """Return by letter the ids of all tokens that are it: alone, with blanks, or as a byte."""
+        """Return, by letter, the ids of all tokens that stand for that letter.
+
+        Such a token is the letter alone, with blanks around it, or as a byte.
+        """
         tokens: dict[str, list[int]] = {letter: [] for letter in letters}
         candidates = self.tokenizer.candidates(letters)
         for token, piece in zip(candidates, self.pieces(candidates), strict=True):

@@ -23,11 +23,14 @@ _LONGEST_FORM = 100  # characters of a form of dates
 
 
 class Refused(UserError):
-    """The error of a chat template that does not take some messages."""
+    """Report that a chat template does not take some messages."""
 
 
 class ChatTemplate:
-    """A model's chat template, compiled in a sandbox and rendered as transformers does."""
+    """Render messages to a model's prompt by its chat template, compiled in a sandbox.
+
+    The text is what transformers renders.
+    """
 
     def __init__(self, name: str, text: str) -> None:
         """Compile the template of model `name`. Raises UserError if it is no Jinja, or too long."""
@@ -55,7 +58,7 @@ class ChatTemplate:
 
 
 def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any], ...]:
-    """Return messages with the system text where a card's `system` wants it.
+    """Return messages with the system text where a model card's `system` wants it.
 
     That is at the beginning of the first user message (`first-user`), or where it is (None).
     """
@@ -66,9 +69,10 @@ def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any],
 
 
 def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
-    """Return the first message whose text is not in the prompt in its turn; None if all are.
+    """Return the first of a chat's messages whose text is missing in the rendered prompt.
 
-    White space around a text does not matter, and thoughts of earlier turns may be left out.
+    None if the prompt has all of them, in their turn. White space around a text does not matter,
+    and thoughts of earlier turns may be left out.
     """
     at = 0
     for message in messages:

@@ -38,9 +38,9 @@ def counters(sys: Path = SYS) -> list[Counter]:
 
 @contextmanager
 def metered(meters: Sequence[Counter]) -> Iterator[dict[str, float]]:
-    """Enter a context that measures energy; it yields a dict, filled at the end.
+    """Enter a context that measures energy; it yields a dict, which is empty until the end.
 
-    The dict has joules by the meter's name.
+    The dict then has, by the name of each of the `meters`, the joules used in between.
     """
     spent: dict[str, float] = {}
     sums = {meter.name: 0.0 for meter in meters if meter.watts}

@@ -51,8 +51,8 @@ class Choice:
     ) -> list[int]:
         """Return the chosen next token id of each sequence that is still written in a session.
 
-        `places` are their requests' places in the batch; `among` has for each the token ids to
-        choose from, None for all.
+        `places` has, for each sequence, the index of its request in the batch; `among` the token
+        ids to choose from, None for the whole vocabulary.
         """
         chosen = session.argmax(among)
         if self._drawn:
@@ -300,8 +300,8 @@ def _narrow(session: Session, live: list[int], unfinished: list[bool]) -> list[i
 def drawn(log_p: Floats, among: Sequence[int] | None, temperature: float, u: float) -> int:
     """Return a token id drawn from softmax(log_p / temperature) over the ids in `among`.
 
-    `log_p` is `(vocabulary,)`; `among` None takes all. `u` is the uniform draw, in [0, 1). The
-    temperature is above 0.
+    `log_p`, `(vocabulary,)`, has the log-probability of each token id; `among` None takes all ids.
+    `u` is the uniform draw, in [0, 1), that decides. The temperature is above 0.
     """
     tokens = np.arange(len(log_p)) if among is None else np.unique(among)
     with np.errstate(over="ignore"):  # a token far below the likeliest gets probability 0

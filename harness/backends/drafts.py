@@ -13,9 +13,10 @@ MOST = 8  # most tokens of a guess
 
 
 class Drafts:
-    """Remember what followed which tokens in a batch's answers, to guess how others go on.
+    """Remember which token followed which ones in a batch's answers, to guess how others go on.
 
-    Tokens with digits count as equal. A token is guessed only where all answers went on alike.
+    The model checks guesses, several tokens at a time, which is faster than writing them. Tokens
+    with digits count as equal. A token is guessed only where all answers went on alike.
     """
 
     def __init__(self, chat: Chat) -> None:
@@ -24,13 +25,19 @@ class Drafts:
         self._numeric: dict[int, bool] = {}
 
     def learn(self, kind: Hashable, tokens: Sequence[int]) -> None:
-        """Remember an answer's last token as what follows those before it; `kind` is its form."""
+        """Remember the last token id of the answer `tokens` as what follows those before it.
+
+        `kind` is the form of the answer: answers of other forms are kept apart.
+        """
         place = self._place(kind, tokens[:-1])
         if self._next.setdefault(place, tokens[-1]) != tokens[-1]:
             self._next[place] = None
 
     def after(self, kind: Hashable, tokens: Sequence[int], most: int) -> list[int]:
-        """Return up to `most` guessed token ids after `tokens`; none if nothing is known."""
+        """Return up to `most` guessed token ids after `tokens`; none if nothing is known.
+
+        `kind` is the form of the answer, as `learn` takes it.
+        """
         guess: list[int] = []
         while len(guess) < min(most, MOST):
             token = self._next.get(self._place(kind, [*tokens, *guess]))

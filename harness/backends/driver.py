@@ -28,14 +28,17 @@ CHOSEN = {CONSTANT: ("constants", CONSTANTS), OPEN_LOOP: ("open_loops", OPEN_LOO
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":
-    """Return the backend of the rule-based driver that a card names. Raises UserError if none."""
+    """Return the backend of the driver that a model card names: a rule that needs no model.
+
+    Raises UserError if there is none of that name.
+    """
     if card.name not in REFERENCES:
         raise unknown("driver", card.name, REFERENCES)
     return DriverBackend(card.name)
 
 
 class DriverBackend:
-    """A backend of a rule-based driver: it gives all probability to the driver's action.
+    """Answer requests by a rule-based driver: the action that it takes has all of the probability.
 
     The driver `uniform` gives each action the same.
     """

@@ -17,7 +17,7 @@ from harness.core.image import Image
 class Session(Protocol):
     """Describe n token sequences in a model that advance together.
 
-    Each has the model's distribution over its next token.
+    The model has read them, and knows its distribution over the next token of each.
     """
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
@@ -28,9 +28,10 @@ class Session(Protocol):
         ...
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
-        """Return log-probabilities of next tokens, `(n, tokens)`; of all tokens for None.
+        """Return log-probabilities of next tokens, `(n, K)` for the K ids in `tokens`.
 
-        They are normalised over the whole vocabulary.
+        All ids of the vocabulary are taken for None. Values are normalised over the whole
+        vocabulary.
         """
         ...
 
@@ -51,22 +52,27 @@ class Session(Protocol):
         return [0] * len(guesses)
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        """Return log-probabilities of `tokens` after each of several chunks of each sequence.
+        """Return log-probabilities of the K ids `tokens` after each of C chunks of each sequence.
 
-        The shape is `(n, chunks, tokens)`. Each sequence has equally many chunks, none empty. The
-        session can only be closed afterwards.
+        A chunk is a list of token ids that would follow the sequence. The shape is `(n, C, K)`.
+        Each sequence has equally many chunks, none empty. The session can only be closed
+        afterwards.
         """
         ...
 
     def keep(self, places: Sequence[int]) -> None:
-        """Drop all sequences but those at `places`, in this order: n becomes len(places)."""
+        """Drop all sequences but those at the indices `places`, which are then in this order."""
         ...
 
     def close(self) -> None: ...
 
 
 class Engine(Protocol):
-    """Describe a loaded model that reads tokens and gives distributions of next ones."""
+    """Describe a loaded model that reads tokens and gives distributions of next ones.
+
+    `chat` is its tokenizer with the chat template, `context_tokens` the most tokens of one
+    sequence, and `stops` the ids of tokens that end an answer.
+    """
 
     chat: Chat  # its tokenizer and chat template
     context_tokens: int  # most tokens of one sequence
@@ -100,7 +106,10 @@ LEAST_SAVED = 64  # fewer tokens saved are cheaper to read than a group of promp
 
 
 def check_logits(largest: Sequence[float]) -> None:
-    """Raise ArithmeticError if a sequence's largest logit is not finite, as of damaged weights."""
+    """Raise ArithmeticError if one of `largest` is not finite, as from damaged weights.
+
+    They are the largest logit of each sequence.
+    """
     if not all(map(math.isfinite, largest)):
         raise ArithmeticError(
             "the logits are no numbers; the weights are damaged, or too large for this dtype"
@@ -121,9 +130,10 @@ def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
 
 
 def group_by_beginning(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
-    """Yield groups of indices of sequences that share long beginnings, each index once.
+    """Yield groups of sequences that share long beginnings, as indices, each index once.
 
-    A group of its own is made only where that saves reading `LEAST_SAVED` tokens.
+    `sequences` are token ids. A group of its own is made only where that saves reading
+    `LEAST_SAVED` tokens.
     """
     order = sorted(range(len(sequences)), key=sequences.__getitem__)
     shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]

@@ -28,8 +28,9 @@ UNSTATED = object()
 
 
 class EngineOfPackage:
-    """Check what the backend of a package's engine answers, and what it says of itself;
-    all other attributes are passed on to that backend.
+    """Check and copy what a package's backend answers, and what it says of itself.
+
+    All other attributes are passed on to that backend.
     """
 
     def __init__(self, backend: Backend, card: "Card") -> None:

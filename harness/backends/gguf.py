@@ -31,7 +31,13 @@ _TEXT, _ARRAY = 8, 9
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """Hold what a GGUF file states of its model; None where it states nothing."""
+    """Hold what a GGUF file, llama.cpp's format of weights, states of its model in its metadata.
+
+    They are the model's `name` and `licence`, the longest sequence that it was trained for, the
+    text of its chat `template`, and in `decision` the kind of decision model that it is (one that
+    gives options probabilities and writes no text). A field is None where the file states nothing;
+    nothing here is checked against the weights.
+    """
 
     name: str | None = None  # the model's name
     licence: str | None = None  # SPDX id of its licence, or its name, as the file writes it
@@ -42,7 +48,7 @@ class ModelFacts:
 
 
 def read_facts(file: Path) -> ModelFacts:
-    """Return what a GGUF file states of its model; nothing if it is no GGUF.
+    """Return what a GGUF file states of its model; all None if the file is no GGUF.
 
     Raises OSError if it cannot be opened.
     """

@@ -28,7 +28,7 @@ class _Prompt(NamedTuple):
 
 
 class LanguageModel:
-    """A backend of a language model in this process, asked in batches of `batch_size` at most."""
+    """Answer requests by a language model in this process, in batches of at most `batch_size`."""
 
     def __init__(self, engine: Engine, batch_size: int) -> None:
         self.engine = engine
@@ -82,9 +82,9 @@ class LanguageModel:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Return log-probabilities of the first `vocabulary` token ids after each prompt.
+        """Return log-probabilities of the first V token ids after each of n prompts, `(n, V)`.
 
-        The shape is `(n, vocabulary)`.
+        V is `vocabulary`; the prompts are those of the requests.
         """
         with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))

@@ -18,7 +18,13 @@ LEAST_P = 1e-9  # a letter to which a server's list leaves nothing
 
 @dataclass(frozen=True)
 class AveragedReadOut:
-    """Hold an answer made of letters' probabilities, averaged over orders of the action list."""
+    """Hold an answer made of letters' probabilities, averaged over orders of the action list.
+
+    In a read-out the model is asked for one letter, which stands for an action of the list. `text`
+    is the answer, `label_mass` the letters' total probability, averaged over the orders, and
+    `letter_share`, from 0 to 1, how much of the probabilities goes with the letter and not the
+    action. `follows_letter` says that one letter is the likeliest in every order.
+    """
 
     text: str  # the answer
     label_mass: float  # total probability of the letters, the mean over the orders

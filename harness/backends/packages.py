@@ -30,17 +30,21 @@ _UNREACHED = ("connection broken", "Connection to", "NewConnectionError", "timed
 
 @dataclass(frozen=True)
 class Packaged:
-    """Describe a weights file inside a wheel of a package registry."""
+    """Describe a weights file inside a wheel of a package registry.
 
-    package: str
-    version: str
+    `package` and `version` name the wheel, `file` the path inside; `sha256` is the digest that the
+    file must have, and `model` the model's name, for messages.
+    """
+
+    package: str  # the package's name in the registry
+    version: str  # the package's version
     file: str  # its path inside the wheel
     sha256: str  # hex digest that the file must have
     model: str  # the model's name, for messages
 
     @property
     def place(self) -> Path:
-        """Path of the file once it is fetched; files of equal content and name share it."""
+        """Return the file's path once it is fetched; equal files of one name share it."""
         return kept.folder() / "weights" / self.sha256[:16] / self.file.rpartition("/")[2]
 
     @property
@@ -49,7 +53,7 @@ class Packaged:
 
 
 def find_packaged(card: Card) -> Packaged | None:
-    """Return the file in a wheel that a card has as its weights; None if they lie elsewhere.
+    """Return the weights file in a wheel that a model card names; None if it names none.
 
     Raises UserError if the card names no package, file, version or digest that can be fetched.
     """

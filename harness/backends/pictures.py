@@ -19,7 +19,10 @@ _PLACE_BITS, _DIGITS = 16, 10
 
 
 def locate_picture(token: int) -> tuple[int, int]:
-    """Return the number of the picture that a negative token id is of, and its place in it."""
+    """Return which picture a negative token id is of, and the token's index in that picture.
+
+    A picture is named by a number, the same in every engine and process.
+    """
     return divmod(-1 - token, 1 << _PLACE_BITS)
 
 
@@ -32,7 +35,7 @@ def pictures_in(tokens: Iterable[int]) -> list[int]:
 class Pictures(Generic[T]):
     """Keep pictures by number, and the encodings of those that were used last.
 
-    `encode` turns pictures into what an engine's model reads.
+    `encode` turns pictures into what an engine's model reads (`T`), one for each.
     """
 
     def __init__(self, encode: Callable[[list[Image]], list[T]]) -> None:

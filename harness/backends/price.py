@@ -12,7 +12,11 @@ MILLION = 1e6
 
 @dataclass(frozen=True)
 class Price:
-    """Hold what a million tokens of a served model cost, by its maker's price list."""
+    """Hold what a million tokens of a served model cost, by its maker's price list.
+
+    It is the table `[price]` of a model card: `input` is the price of tokens that the model reads,
+    `output` that of those that it writes, thoughts included, in `currency`.
+    """
 
     input: _Amount  # of those that the model reads
     output: _Amount  # of those that it writes, thoughts included
@@ -21,5 +25,5 @@ class Price:
     ]
 
     def of(self, read: float, written: float) -> float:
-        """Return what `read` prompt tokens and `written` answer tokens cost, in `currency`."""
+        """Return the cost in `currency` of `read` prompt tokens and `written` answer tokens."""
         return (read * self.input + written * self.output) / MILLION

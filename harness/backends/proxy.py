@@ -30,12 +30,12 @@ OTHER = 0.10  # probability shared by the actions that are neither SLOWER nor th
 
 
 def open(card: Card, **_: Any) -> "Proxy":
-    """Return the backend of the rule `proxy`, with the failures of its card."""
+    """Return the backend of the rule `proxy`, which spoils answers as its model card says."""
     return Proxy(card.failures)
 
 
 class Proxy:
-    """A backend of a fixed rule that plans on a scene graph, in place of a language model.
+    """Answer requests by a fixed rule that plans on a scene graph, in place of a language model.
 
     It answers in the form that the prompt asks for. With `failures`, some answers are spoilt.
     """
@@ -98,9 +98,10 @@ def _text(request: Request, view: SceneGraph, intent: dict[str, float]) -> str:
 
 
 def distribution(scenario: Scenario, view: SceneGraph) -> dict[str, float]:
-    """Return the rule's probability of each action, by name, for a viewer's scene graph.
+    """Return the probability that the rule gives each action, by name.
 
-    The planner's action is likeliest, and less so the more of its sectors the viewer cannot see.
+    `view` is the scene graph of a viewer: what that vehicle sees. The planner's action is
+    likeliest, and less so the more of the ego's sectors the viewer cannot see.
     """
     return _hedged(scenario.actions, plan(scenario, view), view)
 

@@ -27,7 +27,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """Hold what an engine can do; other code tests these fields, never an engine's name."""
+    """Hold what an engine, the program that runs a model, can do.
+
+    Other code tests these fields, never an engine's name. `language_model` is false for rules,
+    `answer_modes` are the ways in which it can answer, and `thinks` says which models are asked to
+    think first. `renders` says that prompts can be shown as its model reads them, `has_weights`
+    that it loads some, `asks_helpers` that helpers are asked as well as the ego, and `closed_loop`
+    that it answers for new scenes. With `own_latency` its answers were timed earlier; a `reference`
+    is a driver that reports compare models with; `samples` says that it heeds a temperature.
+    """
 
     # whose answers can be timed, and which can be asked to fuse messages
     language_model: bool = True
@@ -47,7 +55,14 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class Registration:
-    """Describe an engine: what it can do, what its cards need, and how a backend is opened."""
+    """Describe an engine: what it can do, what its cards need, and how a backend is opened.
+
+    `opens`, `finds`, `prepares` and `sees` are functions of a model card, `module:function`: they
+    open a backend, find the weights, prepare fetched ones, and count the tokens of a picture; empty
+    for none. `answers` is the version of the engine's answers. `card_keys` are further keys that
+    its cards may have, `required_keys` those that they must have. `packages` has the packages that
+    it needs by their module, and `install` is the command for these.
+    """
 
     # `module:function`, called with a card and the options of `open_backend`; returns a backend
     opens: str
@@ -135,7 +150,7 @@ BUILT_IN: Mapping[str, Registration] = {
 
 
 class Engines(Plugins[Registration]):
-    """All engines, by name. A package's registration is checked, and copied."""
+    """Hold all engines by name; the registration of a package's engine is checked, and copied."""
 
     def _load(self, name: str) -> Registration:
         package_registration = super()._load(name)
@@ -176,7 +191,7 @@ def reads_prompts(engine: str) -> bool:
 def open_backend(
     card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> Backend:
-    """Return the backend of a card, with its weights loaded.
+    """Return the backend of a model card, with its weights loaded.
 
     The options are for engines with weights. The device is `cpu`, `cuda` or `cuda:N`; None takes
     CUDA if there is any. `dtype` is a number format instead of the card's; `batch_size` the most
@@ -201,7 +216,7 @@ def open_backend(
 
 
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
-    """Return a card's backend as `open_backend` does, opened only once in each process."""
+    """Return a model card's backend as `open_backend` does, opened only once in each process."""
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 
 
@@ -221,7 +236,7 @@ def import_object(place: str) -> Any:
 
 
 def engine_answer(card: "Card", place: str) -> Any:
-    """Return what a function of the card's engine returns for the card.
+    """Return what a function of the model card's engine returns for the card.
 
     `place` is where the function is, `module:name`, as the engine's registration has it.
     """
@@ -238,7 +253,10 @@ def missing_package(engine: str) -> str | None:
 
 
 def missing(card: "Card") -> str | None:
-    """Return what keeps a card from running here: a package's name, `weights`, or None."""
+    """Return what keeps a model card's model from running here; None if nothing does.
+
+    It is the name of a package that is not installed, or `weights`.
+    """
     if package := missing_package(card.engine):
         return package
     try:
@@ -250,7 +268,10 @@ def missing(card: "Card") -> str | None:
 
 
 def locate(card: "Card") -> Path:
-    """Return the path of a card's weights, by its engine. Raises UserError if not found."""
+    """Return the path of the weights that a model card names, by the rules of its engine.
+
+    Raises UserError if they are not found.
+    """
     where = engine_answer(card, registration(card.engine).finds)
     if not isinstance(where, Path):
         raise UserError(f"engine {printable(card.engine)} finds no path; repair its package")
@@ -258,7 +279,7 @@ def locate(card: "Card") -> Path:
 
 
 def processor_tokens(card: "Card") -> int | None:
-    """Return how many tokens a card's own image processor makes of its picture.
+    """Return how many tokens a model card's own image processor makes of its picture.
 
     None if its engine or weights are not installed, or take no pictures.
     """

@@ -27,7 +27,7 @@ _KEPT = [field.name for field in fields(Completion)[2:] if field.name != "server
 
 
 def open(card: Card, **_: Any) -> "Replay":
-    """Return the backend that answers from the run folder that a card names.
+    """Return the backend that answers from the run folder that a model card names.
 
     Raises UserError if it is not a finished run, is a driver's run, which has answers of the ego
     only, or lacks answers that no run can do without.
@@ -47,10 +47,11 @@ def open(card: Card, **_: Any) -> "Replay":
 
 
 class Replay:
-    """A backend that gives a run's stored answers, found by scene and viewer.
+    """Answer requests from a finished run, whose answers are found by scene and viewer.
 
-    If other decisions lead to a scene that the run did not reach, the run's model is asked; its
-    identity must be the same. Raises UserError for a prompt other than the one that was answered.
+    The viewer is the vehicle that was asked. If other decisions lead to a scene that the run did
+    not reach, the run's model is asked; its identity must be the same. Raises UserError for a
+    prompt other than the one that was answered.
     """
 
     def __init__(self, run: Run) -> None:
@@ -191,7 +192,7 @@ class Replay:
 
 
 class LacksAnswer(UserError):
-    """The error of a run that has no answer to a question which its own record says was asked.
+    """Report that a run has no answer to a question which its own record says was asked.
 
     `question` is the id of the request; `otherwise` counts the run's answers that the rule-based
     model here gives otherwise.
@@ -203,7 +204,7 @@ class LacksAnswer(UserError):
 
 
 class Kept(Replay):
-    """A backend that gives a run's stored answers and never opens a model.
+    """Answer requests from a finished run, and never open a model.
 
     So a stranger's run opens nothing: a missing answer raises UserError. A delay that it states of
     an answer is not taken; only rules declare such, and they are asked.

@@ -37,7 +37,12 @@ _BYTES = {"type": "ByteLevel", "add_prefix_space": False, "use_regex": False}
 
 
 class Saved(NamedTuple):
-    """Hold what the small files of a saved Qwen3 checkpoint say."""
+    """Hold what the small files of a saved Qwen3 checkpoint say: all but its weights.
+
+    `config` is that of the text part, `tokenizer` the content of tokenizer.json, and `template` the
+    chat template. `vision` is the config of the vision encoder with its processor's means and
+    deviations; None if the model reads text only.
+    """
 
     config: dict[str, Any]  # of the text part
     tokenizer: dict[str, Any]  # whole

@@ -92,7 +92,7 @@ class Fields:
 
     @property
     def changed(self) -> Mapping[str, str | bool]:
-        """The fields that are left out (false) or renamed (the new name), by their usual name."""
+        """Return the fields that are left out (false) or renamed, by their usual name."""
         return {name: alias for name, alias in vars(self).items() if alias is not True}
 
     def applied(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -142,7 +142,7 @@ _OF_MODELS = {
 
 @dataclass(frozen=True)
 class Server:
-    """Describe the servers of a model and how they are asked: a card's `[server]` table.
+    """Describe the servers of a model and how they are asked: a model card's `[server]` table.
 
     Raises ValueError for a URL or variable name that is not allowed, without showing the URL.
     """
@@ -186,9 +186,9 @@ class Server:
     def key(self) -> str | None:
         """Return the server's key; None if its variable is not set.
 
-        A card may come from others, so it may not have any variable sent to its server. Raises
-        UserError if the variable's name is not that of a key of models, and the user does not list
-        it.
+        A model card may come from others, so it may not have any variable sent to its server.
+        Raises UserError if the variable's name is not that of a key of models, and the user does
+        not list it.
         """
         if not self.key_env or not (key := os.environ.get(self.key_env, "").strip()):
             return None
@@ -207,7 +207,7 @@ class Server:
 
     @property
     def any_may_answer(self) -> bool:
-        """Whether `base_url` is a list of servers, any of which may answer a request.
+        """Return whether `base_url` is a list of servers, any of which may answer a request.
 
         The model's identity is then what they list, and has no address.
         """
@@ -219,7 +219,7 @@ class Server:
 
 
 def readable(variable: str) -> bool:
-    """Return whether a card may have this environment variable sent to its server as a key.
+    """Return whether a model card may have this environment variable sent to its server as a key.
 
     It ends in KEY or TOKEN and has the word of a service or a server of models, or the user lists
     it in `SWARMDRIVE_KEYS`.

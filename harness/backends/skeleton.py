@@ -28,15 +28,24 @@ UNIT = (0, 1)  # bounds of a number that is `0.` and two digits
 
 
 class Branch(NamedTuple):
-    """Hold fixed text of an answer, and the point after it at which the model decides."""
+    """Hold fixed text of a constrained answer, and the point after it at which the model decides.
 
-    text: str
-    then: "Point | None"
+    A constrained answer is JSON whose fixed text is given, so that the model only fills in values.
+    `then` is None at its end.
+    """
+
+    text: str  # the fixed text
+    then: "Point | None"  # where the model decides next; None at the end of the answer
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A place in a constrained answer where the model decides, before one of some branches."""
+    """Describe a place in a constrained answer where the model decides.
+
+    It chooses one of the texts `options`, or, where `most` is above 0, writes a text of at most so
+    many characters. Then one of `branches` follows, or one of `instead` stands in its place: the
+    end of a list.
+    """
 
     options: tuple[str, ...]  # texts to choose from; one empty text where only the branch is chosen
     most: int  # most characters of a text that the model writes instead of a choice; 0 for a choice
@@ -95,9 +104,10 @@ def start(shape: Shape) -> Point:
 
 
 def filled(shape: Shape, place: int) -> str:
-    """Return an example of an answer of a form (`Shape`).
+    """Return an example of a constrained answer of a form (`Shape`), as text.
 
-    Of the options of each choice it has the one at index `place`; texts are empty.
+    Where the model would choose, it has the option at index `place`; texts that the model would
+    write are empty.
     """
     text, point = "", Branch("", start(shape)).then
     while point:
@@ -117,7 +127,7 @@ def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
 
 
 class Ask(NamedTuple):
-    """Hold a choice that the model makes while it fills in an answer.
+    """Hold a choice that the model makes while it fills in a constrained answer.
 
     `forced` are the token ids of fixed text to append first, `among` the sorted ids to choose from.
     """
@@ -127,23 +137,30 @@ class Ask(NamedTuple):
 
 
 class Filled(NamedTuple):
-    """Hold a finished constrained answer: its text, and its number of tokens."""
+    """Hold a finished constrained answer: JSON with fixed text, whose values a model chose.
 
-    text: str
-    tokens: int
+    `tokens` counts those of the whole `text`.
+    """
+
+    text: str  # the answer's JSON
+    tokens: int  # number of its tokens, those of the fixed text included
 
 
 class Leg(NamedTuple):
-    """Hold an option and the branch after it: their text, its tokens, and that branch."""
+    """Hold one option at a point of a constrained answer, with the fixed text that follows it.
 
-    text: str
-    tokens: tuple[int, ...]
-    branch: Branch
+    `text` is both texts, `tokens` their token ids, and `branch` what follows the option.
+    """
+
+    text: str  # the option and the branch's fixed text
+    tokens: tuple[int, ...]  # ids of the tokens of `text`
+    branch: Branch  # what follows the option
 
 
 class Skeleton:
     """Hold the tokens of all constrained answers of a form (`Shape`), for one tokenizer.
 
+    A constrained answer is JSON whose fixed text is given, so that the model only fills in values.
     Answers follow a line break, as in every chat template. Raises UserError if the tokenizer cannot
     tell choices apart.
     """
@@ -199,7 +216,10 @@ class Skeleton:
         return longest[self._start]
 
     def walk(self) -> Generator[Ask, int, Filled]:
-        """Yield each decision, receive the chosen token id, and return the finished answer."""
+        """Yield each choice of the model in a constrained answer, and return the finished answer.
+
+        Each choice wants the chosen token id sent to the generator.
+        """
         text, count, before = "", 0, "\n"
         forced: list[int] = []
         point: Point | None = self._start

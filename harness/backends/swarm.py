@@ -10,9 +10,11 @@ from harness.backends.card import Card
 
 
 class Swarm:
-    """A backend that sends each request to the backend of its agent (`Request.agent`).
+    """Send each request to the backend of its agent (`Request.agent`), where a run has several.
 
-    `backends` are those of the agents, the ego's first; agents may share one.
+    An agent is one of the models (with prompt and answer mode) that vehicles of a run ask; the
+    ego's has index 0, those of helpers follow. `backends` are the agents', in this order; several
+    agents may share one backend.
     """
 
     def __init__(self, backends: Sequence[Backend]) -> None:
@@ -43,7 +45,7 @@ class Swarm:
 
 
 def open_each(cards: Sequence[Card], opens: Callable[[Card], Backend]) -> list[Backend]:
-    """Return the backend of each card, opened by `opens`; equal cards share one."""
+    """Return the backend of each model card, in order, opened by `opens`; equal cards share one."""
     opened = {card: opens(card) for card in dict.fromkeys(cards)}
     return [opened[card] for card in cards]
 
@@ -51,9 +53,12 @@ def open_each(cards: Sequence[Card], opens: Callable[[Card], Backend]) -> list[B
 def together(
     cards: Sequence[Card], backends: Sequence[Backend], cache: Path | None = None
 ) -> Backend:
-    """Return one backend of a run's agents, which routes requests by agent.
+    """Return one backend that passes each request to the model of the agent it is for.
 
-    With a `cache` file, a completion cache is put before each.
+    An agent is one of the models that vehicles of a run ask. `cards` are the agents' model cards
+    and `backends` the opened models, both in the same order, the ego's first. `cache` is the file
+    of the completion cache (stored answers), which each of them then looks in before it asks its
+    model; None for no cache. A single agent needs no routing: its own backend is returned.
     """
     agents = [cached(backend, card, cache) for backend, card in zip(backends, cards, strict=True)]
     return agents[0] if len(agents) == 1 else Swarm(agents)

@@ -9,7 +9,7 @@ MOST_CHARACTERS = 16  # of a token, on average over a text: whoever counts fewer
 
 
 def least_tokens(characters: int) -> int:
-    """Return the fewest tokens that a text of so many characters has."""
+    """Return the fewest tokens that a text of so many characters can have."""
     return math.ceil(characters / MOST_CHARACTERS)
 
 
@@ -20,10 +20,11 @@ def too_few(
     prompt_tokens: int | None,
     completion_tokens: int | None,
 ) -> str | None:
-    """Return which count of a model's answer is too small for its text, as a phrase; None if none.
+    """Return which stated token count is too small for its text, as a phrase; None if none is.
 
-    `text` is the answer's. The text of a read-out is not its model's, so its tokens are not held
-    against it; nor are those of a server's prompt, which it may have cut.
+    `text` is the answer, `can` what the engine can do. The text of a read-out is not its model's,
+    so its tokens are not held against it; nor are those of a server's prompt, which it may have
+    cut.
     """
     of_prompt = sum(len(message["content"]) for message in request.messages)
     of_text = 0 if request.bare or not can.language_model else len(text)

@@ -59,14 +59,17 @@ def tokenizer(source: Path) -> Any:
 
 
 def whole(loaded: Any) -> Any:
-    """Return a `tokenizers.Tokenizer`, changed so that it neither cuts texts off nor pads."""
+    """Return `loaded`, a `tokenizers.Tokenizer`, set neither to cut texts off nor to pad."""
     loaded.no_truncation()
     loaded.no_padding()
     return loaded
 
 
 def token_ids(loaded: Any, text: str) -> list[int]:
-    """Return the token ids of a text in a chat, without special ones such as a BOS around it."""
+    """Return the token ids of a text in a chat, without special ones such as a BOS around it.
+
+    `loaded` is a `tokenizers.Tokenizer`.
+    """
     encoded: list[int] = loaded.encode(text, add_special_tokens=False).ids
     return encoded
 
@@ -120,7 +123,8 @@ def _converted(file: Path, kind: str, pre: str) -> Any:
 def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
     """Return a `tokenizers.Tokenizer` of a byte-level BPE model.
 
-    It splits text by the patterns `splits`, one after another, by default as Qwen2 does.
+    `model` is a `tokenizers.models.BPE`. The tokenizer splits text by the patterns `splits`, one
+    after another, by default as Qwen2 does.
     """
     from tokenizers import Regex, Tokenizer, decoders, pre_tokenizers
 
@@ -138,10 +142,10 @@ def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
 def counter(
     source: Path | None, card: Card | None = None
 ) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
-    """Return a function that counts the tokens of messages, without the chat template's.
+    """Return a function that counts the tokens of chat messages, without the chat template's.
 
-    It uses the tokenizer at `source`, or else the one with the card's weights; None if there is
-    neither. Raises UserError if there is no tokenizer at `source`.
+    It uses the tokenizer at `source`, or else the one with the model card's weights; None if there
+    is neither. Raises UserError if there is no tokenizer at `source`.
     """
     if source is None and card and card.weights:
         source = _of_weights(card)

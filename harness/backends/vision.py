@@ -46,13 +46,16 @@ class Vision:
 
     @property
     def tokens(self) -> int:
-        """Number of tokens that one picture becomes, without markers around it."""
+        """Return the number of tokens that one picture becomes, without markers around it."""
         square = self.patch_px * self.merge
         width, height = self.scaled_to_px or self._whole_squares(square)
         return (width // square) * (height // square)
 
     def difference(self, tokens: int) -> str | None:
-        """Return the error for a processor that makes `tokens` of a picture; None if it agrees."""
+        """Return the error for a processor that makes `tokens` of a picture, or None.
+
+        It is None if that is how many tokens this record expects.
+        """
         if tokens == self.tokens:
             return None
         return (

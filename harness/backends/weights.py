@@ -36,9 +36,10 @@ _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 
 def find_checkpoint(card: Card) -> Path:
-    """Return the directory of a card's checkpoint: as given, beside the cards, or the hub's cache.
+    """Return the directory of the checkpoint that a model card names.
 
-    Raises UserError if there is none, or it lacks a file.
+    It is looked for as the path given, beside the cards, and in the hub's cache. Raises UserError
+    if there is none, or it lacks a file.
     """
     find_adapter(card)
     local = find("models", card.weights or "")
@@ -73,9 +74,10 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 
 
 def find_gguf(card: Card) -> Path:
-    """Return a card's GGUF file: as given, beside the cards, of a package, or the hub's cache.
+    """Return the GGUF file that a model card names.
 
-    Raises UserError if there is none, or its projector is missing.
+    It is looked for as the path given, beside the cards, in a package, and in the hub's cache.
+    Raises UserError if there is none, or its projector (the file of its vision encoder) is missing.
     """
     find_adapter(card)
     if wanted := packages.find_packaged(card):
@@ -102,13 +104,13 @@ def find_gguf(card: Card) -> Path:
 
 
 def is_gguf(card: Card) -> bool:
-    """Return whether a card's weights are a GGUF file, on whatever engine."""
+    """Return whether a model card's weights are a GGUF file, on whatever engine."""
     weights = card.file or card.weights or ""
     return weights.endswith(".gguf") or weights.startswith(packages.PREFIX)
 
 
 def find_weights(card: Card) -> Path:
-    """Return the checkpoint's directory or the GGUF file of a card.
+    """Return the checkpoint's directory or the GGUF file of a model card.
 
     Raises UserError if there is none, or it is not complete.
     """
@@ -116,7 +118,7 @@ def find_weights(card: Card) -> Path:
 
 
 def check_digest(card: Card, file: Path) -> Path:
-    """Return `file`, after comparing its SHA-256 with the card's, if that has one.
+    """Return `file`, after comparing its SHA-256 with the model card's, if that has one.
 
     Raises UserError if they differ.
     """
@@ -132,9 +134,9 @@ def check_digest(card: Card, file: Path) -> Path:
 
 
 def contradictions(card: Card) -> Iterator[str]:
-    """Yield a line for each fact that a card states otherwise than its weights do.
+    """Yield a line for each fact that a model card states otherwise than its weights do.
 
-    They are the licence, and a context longer than the weights'; the card's is used. Raises
+    The facts are the licence, and a context longer than the weights'; the card's is used. Raises
     UserError if the weights are not found.
     """
     where = locate(card)
@@ -164,7 +166,7 @@ def _context_tokens(checkpoint: Path) -> int | None:
 
 
 def pull(card: Card) -> Path:
-    """Download a card's weights into a cache, and return the checkpoint or the GGUF file.
+    """Download a model card's weights into a cache, and return the checkpoint or the GGUF file.
 
     Raises UserError if there is nothing to fetch, the hub or the registry is not reached or
     refuses, or the digest is not the card's.

@@ -80,7 +80,7 @@ def groups() -> Mapping[str, str]:
 
 
 def spellings() -> Mapping[str, str]:
-    """Return the new spelling of each renamed command by its old one, extensions' included."""
+    """Return what replaces each renamed command, by its old spelling, extensions' included."""
     return joined(OLD, "spellings")
 
 
@@ -90,7 +90,7 @@ def short() -> Mapping[str, str]:
 
 
 def panels() -> Mapping[str, tuple[str, ...]]:
-    """Return the headings of the first help screen, each with the commands or groups below it."""
+    """Return the headings of the first help screen, with the commands or groups below each."""
     words = {panel: list(names) for panel, names in PANELS.items()}
     for extension in extensions().values():
         for word, panel in extension.panels.items():

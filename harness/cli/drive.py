@@ -47,7 +47,8 @@ class Videos(Protocol):
     def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
         """Draw up to `most` episodes that failed under the run's last condition; return the files.
 
-        `run` is the run's folder; `quiet` shows no progress.
+        A condition is an operating point by its name. `run` is the run's folder; `quiet` shows no
+        progress.
         """
         ...
 

@@ -151,9 +151,10 @@ def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: st
 
 
 def show_counted(spec: "Spec", counted: dict[str, Any], times: int = 1) -> None:
-    """Print a dry run's counts: requests, prompt tokens and cost of the evaluation `spec`.
+    """Print what an evaluation would take, as a dry run counted it: requests, tokens and cost.
 
-    It is made so many `times`.
+    `spec` is the evaluation, and `counted` what `evaluate.dry_run.count` returned for it. The cost
+    is that of so many `times`, as of repeats.
     """
     repeated = f" × {times} repeats" if times > 1 else ""
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"

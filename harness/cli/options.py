@@ -281,9 +281,9 @@ def _parameter(option: stated.Option) -> inspect.Parameter:
 
 
 def cards(models: "Sequence[str] | None") -> "list[Card]":
-    """Return the model cards of the models that a user names.
+    """Return the model cards (files that describe a model) of the models that a user names.
 
-    Raises UserError if there is no such model.
+    None stands for no models. Raises UserError if there is no such model.
     """
     from harness.backends.cards import resolve
 
@@ -304,7 +304,8 @@ def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
 def of_families(command: Any) -> Any:
     """Give a command the options that name a scenario of a family.
 
-    The command gets what is typed for them as `of_family`: texts by the option's name.
+    A family is scenarios that an extension makes by name, such as `env:merge-v0`. The command gets
+    what is typed for them as `of_family`: texts by the option's name.
     """
     from harness.world.families import FAMILIES
 

@@ -27,7 +27,8 @@ COLUMNS = 64  # of a picture in a terminal
 class PictureModel:
     """Hold a model with vision that pictures of a prompt are drawn for, and its picture size.
 
-    `processor_tokens` is the tokens of a picture by its own image processor; None if not asked.
+    `card` is its model card, and `vision` how it takes pictures. `processor_tokens` is the number
+    of tokens of a picture by its own image processor; None if not asked.
     """
 
     card: "Card"  # the model's

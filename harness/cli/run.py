@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 class Column:
     """Describe a column of a run's table: its head, and the metric whose scores stand below it.
 
-    With `interval`, a score is shown with its interval, else with its unit.
+    `metric` is the metric's name. With `interval`, a score is shown with its interval, else with
+    its unit.
     """
 
     head: str
@@ -130,7 +131,7 @@ def evaluate(
 
 
 def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
-    """Return the part of a dataset that a run evaluated, which may have stopped early."""
+    """Return the part of a dataset that a run evaluated, since a run may stop early."""
     numbers = dataset.episodes[: run.manifest.world.episodes]
     if len(numbers) == len(dataset.episodes):
         return dataset
@@ -250,8 +251,9 @@ def show(
 ) -> None:
     """Print a run's table, a row for each condition, with its caveats and notes.
 
-    `beside` adds rows of references without a model: scores by name and metric. A run with balanced
-    success has a table of it first.
+    A condition is an operating point by its name. `done` is the run as it was just evaluated,
+    `scenes` a phrase on its scenes, and `columns` are the table's. `beside` adds rows of references
+    without a model: scores by name and metric. A run with balanced success has a table of it first.
     """
     from harness.report.findings import FIRST, LAST, Kind, findings
     from harness.runs.folder import read
@@ -298,7 +300,8 @@ def _scores_table(
 def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:
     """Print success by the number of helpers that see the danger, if the layouts declare it.
 
-    `figures` holds scores by condition and metric.
+    A layout is one drawn start situation; `figures` holds scores by condition and metric,
+    `conditions` the names of the operating points to print.
     """
     metrics = {}
     for name, metric in BY_WITNESSES.items():

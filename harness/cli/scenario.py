@@ -89,7 +89,12 @@ def drive(
 
 @dataclass(frozen=True)
 class Drives:
-    """Describe how reference drivers drive the layouts of a scenario, and what is said of it."""
+    """Describe how reference drivers drive the layouts of a scenario, and what is said of it.
+
+    A reference driver is a rule that decides without a model; a layout is one drawn start
+    situation. `check` drives a number of layouts from a seed on and returns the results, `show`
+    prints them.
+    """
 
     # takes the scenario, how many layouts, the seed of the first, the workers, and what is told how
     # many are done; returns the results as the JSON output has them

@@ -23,7 +23,7 @@ DIGITS = 18  # most of a number that is read here
 
 
 class Stopped(Exception):
-    """Signal that a command was interrupted; the cause is the KeyboardInterrupt.
+    """Report that a command was interrupted; the cause is the KeyboardInterrupt.
 
     Typer would end such a command without a word.
     """
@@ -279,7 +279,8 @@ def _value(parameter: Any, by_typer: Callable[[Any, Any], Any], context: Any, va
 def plain(annotation: Any, value: Any) -> Any:
     """Return a typed value converted to its annotation, the same as typer converts it.
 
-    `UNREAD` if typer itself must convert or refuse it.
+    `annotation` is that of the command's parameter. The result is `UNREAD` if typer itself must
+    convert or refuse the value.
     """
     if get_origin(annotation) is list and isinstance(value, list | tuple):
         items = [plain(get_args(annotation)[0], item) for item in value]

@@ -64,8 +64,9 @@ def evaluate(
 ) -> Path:
     """Evaluate on every dataset of a suite with one backend; write and print the means.
 
-    `specs` and `datasets` are the evaluation on each, and the dataset; `evaluated` evaluates one of
-    them. Returns the suite's folder, `out` or a default one for None.
+    A suite is several datasets, one for each family of scenes. `specs` and `datasets` are the
+    evaluation on each, and the dataset; `evaluated` evaluates one of them. Returns the suite's
+    folder, `out` or a default one for None.
     """
     from harness.backends.registry import open_backend
     from harness.evaluate.run import finished_run

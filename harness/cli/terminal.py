@@ -67,7 +67,8 @@ def echo_each(
 ) -> None:
     """Print a list of entries by name, and the error of those that cannot be used.
 
-    `plain` returns an entry's values for JSON, `show` prints it as text.
+    `things` has each entry, or the UserError that it raised, by its name; `plain` returns an
+    entry's values for JSON, `show` prints it as text.
     """
     if as_json:
         rows = []
@@ -119,8 +120,9 @@ def console() -> "Console":
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a table, the first column aligned left and the others right.
 
-    Columns are two spaces apart, or one if a name needs the room. A name that is still too long
-    stands on a line above its row; heads longer than `HEAD` are folded.
+    `heads` are the columns' titles, and each of `rows` has a text for every column. Columns are two
+    spaces apart, or one if a name needs the room. A name that is still too long stands on a line
+    above its row; heads longer than `HEAD` are folded.
     """
     from rich.cells import cell_len, chop_cells
 

@@ -75,9 +75,10 @@ _IN_WORDS = {
 
 
 def toml(path: Path, where: str) -> dict[str, Any]:
-    """Read a TOML file into tables; `where` names it in messages: `model card models/mine.toml`.
+    """Read a TOML file into tables, as nested dicts.
 
-    Raises UserError if it cannot be read or is no TOML.
+    `where` names the file in messages, such as `model card models/mine.toml`. Raises UserError if
+    it cannot be read or is no TOML.
     """
     try:
         return loads(text_of(path, "settings"), where)
@@ -138,8 +139,8 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
 def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
     """Return a copy of a frozen dataclass with the fields in `settings` set from text.
 
-    `where` names the record in messages. Raises UserError for an unknown field or a value that is
-    not allowed.
+    `settings` has the text of each new value by the field's name; `where` names the record in
+    messages. Raises UserError for an unknown field or a value that is not allowed.
     """
     hints = get_type_hints(type(record), include_extras=True)
     current_values = {name: getattr(record, name) for name in settable(record)}
@@ -179,7 +180,7 @@ def settable(record: Any) -> list[str]:
 
 
 def value_of(usual: object, text: str) -> object:
-    """Convert a text to the type of `usual`: bool, int, float or str.
+    """Convert a text to the type of `usual`, the value that it replaces: bool, int, float or str.
 
     A text that cannot be converted is returned unchanged, for a later type check to refuse.
     """

@@ -35,8 +35,9 @@ def corrected(
 ) -> Estimate | None:
     """Return the mean of values (E,), corrected by control variates; None if it cannot be.
 
-    A control variate is a variable that goes with the values and is known of more layouts than they
-    are. It is None with fewer than `LEAST` values, without further layouts, or if the values or all
+    A layout is one drawn start situation of a scenario, which one episode starts from. A control
+    variate is a variable that goes with the values and is known of more layouts than they are. It
+    is None with fewer than `LEAST` values, without further layouts, or if the values or all
     variables are constant.
 
     Args:
@@ -72,8 +73,9 @@ def corrected(
 def worth(plain: Estimate, better: Estimate) -> float:
     """Return how many times as many layouts the mean `plain` needs to be as precise as `better`.
 
-    It is the squared ratio of the widths of their intervals, at the end farther from the bounds of
-    the values; 1 if not known.
+    Both are estimates of the same mean, over layouts (start situations of episodes). The result is
+    the squared ratio of the widths of their intervals, at the end farther from the bounds of the
+    values; 1 if not known.
     """
     below = plain.value - plain.low, better.value - better.low
     above = plain.high - plain.value, better.high - better.value

@@ -37,11 +37,14 @@ class UserError(Exception):
 
 
 class Unfinished(UserError):
-    """Report that some parts of the work cannot be done; all other parts are done."""
+    """Report that some parts of the work could not be done, while all other parts are done."""
 
 
 class Unanswered(Unfinished):
-    """Report that the model could not be asked; begins with the message of its server or engine."""
+    """Report that the model could not be asked.
+
+    The message begins with that of its server or engine.
+    """
 
     code = 3
 
@@ -66,10 +69,10 @@ def _text_of(thing: object) -> str:
 
 
 def sayable(what: str, name: str, repair: str = "rename it") -> str:
-    """Return `name` unchanged. Raises UserError if terminals or tables cannot show it as it is.
+    """Return `name` unchanged, if terminals and tables can show it as it is.
 
-    That is so if it has control characters, invalid UTF-8 or the separator ` · `. `what` and
-    `repair` are words of the message.
+    Raises UserError if it has control characters, invalid UTF-8 or the separator ` · `. `what` says
+    in the message what is named so, and `repair` what to do.
     """
     if not name.isprintable():
         raise UserError(

@@ -57,9 +57,7 @@ Texts = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Setting:
-    """Describe a setting of a run that an extension adds.
-
-    It is an option of `harness eval` and `harness drive`.
+    """Describe a setting of a run that an extension adds, an option of `harness eval` and `drive`.
 
     A setting of the kind `tuple` holds texts: its option may be repeated, and its default is ().
     `help` is a sentence for people. `behind` names settings, each with its table, such as
@@ -84,7 +82,7 @@ class Setting:
 
     @property
     def table(self) -> str:
-        """The table of files in which it stands behind another; empty for none."""
+        """Return the table of files in which it stands behind another setting; empty for none."""
         beside = self.place or next(iter(self.behind), "")
         return beside.rpartition(".")[0]
 
@@ -163,9 +161,13 @@ def from_python(name: str) -> Any:
 
 
 class OfExtension(NamedTuple):
-    """Name the extension to which a setting belongs, by package metadata."""
+    """Name the extension that a setting belongs to, as package metadata states it.
 
-    extension: str
+    So it is known even if the extension is not installed. `idle` is the setting's value that does
+    nothing, as text; empty for none.
+    """
+
+    extension: str  # the extension's name
     idle: str  # the value that does nothing, as text; empty for none
 
 
@@ -179,9 +181,10 @@ def setting_of_extension(name: str) -> OfExtension | None:
 
 
 def beside() -> dict[str, Setting]:
-    """Return, by name, the settings that extensions add among those of the core.
+    """Return the settings of runs that stand among those of the core, by name.
 
-    The settings of other packages stand in a table of their own in files (`Setting.behind`).
+    They are those that shipped extensions add; the settings of other packages stand in a table of
+    their own in files (`Setting.behind`).
     """
     declared = entries(GROUP)
     settings: dict[str, Setting] = {}
@@ -192,10 +195,10 @@ def beside() -> dict[str, Setting]:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Return names of settings of the core with those that extensions add behind them.
+    """Return the names of settings in the order in which files and help list them.
 
-    A name has its table before it, such as `world.limit`. What stands behind none of them is left
-    out.
+    `names` are those of the core, with the table before each, such as `world.limit`. Those that
+    extensions add come behind them; what stands behind none of them is left out.
     """
     core, order, followers = list(names), list[str](), dict[str, list[str]]()
     others = {each.path(name): each for name, each in beside().items()}
@@ -215,26 +218,27 @@ def _followed(name: str, followers: Mapping[str, Sequence[str]]) -> Iterator[str
 
 
 def owner_of_plugin(kind: str, name: str) -> str | None:
-    """Return the extension that adds the plug-in `name` of a kind such as `contents`, or None.
+    """Return the extension that adds a plug-in, or None.
 
-    It is read from package metadata, so it is known even if the extension is missing.
+    `kind` is the plug-in's kind, such as `contents`, and `name` its name among these. It is read
+    from package metadata, so it is known even if the extension is missing.
     """
     entry = entries(PLUG_INS).get(f"{kind} {name}")
     return _of_entry(entry).extension if entry else None
 
 
 def setting_of_run(name: str) -> OfExtension | None:
-    """Return the extension that adds a setting of runs by a name without its table, or None.
+    """Return the extension that adds the setting `name` of runs, and the value that does nothing.
 
-    The name is that of files, or the option's, with the table where both differ. It is read from
-    package metadata, with the value that does nothing where that is not null.
+    None if no extension adds it. The name is that of files without its table, or the option's; with
+    the table where both differ. It is read from package metadata.
     """
     entry = entries(PLUG_INS).get(f"settings {name}")
     return _of_entry(entry) if entry else None
 
 
 def tables_of_settings() -> set[str]:
-    """Return the names of files' tables that have settings of extensions alone.
+    """Return the names of tables in files of runs whose settings all come from extensions.
 
     They are read from package metadata, which name such a setting by its table and key as well.
     """
@@ -243,16 +247,17 @@ def tables_of_settings() -> set[str]:
 
 
 def control_settings() -> dict[str, str]:
-    """Return, by the name of each control of extensions, the setting that it is: `messages=blind`.
+    """Return the setting that each control of extensions stands for, by the control's name.
 
-    A control is a condition that replaces what helpers say; it is read from package metadata.
+    A control is a condition that replaces what helpers say, to show what cooperation gains; its
+    setting is such as `messages=blind`. It is read from package metadata.
     """
     values = {name: str(entry.value).partition(" ")[2] for name, entry in entries(CONTROLS).items()}
     return {name: setting.strip("[]") for name, setting in values.items()}
 
 
 def part_of(extension: str) -> str:
-    """Return the phrase, for messages, that something is part of an extension not installed."""
+    """Return the phrase that something is part of an extension which is not installed."""
     return f"part of the extension {printable(extension)}, which is not installed"
 
 
@@ -287,16 +292,19 @@ def taken(path: str, table: Iterable[str]) -> bool:
 
 
 def studies() -> Texts:
-    """Return every kind of study and the name that lists give it.
+    """Return the kinds of study and the name that lists give each.
 
-    Kinds of missing extensions are included.
+    Kinds that extensions add are there even where the extension is missing.
     """
     gone = {kind: kind for kind in entries(STUDIES)}
     return {**gone, **joined(formats.STUDIES, "studies")}
 
 
 def added(group: str) -> Mapping[str, Any]:
-    """Return the entry points that extensions add to a plug-in group such as `swarmdrive.rules`."""
+    """Return what extensions add to a plug-in group such as `swarmdrive.rules`, by name.
+
+    Each is like an entry point, which loads the plug-in.
+    """
     if group == GROUP:
         return {}
     kind, declared = group.rpartition(".")[2], entries(GROUP)

@@ -11,7 +11,7 @@ DASH = "–"
 
 
 class Bounded(Protocol):
-    """A value with the ends of its confidence interval; None or NaN if not known."""
+    """Describe a value with the ends of its confidence interval; None or NaN if not known."""
 
     @property
     def value(self) -> float | None: ...
@@ -22,7 +22,10 @@ class Bounded(Protocol):
 
 
 class Counted(Bounded, Protocol):
-    """A value with its interval, and the number n of episodes, decisions or seeds behind it."""
+    """Describe a value with its interval, and the number n behind it.
+
+    n counts the episodes, decisions or seeds that the value is a mean of.
+    """
 
     @property
     def n(self) -> int: ...
@@ -88,7 +91,10 @@ def interval_of(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
 
 
 def within(low: float, high: float) -> str:
-    """Write the larger size of an interval's ends as a bound of a difference: `±5.2 points`."""
+    """Write a bound of a difference that its interval leaves: `±5.2 points`.
+
+    `low` and `high` are the interval's ends, shares from -1 to 1; the farther from 0 is the bound.
+    """
     return f"±{POINTS.text(max(abs(low), abs(high)))}"
 
 
@@ -104,12 +110,19 @@ def some_of(names: Sequence[str], most: int = 3) -> str:
 
 
 def crossed(episodes: int, seeds: int) -> str:
-    """Write the size of a run: `6 episodes × 1 channel seed`."""
+    """Write the size of a run, whose episodes are played with each channel seed.
+
+    It is such as `6 episodes × 1 channel seed`.
+    """
     return f"{amount(episodes, 'episode')} × {amount(seeds, 'channel seed')}"
 
 
 def dataset_size(layouts: int, points: int) -> str:
-    """Write the size of a dataset: `2 layouts, 40 decision points`."""
+    """Write the size of a dataset: `2 layouts, 40 decision points`.
+
+    A layout is one drawn start situation of a scenario; a decision point is a scene of it in which
+    decisions are due.
+    """
     return f"{amount(layouts, 'layout')}, {amount(points, 'decision point')}"
 
 

@@ -77,7 +77,7 @@ MOST_TIMES = 200
 
 
 def opened(path: str | Path, kind: Kind) -> BufferedReader:
-    """Open a file for reading in binary mode; `kind` says how large it may be.
+    """Open a file for reading in binary mode; `kind`, a key of `LARGEST`, says how large it may be.
 
     It is checked after it is opened, so that nothing can replace it in between. Raises OSError, and
     Refused if it is not a regular file or is larger than `LARGEST` of its kind.
@@ -124,7 +124,7 @@ def text_of(path: str | Path, kind: Kind = "text") -> str:
 
 
 def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Decorate a function that reads a file: cache its result until the file is modified."""
+    """Decorate a function that reads a file: its result is kept until the file is modified."""
 
     @lru_cache(maxsize=64)
     def kept(path: Path, written_ns: int) -> T:
@@ -185,7 +185,10 @@ def digest(value: Any) -> str:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Add the file's name to an OSError that the disk is full or fails, which comes without it."""
+    """Enter a context in which errors of the disk name the file `path`.
+
+    An OSError that the disk is full, or fails, comes without it.
+    """
     try:
         yield
     except OSError as error:

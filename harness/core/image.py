@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Image:
-    """Hold a picture as RGB `pixels`, (height, width, 3) uint8."""
+    """Hold a picture as RGB `pixels`, (height, width, 3) uint8, row 0 at the top."""
 
     def __init__(self, pixels: "Pixels") -> None:
         self._pixels = pixels
@@ -23,7 +23,7 @@ class Image:
 
     @cached_property
     def sha256(self) -> str:
-        """Hex SHA-256 digest of the picture's size and pixels, whatever its file format."""
+        """Return the hex SHA-256 digest of the picture's size and pixels."""
         return sha256_bytes(repr(self.pixels.shape).encode() + self.pixels.tobytes())
 
     def png(self) -> bytes:

@@ -58,7 +58,7 @@ def workers_of(text: str) -> Workers:
 
 
 class Executor(Protocol):
-    """Runs items on workers; each submitted item comes back once, as result or `WorkerDied`."""
+    """Run items on workers; each submitted item comes back once, as result or `WorkerDied`."""
 
     def room(self) -> bool:
         """Return whether another item can be submitted."""

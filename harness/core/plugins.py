@@ -94,13 +94,17 @@ def _of_groups(distribution: Any) -> set[tuple[str, str]]:
 def is_ours(entry: Any) -> bool:
     """Return whether an entry point is of this distribution, whose names nobody else's replace.
 
-    A package's may name an object of the harness's: who has the entry point decides.
+    `entry` is an `importlib.metadata.EntryPoint`, or `Added`. A package's may name an object of the
+    harness's: who has the entry point decides.
     """
     return str(entry.value).startswith("harness.") and _name_of(entry.dist) == OURS
 
 
 def package_of(entry: Any) -> str:
-    """Return the package that has an entry point, for messages."""
+    """Return the name of the package that an entry point belongs to, for messages.
+
+    `entry` is an `importlib.metadata.EntryPoint`, or `Added`.
+    """
     return printable(_name_of(getattr(entry, "dist", None)) or "of no name")
 
 
@@ -111,9 +115,10 @@ def _name_of(distribution: Any) -> str:
 
 @dataclass(frozen=True)
 class Added:
-    """An object that an extension adds, as if it were an entry point of the extension's package.
+    """Stand in for an entry point: an object that an extension adds to a group of plug-ins.
 
-    `value` is its place, `module:name`, and `dist` the package's distribution.
+    `value` is its place, `module:name`, and `dist` the distribution of the extension's package, an
+    `importlib.metadata.Distribution`.
     """
 
     value: str  # its place, `module:name`
@@ -221,10 +226,10 @@ class Plugins(Mapping[str, T], Generic[T]):
         }
 
     def ask(self, name: str, question: Callable[[T], Said]) -> Said:
-        """Return `question(plugin)`, such as its description for people.
+        """Return what `question` returns for a plug-in, such as its description for people.
 
-        Raises Failed if the plug-in does not load or its code fails, and UserError if it raises
-        that.
+        The plug-in is that called `name`. Raises Failed if it does not load or its code fails, and
+        UserError if it raises that.
         """
         try:
             plugin = self[name]
@@ -285,7 +290,7 @@ class Plugins(Mapping[str, T], Generic[T]):
 
 
 class Shipped(Plugins[T]):
-    """Plug-ins that the core and extensions that ship have; other packages add none."""
+    """Hold plug-ins that the core and the shipped extensions have; other packages add none."""
 
     def _entries(self) -> Mapping[str, Any]:
         return {name: entry for name, entry in super()._entries().items() if is_ours(entry)}
@@ -294,7 +299,8 @@ class Shipped(Plugins[T]):
 class FilesAndPlugins(Plugins[T]):
     """Hold plug-ins that may also be TOML files, shipped or in the user's project.
 
-    Built-in ones come first, then files, then packages.
+    Built-in ones come first, then files, then packages. `folder` is the name of the folder of these
+    files, such as `channels`.
     """
 
     folder: str  # kind of resource that the files are, such as `channels`

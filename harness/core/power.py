@@ -31,9 +31,10 @@ class Spread:
     variances: Floats  # variance of an episode's difference in each stratum, (..., H)
 
     def episodes(self, difference: float, power: float) -> Floats:
-        """Return how many episodes find a difference (a share) with this power, (...).
+        """Return how many episodes find a difference of success with this power, (...).
 
-        Whole numbers; inf above `MOST`. Found means that the 95 % interval excludes 0.
+        `difference` is one of shares, and `power` the probability that it is found: that the 95 %
+        interval excludes 0. Whole numbers; inf above `MOST`.
         """
         low, high = np.ones(self._shape), np.full(self._shape, MOST)
         for _ in range(HALVINGS):  # of the ratio, since the bracket spans nine orders of magnitude
@@ -43,9 +44,10 @@ class Spread:
         return np.where(high < MOST, np.ceil(high - 1e-6), np.inf)
 
     def difference(self, n: float, power: float) -> Floats:
-        """Return the least difference (a share) that n episodes find with this power, (...).
+        """Return the least difference of success that n episodes find with this power, (...).
 
-        NaN if they find none up to 1. Found means that the 95 % interval excludes 0.
+        It is one of shares; `power` is the probability that it is found: that the 95 % interval
+        excludes 0. NaN if they find none up to 1.
         """
         low, high = np.zeros(self._shape), np.ones(self._shape)
         for _ in range(HALVINGS):
@@ -86,7 +88,7 @@ class Spread:
 
 
 def variance(values: Floats, counts: Ints) -> Floats:
-    """Return the sample variance of E values, (E,), with integer weights, (...).
+    """Return the sample variance of E values, (E,), for each set of integer weights, (...).
 
     `counts`, (..., E), are the weights: how often each value counts. inf where they sum to less
     than 2.

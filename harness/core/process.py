@@ -29,7 +29,7 @@ STREAMS = {"stdin": "r", "stdout": "w", "stderr": "w"}  # in the order of their 
 
 
 class Stop(KeyboardInterrupt):
-    """Raised wherever the program is when SIGTERM or SIGINT comes; it holds the signal's number."""
+    """Report that SIGTERM or SIGINT came, wherever the program is; it holds the signal's number."""
 
     @property
     def word(self) -> str:
@@ -37,7 +37,7 @@ class Stop(KeyboardInterrupt):
 
     @property
     def code(self) -> int:
-        """The exit code as shells have it: 128 plus the signal's number."""
+        """Return the exit code as shells have it: 128 plus the signal's number."""
         return 128 + int(self.args[0])
 
 

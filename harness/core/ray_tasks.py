@@ -36,7 +36,7 @@ COUNT_S = 2.0  # cores are counted again after this time, since nodes come and g
 
 
 class Tasks:
-    """An `Executor` that runs items as tasks on a Ray cluster, which chooses the nodes.
+    """Run items as tasks on a Ray cluster, which chooses the nodes: an `Executor`.
 
     Ray does not retry a task, so that `each` can count deaths of workers. The first item of every
     further node is run again on the first node, and must give the same result.

@@ -36,13 +36,14 @@ def folder(kind: str) -> Path:
 def entries(kind: str, pattern: str) -> list[Path]:
     """List the paths of one kind of resource that match a glob pattern, sorted.
 
-    Both the shipped folder and the project's are searched.
+    A kind is a folder's name, such as `prompts` or `channels`; it is searched where the harness
+    ships it and in the user's project.
     """
     return sorted(path for where in _folders(kind) for path in where.glob(pattern))
 
 
 def names(kind: str) -> list[str]:
-    """Return the sorted names (file stems) of the TOML files of one kind."""
+    """Return the sorted names (file stems) of the TOML files of one kind, such as `channels`."""
     return sorted({path.stem for path in entries(kind, "*.toml")})
 
 
@@ -77,7 +78,7 @@ def find(kind: str, name: str) -> Path:
 
 
 def card_to_copy(model: str) -> str | None:
-    """Return the advice for a model whose card no longer ships: where it is and where to copy it.
+    """Return the advice for a model whose card no longer ships: where it is, where to copy it.
 
     None for all other names.
     """

@@ -29,10 +29,10 @@ KEY, KEY_BYTES = "seal.key", 32
 
 
 def seal(content: Mapping[str, bytes], place: str) -> str | None:
-    """Return the seal of files by name, which belong to `place`; None if there is no key.
+    """Return the seal of files, a digest that only this user's key makes; None if there is no key.
 
-    A seal of the same files at another place is another one. There is no key where the cache folder
-    cannot be written.
+    `content` has the files' bytes by name; `place` names what they belong to, such as their folder:
+    for another name the seal is another. There is no key where the cache folder cannot be written.
     """
     key = _key()
     if key is None:

@@ -33,10 +33,13 @@ TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}
 
 @dataclass(frozen=True)
 class Shard:
-    """Name part `number`, from 1, of the `of` equal parts into which some work is divided."""
+    """Name one of the equal parts into which some work is divided, to be done apart.
 
-    number: int
-    of: int
+    It is part `number`, from 1, of `of` parts.
+    """
+
+    number: int  # which part, from 1
+    of: int  # how many parts there are
 
     def __str__(self) -> str:
         return f"{self.number}/{self.of}"
@@ -118,10 +121,10 @@ def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
 
 @contextmanager
 def made_whole(folders: Sequence[Path], out: Path) -> Iterator[None]:
-    """Make one dataset or run of its shards (parts of the work), in the folder `out`.
+    """Turn errors of damaged shards into a UserError, while code makes the whole in folder `out`.
 
-    The code inside does that of what the shards' files in `folders` state. Raises UserError where
-    that makes none; then `out` is not there if it was not before.
+    The context is entered around code that makes one dataset or run of what the files of its shards
+    (parts of the work) in `folders` state. If it fails, `out` is not there if it was not before.
     """
     was_there = out.exists()
     try:
@@ -161,8 +164,10 @@ def owners(
 ) -> dict[str, Path]:
     """Return the path of each part of the work, by its name, in the folder of its shard.
 
-    `parts` are the names of all parts, in order; `label` gives a part's name in messages. Raises
-    UserError if a shard is not finished, or a part differs between two folders.
+    A part is a file or folder of the working folder, such as that of an episode. `folders` and
+    `configs` are those of the shards, in the same order; `parts` are the names of all parts, in
+    order; `label` gives a part's name in messages. Raises UserError if a shard is not finished, or
+    a part differs between two folders.
     """
     paths: dict[str, Path] = {}
     for folder, config in zip(folders, configs, strict=True):

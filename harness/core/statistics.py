@@ -24,7 +24,12 @@ ROUNDING = 1e-18
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and its confidence interval."""
+    """Hold a mean, `value`, and the ends of its confidence interval, `low` and `high`.
+
+    `n` is the number of independent units behind it, such as episodes, pairs of episodes or seeds,
+    and `n_excluded` how many more were left out because their value is NaN. What is not known is
+    NaN.
+    """
 
     value: float  # the mean; NaN if there was nothing to average
     low: float  # lower end of the interval; NaN if the data cannot bound it
@@ -58,10 +63,11 @@ def brier(p: Floats, target: Floats) -> Floats:
 def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
     """Return -ln of the probability that intents give to the safe ones of A actions, `(...)`.
 
-    Both arguments are `(..., A)`: probabilities, and which actions are safe. This is the
-    logarithmic score (Good 1952) of the event that the action is safe, in nats; 0 is best. How the
-    probability is spread among safe actions does not matter. NaN where no action is safe. An answer
-    that is sure and wrong costs -ln(`LEAST_MASS`) = 9.2.
+    `p`, `(..., A)`, has the probabilities, and `safe`, `(..., A)`, says after which actions the
+    episode can still succeed. This is the logarithmic score (Good 1952) of the event that the
+    action is safe, in nats; 0 is best. How the probability is spread among safe actions does not
+    matter. NaN where no action is safe. An answer that is sure and wrong costs -ln(`LEAST_MASS`) =
+    9.2.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
     # Rounding may put the mass of a distribution slightly above 1.
@@ -71,8 +77,8 @@ def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
 def seed_interval(per_seed_means: Floats) -> Estimate:
     """Return the mean over S seeds, `(S,)`, with Student's 95 % interval.
 
-    Each value is the mean of one seed; the paper's error bars are made so. With one seed, or if all
-    have the same mean, the ends are NaN.
+    Each value is the mean of one channel seed, which keys the draws of lost messages; the paper's
+    error bars are made so. With one seed, or if all have the same mean, the ends are NaN.
     """
     return _student(per_seed_means, np.arange(len(per_seed_means)))
 
@@ -96,7 +102,7 @@ def episode_interval(
 
 
 def known_mean(values: Floats, axis: int) -> Floats:
-    """Return the mean along an axis, NaN left out; NaN where all values are."""
+    """Return the mean along an axis, which is dropped; NaN are left out, or returned if all are."""
     is_known = ~np.isnan(values)
     count = np.sum(is_known, axis=axis)
     total = np.sum(np.where(is_known, values, 0.0), axis=axis)
@@ -106,8 +112,9 @@ def known_mean(values: Floats, axis: int) -> Floats:
 def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
     """Return the mean of n shares from 0 to 1, with Wilson's interval for their effective size.
 
-    Values are `(n,)`, NaN left out. `episodes` is the episode of each value, `(n,)`; by default
-    each is its own. Values of one episode count as clustered (`_effective_n`).
+    `values` are `(n,)`, NaN left out. `episodes`, `(n,)`, has the number of each value's episode;
+    by default each value has one of its own. Values of one episode count as clustered
+    (`_effective_n`).
     """
     is_known = ~np.isnan(values)
     n, n_excluded = int(is_known.sum()), int((~is_known).sum())
@@ -121,7 +128,10 @@ def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
 
 
 def wilson(rate: float, n: float, level: float = LEVEL) -> tuple[float, float]:
-    """Return the ends of Wilson's score interval (1927) of a share `rate` observed in n trials."""
+    """Return the ends of Wilson's score interval (1927) of a share `rate` observed in n trials.
+
+    `level` is the confidence of the interval.
+    """
     z = _normal(level)
     centre = (rate + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * math.sqrt(rate * (1 - rate) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
@@ -247,8 +257,8 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
     """Return the unweighted mean of independent estimates, with an interval combined from theirs.
 
     The distances of the ends from the values are combined as the root of their sum of squares
-    ("MOVER": Zou and Donner 2008), so the level is theirs. The estimates are taken as fixed, not as
-    a sample of more. NaN where any estimate is.
+    ("MOVER": Zou and Donner 2008), so the level of confidence is that of the estimates. They are
+    taken as fixed, not as a sample of more. NaN where any estimate is.
     """
     value = np.array([estimate.value for estimate in estimates])
     low = np.array([estimate.low for estimate in estimates])
@@ -272,8 +282,9 @@ def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
 def resampled_estimate(values: Floats, n: int) -> Estimate:
     """Return a figure of n units with the 95 % percentile interval of its bootstrap.
 
-    `values` are the figure itself, then that of each resample, in the order of `resampled`, `(1 +
-    times,)`. NaN resamples are left out; if the figure itself is NaN, there is no interval.
+    A unit is what is drawn with replacement, such as an episode. `values`, `(1 + times,)`, are the
+    figure itself, then that of each resample, in the order of `resampled`. NaN resamples are left
+    out; if the figure itself is NaN, there is no interval.
     """
     resamples = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]):

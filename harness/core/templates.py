@@ -324,7 +324,10 @@ class _Namespace(Namespace):
 
 
 class Code(CodeGenerator):
-    """Jinja's code generator; its code charges the budget for what it reads, joins and repeats."""
+    """Generate the code of a template, which charges the budget for what it reads.
+
+    It does so for what it joins and repeats, too.
+    """
 
     environment: "Sandbox"
 
@@ -401,7 +404,7 @@ def _cost(body: Iterable[nodes.Node]) -> int:
 
 
 class Bounded(Template):
-    """A compiled template, each of whose renderings begins with the full budget of steps."""
+    """Hold a compiled template, each of whose renderings begins with the full budget of steps."""
 
     def render(self, *given: Any, **named: Any) -> str:
         begin()
@@ -409,7 +412,7 @@ class Bounded(Template):
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """A Jinja environment for untrusted templates; each rendering is limited to `MOST_STEPS` steps.
+    """Compile untrusted Jinja templates; each rendering is limited to `MOST_STEPS` steps.
 
     Compiling raises jinja2.TemplateSyntaxError for an invalid template and for one that is too
     long.

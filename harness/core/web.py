@@ -24,7 +24,7 @@ WAITING = 64
 
 
 class HeadInTime(H11Protocol):
-    """HTTP protocol of uvicorn that limits how long a request's line and headers may take.
+    """Limit how long a request's line and headers may take, in uvicorn's HTTP protocol.
 
     A connection is closed after `HEAD_S` seconds without a complete head. At most `WAITING`
     connections may wait for one; of more, the one that waited longest is closed.

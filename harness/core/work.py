@@ -33,7 +33,11 @@ SHORT = 30  # most characters of a setting's value that a message has
 
 
 class WorkStart(msgspec.Struct, frozen=True, kw_only=True):
-    """Hold the settings that a piece of work began with, as stored in its working folder."""
+    """Hold the settings that a piece of work began with, as stored in its working folder.
+
+    `settings` are plain values that must be the same for the work to be resumed; `shard` says which
+    part of the work it is, such as `3/16`, empty for the whole.
+    """
 
     settings: dict[str, Any]  # plain values that must be the same for the work to be resumed
     shard: str = ""  # which part of the work this is, such as `3/16`; empty for the whole

@@ -20,7 +20,10 @@ MARKS = {"ego": ("maneuver", "action_distribution"), "helper": FIELDS["helper"]}
 
 
 class Answer(Struct, frozen=True):
-    """Hold an answer that was read from an object: its intent, and the repairs that it took.
+    """Hold an answer that was read from a JSON object: its intent, and the repairs that it took.
+
+    An intent is the probabilities that a vehicle gives to the ego's actions. A repair is one
+    correction without which the text could not be read.
 
     `intent` has the probabilities in the order of the actions, and `mass` their sum as stated; None
     without any. `message` is a helper's evidence, risk, maneuver and confidence, None of the ego;
@@ -29,8 +32,9 @@ class Answer(Struct, frozen=True):
 
     intent: values.Intent  # probabilities in the order of the actions
     mass: float | None  # sum of the probabilities as stated; None without any
-    message: dict[str, Any] | None  # a helper's evidence, risk, maneuver and confidence
-    repairs: frozenset[Repair]
+    # a helper's evidence, risk, maneuver and confidence; None of the ego
+    message: dict[str, Any] | None
+    repairs: frozenset[Repair]  # the repairs that reading it took
     extension: dict[str, Any] | None = None  # further members that the prompt asked for
 
     def mended(self, repair: Repair) -> "Answer":
@@ -45,9 +49,9 @@ def read(
 ) -> Answer:
     """Read an answer of this shape from the members of a JSON object.
 
-    With `divides`, probabilities of any sum above 0 are divided by it. `so_far` are the repairs
-    that finding the object took. Raises Failure, with all statuses that apply, if the members give
-    no intent.
+    `shape` says which members the prompt asked for. With `divides`, probabilities of any sum above
+    0 are divided by it. `so_far` are the repairs that finding the object took. Raises Failure, with
+    all statuses that apply, if the members give no intent.
     """
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
@@ -170,9 +174,10 @@ def _judgement(
 
 
 def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
-    """Return the intent of one action with a confidence, the rest spread evenly over others.
+    """Return the intent of an answer that names one action, the rest spread evenly over others.
 
-    `maneuver` is that action and `confidence` its probability; the order is that of `actions`.
+    `maneuver` is that action and `confidence` its probability. The result has the probabilities of
+    all `actions`, in their order.
     """
     if len(actions) == 1:
         return (1.0,)

@@ -28,7 +28,7 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 
 @dataclass(frozen=True)
 class Candidate:
-    """Hold an object in a completion that is shaped like an answer.
+    """Hold an object in a completion (a model's text) that is shaped like an answer.
 
     `repairs` are those that reading its `members` took. `lost` are repairs to drop later: they
     would report as missing what merely could not be read.
@@ -54,10 +54,10 @@ def candidates(
 ) -> list[Candidate]:
     """Return all objects in a text that could be the answer, in the order of the text.
 
-    The text is without thought and special tokens. `cut` says that the token limit ended it; then
-    an open bracket is not closed. With `reasons_first` the prompt asked for reasons before the
-    answer, and prose there is no repair. Raises Failure (no_json, label_only, truncated_json,
-    syntax or missing_action) if there is no candidate.
+    The text is a model's, without thought and special tokens; `role` is `ego` or `helper`. `cut`
+    says that the token limit ended it; then an open bracket is not closed. With `reasons_first` the
+    prompt asked for reasons before the answer, and prose there is no repair. Raises Failure
+    (no_json, label_only, truncated_json, syntax or missing_action) if there is no candidate.
     """
     escapes: frozenset[Repair] = frozenset()
     objects = _objects(text, cut)
@@ -106,7 +106,7 @@ def candidates(
 
 
 def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Return the start and end of each candidate in a text.
+    """Return where each object that could be the answer stands in a text, as start and end.
 
     Empty if `candidates` must change the text to find any.
     """

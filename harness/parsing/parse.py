@@ -46,10 +46,14 @@ _ECHO = re.compile(
 class Parsed(Struct, frozen=True):
     """Hold the result of parsing one completion: a status, and an intent unless it failed.
 
+    A completion is a model's text, an intent the probabilities that a vehicle gives to the ego's
+    actions, and a repair one correction without which the text could not be read.
+
     `repairs` is empty unless the status is recovered. If it failed, `intent` (probabilities in the
     order of the actions) and `message` (a helper's evidence, risk, recommended maneuver and
-    confidence) are None, and `faults` has all that is wrong. `mass` is the probabilities' sum as
-    written, None without; `reasoning` is the model's thought, None without.
+    confidence) are None, `faults` has all that is wrong, and `detail` says it in a sentence. `mass`
+    is the probabilities' sum as written, None without; `reasoning` is the model's thought, None
+    without. `extension` has what the prompt asked for beside the decision, None without.
     """
 
     status: Status  # the outcome

@@ -56,14 +56,18 @@ def fields_of(members: dict[str, Any], role: str, actions: Sequence[str]) -> set
 
 
 def decides(fields: set[str], role: str) -> bool:
-    """Return whether these fields of an answer name an action or a distribution."""
+    """Return whether an answer with these fields has what decides: an action or a distribution.
+
+    `role` is `ego` or `helper`.
+    """
     return not fields.isdisjoint((_DISTRIBUTION, NAMED[role]))
 
 
 def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list[Found]:
-    """Return the answers that a model wrote into a JSON Schema, each with the repairs.
+    """Return the answers that a model wrote into a JSON Schema that it was shown.
 
-    They are beside the schema's keywords, or under `properties` in place of types.
+    Each comes with the repairs that it took. They stand beside the schema's keywords, or under
+    `properties` in place of types.
     """
     answers: list[Found] = []
     outer = {key: value for key, value in schema.items() if key not in _OF_A_SCHEMA}
@@ -77,9 +81,9 @@ def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list
 
 
 def distribution_in(value: object, actions: Sequence[str]) -> tuple[Any, frozenset[Repair]]:
-    """Return the distribution in a text or under a schema's `properties`, and the repairs.
+    """Return the distribution over actions that stands in a text, and the repairs that it took.
 
-    Any other value is returned as it is.
+    It may stand under a schema's `properties`, too. Any other value is returned as it is.
     """
     value, repairs = decoded(value)
     inner = _properties(value)
@@ -110,7 +114,7 @@ def _states(members: dict[str, Any], role: str, actions: Sequence[str]) -> bool:
 def gathered(
     members: dict[str, Any], role: str, actions: Sequence[str], apart: Sequence[str]
 ) -> Found:
-    """Return an answer's members, with fields from one level deeper moved up, and the repairs.
+    """Return an answer's members, with its fields moved up from one level deeper, and the repairs.
 
     Members named in `apart` are left alone. Raises Failure (conflicting_answers) if two members
     have the same field.

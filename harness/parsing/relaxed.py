@@ -48,7 +48,7 @@ _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "b": "\b", "f": "\f", "\n": ""}
 
 
 class Repeated(dict[str, Any]):
-    """An object in which a key was repeated; it holds the last value of each key."""
+    """Hold an object in which a key was repeated, with the last value of each key."""
 
 
 class Broken(Exception):
@@ -70,13 +70,15 @@ class Unfinished(Exception):
 class Reading:
     """Hold a value that was read from almost-JSON, with the repairs that it took.
 
+    Almost-JSON is JSON with the slips of models, such as comments or bare keys.
+
     `end` is where it ends in the text; `closed_by_end` is true if brackets were still open there.
     """
 
-    value: Any = None
-    end: int = 0
-    repairs: set[Repair] = field(default_factory=set)
-    closed_by_end: bool = False
+    value: Any = None  # the value, as Python has it
+    end: int = 0  # index in the text behind it
+    repairs: set[Repair] = field(default_factory=set)  # the repairs that reading it took
+    closed_by_end: bool = False  # whether brackets were still open at the text's end
 
 
 def from_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -130,7 +132,10 @@ def next_token(text: str, at: int) -> Token:
 
 
 def read(text: str, at: int) -> Reading:
-    """Read the object of almost-JSON whose brace is at `at`. Raises `Broken` or `Unfinished`."""
+    """Read the object of almost-JSON whose opening brace is at index `at` of a text.
+
+    Raises Broken if what stands there is no object, Unfinished if the text ends inside it.
+    """
     return _Reader(text, at).run()
 
 

@@ -21,7 +21,11 @@ class _Documented(StrEnum):
 
 
 class Status(_Documented):
-    """State the outcome of parsing a completion; all but the first two give no intent."""
+    """State the outcome of parsing a completion, a model's text.
+
+    All but the first two give no intent, the probabilities that a vehicle gives to the ego's
+    actions.
+    """
 
     STRICT = (
         "strict",
@@ -184,7 +188,7 @@ def noted(failures: list[Failure]) -> Iterator[None]:
 
 
 def joined(failures: Sequence[Failure]) -> Failure:
-    """Return one failure with the faults of all `failures`.
+    """Return one failure with the faults (statuses that apply) of all `failures`.
 
     Its status is the first one's, but an echo of the prompt goes first: it was never meant.
     """

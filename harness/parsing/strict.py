@@ -18,9 +18,9 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 def fitting(text: str, shape: Shape) -> Answer | None:
-    """Return the answer if the text is exactly JSON of this shape, and its probabilities sum to 1.
+    """Return the answer if a text is exactly JSON of this shape, and its probabilities sum to 1.
 
-    Else None.
+    None for any other text, which then takes repairs or fails.
     """
     try:
         value = DECODER.decode(text)

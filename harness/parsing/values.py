@@ -90,9 +90,9 @@ def distribution(
 ) -> tuple[Intent, float]:
     """Return the probabilities in the order of `actions`, summing to 1, and their sum as stated.
 
-    `value` is what the answer gives for the distribution. Repairs that it took are added to
-    `repairs`; with `divides` any sum above 0 is divided out. Raises Failure, with all statuses that
-    apply, if `value` is no such distribution.
+    `value` is what the answer gives for the distribution. Repairs (corrections) that it took are
+    added to `repairs`; with `divides` any sum above 0 is divided out. Raises Failure, with all
+    statuses that apply, if `value` is no such distribution.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)
@@ -212,8 +212,8 @@ def is_placeholder(value: object) -> bool:
 def is_placeholder_text(text: str, shape: Shape) -> bool:
     """Return whether a text is a placeholder of a prompt: max 12 words, <text>, low|medium.
 
-    It is one of the prompt that asked (`shape.placeholders`), one that any prompt may use, or
-    several choices of such.
+    A placeholder is what a prompt shows in place of a value. It is one of the prompt that asked
+    (`shape.placeholders`), one that any prompt may use, or several choices of such.
     """
     if _WORDS.fullmatch(text.strip().strip(".").strip() or text.strip()):
         return True

@@ -29,15 +29,15 @@ class Mark(NamedTuple):
     %}A{% or %}B{% endeither %}`, or with `order`.
     """
 
-    start: int
-    end: int
+    start: int  # where it begins in the template's text
+    end: int  # where the text after it begins
     order: bool  # whether its parts are ordered, and not chosen from
-    name: str
-    parts: list[str]
+    name: str  # marks of one name in both templates are one choice
+    parts: list[str]  # the texts between its tags
 
     @property
     def choices(self) -> int:
-        """Number of alternatives: that of the parts, or of their permutations."""
+        """Return the number of alternatives: that of the parts, or of their permutations."""
         return factorial(len(self.parts)) if self.order else len(self.parts)
 
     def alternative(self, number: int) -> str:

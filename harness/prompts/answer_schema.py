@@ -25,6 +25,8 @@ EVIDENCE_CHARS = 200
 class Shape(NamedTuple):
     """Describe what an answer's JSON must look like; it decides the schema and the parser.
 
+    A meta-action is what the ego can do in one decision, such as to go slower.
+
     `role` is `ego` or `helper`, `actions` are the names of meta-actions in order, and `form` is one
     of the role's `FORMS`, None for any of them. `extension` has the schemas of further members as
     JSON, empty for none; `placeholders` are what the prompt shows in place of values.
@@ -45,7 +47,7 @@ class Shape(NamedTuple):
 
     @property
     def named(self) -> str | None:
-        """Key of the action that the answer names with a confidence; None for a distribution."""
+        """Return the key of the action that the answer names; None for a distribution."""
         return None if self.form == "distribution" else NAMED[self.role]
 
     @property
@@ -63,9 +65,9 @@ def answer_schema(
 ) -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of one role's answer; the arguments are a `Shape`'s.
 
-    An answer has one of two forms: a distribution over the actions, or one action with a
-    confidence. `scenario` is in the title only, and `placeholders` nowhere. Raises UserError for an
-    unknown role.
+    A role is `ego` or `helper`. An answer has one of two forms: a distribution over the actions, or
+    one action with a confidence. `scenario` is in the title only, and `placeholders` nowhere.
+    Raises UserError for an unknown role.
     """
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)
@@ -105,9 +107,9 @@ def closed(properties: Mapping[str, Any]) -> dict[str, Any]:
 
 @lru_cache
 def constrained_schema(shape: Shape) -> Mapping[str, Any]:
-    """Return the JSON Schema by which decoding is constrained, for a shape whose `form` is set.
+    """Return the JSON Schema by which decoding is constrained: a model can write nothing else.
 
-    A helper's evidence is an empty text in it.
+    The `form` of `shape` must be set. A helper's evidence is an empty text in it.
     """
     schema = answer_schema(shape.role, shape.actions, form=shape.form, extension=shape.extension)
     schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
@@ -154,7 +156,7 @@ def longest(schema: Mapping[str, Any]) -> int:
 
 
 def plainest(schema: Mapping[str, Any]) -> Any:
-    """Return a minimal value that fits a schema: an empty text, the first choice, 0."""
+    """Return a minimal value that fits a JSON Schema: an empty text, the first choice, 0."""
     if "enum" in schema:
         return schema["enum"][0]
     match schema["type"]:

@@ -13,30 +13,32 @@ REPAIR = "repair"  # any call with the turn that follows an answer that cannot b
 
 
 class Outside(NamedTuple):
-    """Describe a rendered prompt whose number of tokens is outside the version's budget.
+    """Describe a rendered prompt that has more or fewer tokens than its prompt version allows.
 
     `messages` counts those of helpers in it, `call` is a role, `FUSION` or `REPAIR`, and `tokens`
-    its size.
+    its size. `scene` and `viewer` are ids; the viewer is the vehicle that is asked.
     """
 
     scene: str  # its id
-    viewer: str
+    viewer: str  # id of the vehicle that is asked
     messages: int  # how many helpers' messages it has
     call: str  # a role, `FUSION` or `REPAIR`
-    tokens: int
+    tokens: int  # its size
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Hold the token counts of all rendered prompts, and those outside the version's budget.
+    """Hold the token counts of all rendered prompts, and the prompts outside the version's budget.
 
-    `tokens` lists them by kind of call: `ego`, `helper`, `fusion` (the ego with messages) or
-    `repair` (one that asks again after an answer that could not be parsed).
+    The budget is the least and the most tokens that the version allows. A kind of call is `ego`,
+    `helper`, `fusion` (the ego with helpers' messages) or `repair` (one that asks again after an
+    answer that could not be parsed). `tokens` lists the counts by kind of call, and `outside` has
+    the prompts that are outside.
     """
 
     # by call: a role, `FUSION` or `REPAIR`
     tokens: dict[str, list[int]] = field(default_factory=dict)
-    outside: list[Outside] = field(default_factory=list)
+    outside: list[Outside] = field(default_factory=list)  # the prompts outside the budget
 
 
 def measure(
@@ -47,12 +49,12 @@ def measure(
     picture: int,
     progress: Callable[[int], None],
 ) -> Sizes:
-    """Render every prompt of some scenes, and return their sizes in tokens.
+    """Render every prompt that some scenes can give, and return their sizes in tokens.
 
     These are the prompt of every viewer, and that of the ego with the longest possible messages of
-    one helper, of two, and so on. `count` returns the tokens of a chat's messages; None renders and
-    counts nothing. A picture beside a text costs `picture` tokens. `progress` is called with 1
-    after each scene.
+    one helper, of two, and so on. `data` is the dataset of the scenes. `count` returns the tokens
+    of a chat's messages; None renders and counts nothing. A picture beside a text costs `picture`
+    tokens. `progress` is called with 1 after each scene.
     """
     words, (least, most) = data.scenario.prompt_words, prompt.token_budget
     turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}

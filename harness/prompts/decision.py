@@ -37,6 +37,8 @@ CARE = {
 class Question:
     """State a choice between actions, or between other options that a client of a server gives.
 
+    A decision model gives each option a probability.
+
     `state` is what the prompt says of the scene, `instructions` what is asked, and `meanings` what
     each option means, None where nobody says.
     """
@@ -44,7 +46,7 @@ class Question:
     state: str  # what the prompt says of the scene
     instructions: str  # what is asked, in the scenario's words
     meanings: Mapping[str, str | None]  # of each action or other option; None where nobody says
-    kind: Kind = "choice"
+    kind: Kind = "choice"  # how servers of decision models type it
 
     def reworded(self, change: Callable[[str], str]) -> "Question":
         """Return the question with `change` applied to all of its texts."""
@@ -94,8 +96,9 @@ def letter_chat(
 ) -> tuple[Mapping[str, str], ...]:
     """Return the chat messages that ask a chat model a decision model's question, by one letter.
 
-    The actions are listed in `order`, after the state, which all orders share. `messages` are the
-    prompt's chat about the same scene; a picture stays with the last of them.
+    A decision model gives each option of a question a probability; a chat model does so by the
+    letter before it. The actions are listed in `order`, after the state, which all orders share.
+    `messages` are the prompt's chat about the same scene; a picture stays with the last of them.
     """
     meant = (question.meanings[action] for action in order)
     options = [

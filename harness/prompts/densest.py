@@ -21,7 +21,11 @@ EVIDENCE = dense(EVIDENCE_CHARS)
 
 
 def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Return a message of each sender, for `Prompt.render`, that takes the most tokens."""
+    """Return a message of each sender, for `Prompt.render`, that takes the most tokens.
+
+    `senders` are helpers' ids, `actions` the names of meta-actions. The messages serve to find the
+    longest prompt.
+    """
     share = round(1 / len(actions), 2)
     return [
         {
@@ -37,7 +41,11 @@ def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Map
 
 
 def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Return a plan of each sender, for `Prompt.render`, that takes the most tokens."""
+    """Return a plan of each sender, for `Prompt.render`, that takes the most tokens.
+
+    A plan is what a vehicle that decides for itself says it will do. `senders` are vehicles' ids,
+    `actions` the names of meta-actions.
+    """
     share = round(1 / len(actions), 2)
     return [
         {

@@ -79,7 +79,7 @@ class PromptChange:
 
 @dataclass(frozen=True)
 class Sent:
-    """Compare the messages about one scene as versions A and B render them.
+    """Compare the messages about one scene that prompt versions A and B send to a model.
 
     `words` and `tokens` count A's and B's, None for tokens without a tokenizer; `parts` are the
     differences by part, such as the system message. The comparison is before any chat template of a
@@ -104,7 +104,10 @@ def change(a: Prompt, b: Prompt) -> PromptChange:
 
 
 def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
-    """Return a version with the ego's part of the version `ego` and the helper's of `helper`."""
+    """Return a prompt version with the ego's part of `ego` and the helper's part of `helper`.
+
+    It is for a run whose ego and helpers have prompts of different versions.
+    """
     of_ego, of_helper = (prompt.examples or Examples("") for prompt in (ego, helper))
     examples = Examples(of_ego.scenario or of_helper.scenario, of_ego.ego, of_helper.helper)
     return replace(
@@ -140,7 +143,7 @@ def sent(
     scenario: Scenario,
     count: Callable[[Iterable[Mapping[str, str]]], int] | None = None,
 ) -> list[Sent]:
-    """Render what versions A and B ask about a scene, and compare it call by call.
+    """Render what prompt versions A and B ask about a scene, and compare it call by call.
 
     The calls are that of the ego, of its first helper, and of the ego with a message of every
     helper. `scenario` gives the actions and words of the prompts. `count` counts the tokens of chat

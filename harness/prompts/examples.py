@@ -20,7 +20,11 @@ EXAMPLES = "examples.json"
 
 
 class Example(Struct, frozen=True):
-    """Hold one few-shot example: an earlier turn of the chat with the right answer."""
+    """Hold one few-shot example: an earlier turn of the chat with the right answer.
+
+    `layout_seed` is the seed of the start situation that it comes from, `graph` what the vehicle
+    that is asked sees there, and `answer` the text that the model should have given.
+    """
 
     layout_seed: int  # seed of the layout that it comes from
     graph: SceneGraph  # the viewer's scene graph, which the version's template renders
@@ -30,7 +34,9 @@ class Example(Struct, frozen=True):
 class Examples(Struct, frozen=True):
     """Hold the few-shot examples of a prompt version by role, in the order they are shown in.
 
-    `scenario` is the one that they come from, and may be shown in, unless `everywhere` is true.
+    A few-shot example is an earlier turn of the chat with the right answer; those of `ego` ask the
+    ego, those of `helper` a helper. `scenario` is the one that they come from, and may be shown in,
+    unless `everywhere` is true.
     """
 
     # the scenario that they come from, and the only one in which they may be shown, unless
@@ -71,10 +77,10 @@ class Examples(Struct, frozen=True):
 
 
 def read(text: str, where: str) -> Examples:
-    """Parse the JSON text of a version's `examples.json`; `where` names the file in messages.
+    """Parse the JSON text of the file `examples.json` of a prompt version.
 
-    Raises UserError if it is no JSON or lacks something, or an example is of another role or not of
-    a train seed.
+    `where` names the file in messages. Raises UserError if it is no JSON or lacks something, or an
+    example is of another role, or of a layout seed that is not for training.
     """
     table = json_loads(text, where)
     if not isinstance(table, dict):

@@ -11,9 +11,9 @@ _MEMBER = re.compile(r'"[^"\n]*"\s*:\s*("[^"\n]*"(?=\s*[,}\n])|[^,{}\n]+)')
 
 
 def placeholders(template: str) -> tuple[str, ...]:
-    """Return the values in the JSON answer that a template shows, such as `max 12 words`.
+    """Return what a template writes in place of values in the JSON answer that it shows.
 
-    A value ends where Jinja fills something in.
+    It is such as `max 12 words`. A value ends where Jinja fills something in.
     """
     text = _JINJA.sub(_FILLED, template)
     values = [

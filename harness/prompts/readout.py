@@ -33,7 +33,7 @@ def letters(actions: Sequence[str]) -> str:
 
 
 def cyclic(actions: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the cyclic orders of the actions, so that each action gets each letter once."""
+    """Return the A cyclic orders of A actions, in which each action has each letter once."""
     return [(*actions[start:], *actions[:start]) for start in range(len(actions))]
 
 
@@ -71,7 +71,7 @@ def letter_chat(
 def answer_json(actions: Sequence[str], shares: Sequence[float]) -> str:
     """Return the JSON of an answer whose probabilities are these shares of the actions.
 
-    They are divided by their sum and rounded to millionths.
+    `shares` has one for each action, of any sum: they are divided by it and rounded to millionths.
     """
     total = math.fsum(shares)
     p = rounded([share / total for share in shares], parts=10**6)

@@ -55,7 +55,7 @@ LONGEST_CHAIN = 3  # filters one after another that need not pay
 
 
 class Code(templates.Code):
-    """Jinja's code generator with shorter code for what prompts do most, of the same result.
+    """Generate shorter code for what prompts do most, with the same result as Jinja's generator.
 
     `_at` is a variable of the generated code, which no template can name.
     """
@@ -167,7 +167,7 @@ def _bare(node: nodes.Filter, name: str) -> bool:
 
 
 class Sandbox(templates.Sandbox):
-    """A Jinja environment for prompt templates, with fewer operators and filters than its base.
+    """Compile prompt templates with Jinja, with fewer operators and filters than its base class.
 
     `graph.ego` always means the member of that name; no method of a mapping hides it.
     """

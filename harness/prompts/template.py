@@ -14,6 +14,8 @@ from harness.prompts.sandbox import Sandbox
 class Template:
     """Hold a compiled prompt template.
 
+    A block is a named part of it, such as the system message.
+
     Attributes:
         blocks: names of its blocks.
         reads: every name that occurs in it, and so every variable that it reads.

@@ -48,7 +48,11 @@ OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})
 
 @dataclass(frozen=True)
 class Prompt:
-    """Hold one prompt version: its templates and settings turn scene graphs into chats.
+    """Hold one prompt version, which turns scene graphs into chats: its templates and settings.
+
+    A version is a folder of templates, one for each role: `ego` or `helper`. A scene graph is what
+    one vehicle, the viewer, sees of a scene. `version` is the folder's name, `released` whether it
+    may no longer change.
 
     `texts` has the templates by role, and `max_answer_tokens` the most tokens of an answer by role;
     `token_budget` bounds those of a rendered prompt. `helper_answer` and `ego_answer` are the forms
@@ -127,7 +131,10 @@ class Prompt:
 
     @cached_property
     def repair_turn(self) -> tuple[str, ...]:
-        """Roles whose template has a block `repair`: an unreadable answer is asked for again."""
+        """Return the roles whose unreadable answers are asked for again.
+
+        Their template has a block `repair`.
+        """
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
     def form(self, role: str) -> str:
@@ -139,7 +146,10 @@ class Prompt:
 
     @cached_property
     def placeholders(self) -> Mapping[str, tuple[str, ...]]:
-        """By role, the values of a JSON answer that the template shows, such as `max 12 words`."""
+        """Return what templates write in place of values in the JSON answer that they show.
+
+        It is such as `max 12 words`, by role.
+        """
         texts = self.texts if self._templates else {}  # which raises what is wrong with a text
         return {role: placeholders(resolved(text)) for role, text in texts.items()}
 
@@ -266,9 +276,10 @@ class Prompt:
 
 
 def listed(graph: "SceneGraph", most: int) -> list[int]:
-    """Return the indices of at most `most` nodes, those that a prompt lists.
+    """Return the indices of the nodes of a scene graph that a prompt lists, at most `most` of them.
 
-    Those in conflict with the ego come first, then the nearest to the viewer.
+    A node is a vehicle that the viewer knows of. Those in conflict with the ego come first, then
+    the nearest to the viewer.
     """
     meets = {conflict.vehicle for conflict in graph.conflicts}
     order = [(node.id not in meets, node.forward_m**2 + node.left_m**2) for node in graph.nodes]
@@ -278,7 +289,8 @@ def listed(graph: "SceneGraph", most: int) -> list[int]:
 def soonest(conflicts: Sequence["Conflict"]) -> list[int]:
     """Return the indices of conflicts in the order in which the ego reaches them.
 
-    Those that it never reaches are last.
+    A conflict is a point where another vehicle's path meets that of the ego. Those that it never
+    reaches are last.
     """
     order = [
         (math.inf if c.ego.time_s is None else c.ego.time_s, c.ego.arc_m + c.other.arc_m)
@@ -385,7 +397,10 @@ def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | 
 
 
 def lock(version: str, where: Path | None = None) -> str:
-    """Release a prompt version: pin its digest in `released.toml`, and return it."""
+    """Release a prompt version, so that it may not change: pin its digest in `released.toml`.
+
+    The digest is returned.
+    """
     prompt = load(version, where)
     base = _base(version, where)
     pins = _released(base) | {version: prompt.sha256}
@@ -405,9 +420,10 @@ def _base(version: str, where: Path | None) -> Path:
 
 
 def digest(texts: Mapping[str, str]) -> str:
-    """Return the digest of a version's files, given as text by name in the order of `FILES`.
+    """Return the hex digest of a prompt version's files.
 
-    Files beside those of `FILES` come last.
+    `texts` has their text by name, in the order of `FILES`; files beside those of `FILES` come
+    last.
     """
     return sha256_bytes("\0".join(f"{name}\0{text}" for name, text in texts.items()).encode())
 

@@ -13,9 +13,10 @@ T = TypeVar("T", bound=Manifest | Run | SuiteRun | Runs)
 
 
 def apart(thing: T, built_in: bool) -> T:
-    """Return a copy whose records nobody else has; with `built_in`, the thing itself.
+    """Return a copy of `thing` for a package to read: its records are shared with nobody.
 
-    Its tables cannot be changed, and are those of the thing, so that none is read again.
+    With `built_in`, for code of the harness, it is the thing itself. The tables of a copy cannot be
+    changed, and are those of the thing, so that none is read again.
     """
     copied: Any = thing
     if built_in:

@@ -36,14 +36,17 @@ _FAILED = {
 
 
 def stopped(run: Run) -> Iterator[str]:
-    """Yield when a run that might stop was looked at, and which of its intervals hold."""
+    """Yield when a run that might stop early was looked at, and which of its intervals hold."""
     record = run.manifest.world.interim_looks
     if record is not None and (rule := run.manifest.stopping_rule):
         yield rule.sentence(record)
 
 
 def unread(run: Run) -> Iterator[str]:
-    """Yield a sentence for each role half or more of whose answers could not be parsed."""
+    """Yield a sentence for each role of which at least half of the answers could not be parsed.
+
+    A role is `ego`, `helper` or `merge` (the ego after it heard messages).
+    """
     for role, (whose, instead) in _FAILED.items():
         score = run.score(ALL, f"failed_rate_{role}")
         if score is not None and score.value is not None and score.value >= UNREAD:
@@ -75,7 +78,7 @@ def unanswered(run: Run) -> Iterator[str]:
 
 
 def few(run: Run) -> Iterator[str]:
-    """Yield a warning with the width of a rate's interval for fewer than `FEW` episodes."""
+    """Yield a warning that the interval of a share is wide, for fewer than `FEW` episodes."""
     n = len(run.grid.episodes)
     if n < FEW:
         reach = f"{98 / n**0.5:.0f} points to either side"
@@ -161,7 +164,8 @@ def controls(run: Run) -> Iterator[str]:
 def lagging(run: Run) -> Iterator[str]:
     """Yield the conditions whose decisions mostly take longer than the dataset's lag.
 
-    The lag is the time from a decision to its action, for which the dataset knows what follows.
+    A condition is an operating point by its name. The lag is the time from a decision to its
+    action, for which the dataset knows what follows.
     """
     if off := doubts.lagging(_off_lag(run)):
         yield (
@@ -171,7 +175,11 @@ def lagging(run: Run) -> Iterator[str]:
 
 
 def unmeasured(run: Run) -> Iterator[str]:
-    """Yield a sentence if the run, or its dataset, is too old to have TTC and PET."""
+    """Yield a sentence if the run, or its dataset, does not have TTC and PET.
+
+    TTC is the time to a collision if vehicles go on as they are, PET the time between one leaving a
+    place and another reaching it. Runs and datasets of earlier versions have neither.
+    """
     if all(e.short_ttc is None for e in run.episodes):
         older = "dataset" if run.world == "frozen" else "run"
         yield (
@@ -181,7 +189,7 @@ def unmeasured(run: Run) -> Iterator[str]:
 
 
 def doubted(*runs: Run) -> set[str]:
-    """Return the names of the runs' conditions that have a warning.
+    """Return the names of the conditions (operating points) of some runs that have a warning.
 
     These are controls (helpers' messages are replaced), conditions with another lag from decision
     to action than the dataset's, and radios outside the range for which their channel model was
@@ -294,9 +302,10 @@ def beyond_sources(run: Run) -> Iterator[str]:
 
 
 def no_prompt(runs: Mapping[str, Run]) -> list[str]:
-    """Return up to two sentences on models that read no prompt, from the runs by display name.
+    """Return up to two sentences on models that read no prompt.
 
-    One names rules that decide by the scene graph, the other drivers that look at nothing.
+    `runs` are by the name that the page shows. One sentence names rules that decide by the scene
+    graph, the other drivers that look at nothing.
     """
     looking, blind = list[tuple[str, str]](), list[tuple[str, str]]()  # model and prompt version
     for run in runs.values():

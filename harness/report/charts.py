@@ -66,8 +66,9 @@ def success_latency(
 
     Args:
         rows: as `panels.success` returns them, with the run's name as `run`.
-        references: success of each reference driver by its label, drawn as horizontal lines.
-        window_ms: decision windows, drawn as vertical lines.
+        references: success, from 0 to 1, of each reference driver (a rule without a model) by its
+            label, drawn as horizontal lines.
+        window_ms: decision windows, the times in which replies count, drawn as vertical lines.
         label: the headline metric in words.
     """
     untitled = {"legend": {"orient": "top", "title": None}}
@@ -145,7 +146,10 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
 
 
 def statuses(rows: Rows) -> Spec:
-    """Return a chart of parse statuses: one stacked bar for each run and role."""
+    """Return a chart of parse statuses: one stacked bar for each run and role.
+
+    `rows` are those of `panels.statuses`, with the run's name as `run`.
+    """
     statuses: dict[str, dict[str, None]] = {verdict: {} for verdict in VERDICTS}
     for row in rows:
         # A run's file may say anything; what is no verdict is no answer.
@@ -374,7 +378,10 @@ def colour(field: str, colours: Mapping[str, str]) -> Spec:
 
 
 def condition_colours(rows: Rows) -> Spec:
-    """Return the Vega-Lite encoding of the rows' field `condition` by colour."""
+    """Return the Vega-Lite encoding of the rows' field `condition` by colour.
+
+    A condition is an operating point by its name.
+    """
     shapes = shapes_of(rows, "condition")
     by_name = colours.conditions(shapes["scale"]["domain"])
     return {**shapes, "scale": {**shapes["scale"], "range": list(by_name.values())}}
@@ -427,9 +434,9 @@ def interval(**encoding: Spec) -> Spec:
 
 
 def band(start: float, end: float, what: str, named: bool = False) -> Spec:
-    """Return a layer that shades x from `start` to `end`; `what` is its tooltip.
+    """Return a layer that shades x from `start` to `end`, in the unit of the axis.
 
-    `named`: whether `what` is also written at its top.
+    `what` is its tooltip; `named` says whether that is also written at its top.
     """
     x: Spec = {"x": {"field": "from", **NUMBER}}
     data = {"data": {"values": [{"from": start, "to": end, "what": what}]}}

@@ -20,8 +20,9 @@ DRIVERS = {action: driver for driver, action in ALWAYS.items()}
 class Commonest:
     """Hold which likeliest action comes most often among an ego's answers (`commonest`).
 
-    It is so in `count` of `n` readable answers; `moves` is the standard deviation of its
-    probability.
+    `actions` has its name, or several that are equally likely. It is so in `count` of `n` readable
+    answers, and `all_read` says that there are no others. `moves` is the standard deviation of its
+    probability over them, near 0 if the model answers alike whatever it is shown.
     """
 
     # the likeliest action of these answers; several where they are equally likely

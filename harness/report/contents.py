@@ -32,7 +32,8 @@ def _either(counts: Iterable[int]) -> str:
 def summary(run: Run) -> list[dict[str, Any]]:
     """Return the rows of a run's table of metrics: `name`, `meaning`, and `cells` by condition.
 
-    A cell has `value`, `interval` and `n` as text; None where the metric has no value there.
+    A condition is an operating point by its name. A cell has `value`, `interval` and `n` as text;
+    None where the metric has no value there.
     """
     metrics = dict.fromkeys(score.metric for score in run.scores if score.condition != "all")
     rows: list[dict[str, Any]] = []

@@ -199,7 +199,8 @@ def _places(runs: Sequence[Run]) -> dict[str, tuple[int | str | None, ...]]:
 def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
     """Return decision points of closed-loop runs by id, simulated again to know their full state.
 
-    Points that come out otherwise in this simulator are missing.
+    A decision point is a scene in which decisions are due; `names` are their ids. Points that come
+    out otherwise in this simulator are missing.
     """
     from harness.evaluate.replay import scenes_of  # loads the simulator
 
@@ -219,11 +220,12 @@ def replayed(runs: Runs, names: Sequence[str]) -> dict[str, Scene]:
 
 
 def failures(run: Run) -> dict[str, int]:
-    """Return where a closed-loop run's layouts begin to fail: decision points, each with a seed.
+    """Return the decision points at which a closed-loop run's layouts begin to fail.
 
-    It is the last decision point that a layout's failed episodes share with one that succeeded; if
-    all fail, the last of its first episode. With several agents, there is one for each that decides
-    then.
+    Each is given by its id, with a channel seed under which it is so. A layout is one drawn start
+    situation; it begins to fail at the last decision point that its failed episodes share with one
+    that succeeded, or if all fail, at the last of its first episode. With several agents (vehicles
+    that decide), there is one for each that decides then.
     """
     decisions = run.decisions
     failed = np.array([not episode.success for episode in run.episodes])
@@ -249,7 +251,7 @@ def failures(run: Run) -> dict[str, int]:
 
 
 def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
-    """Return up to n decision points to show, in order; the choice is deterministic.
+    """Return the ids of up to n decision points to show, in order; the choice is deterministic.
 
     Up to a quarter each are points in `failed` (as `failures` returns them), points where
     conditions act differently, and points with an answer that was repaired or failed to parse. The

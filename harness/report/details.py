@@ -322,7 +322,7 @@ class Details:
 
 @dataclass(frozen=True)
 class Part:
-    """Hold a chunk of scenes whose details one process prepares and compresses.
+    """Hold a chunk of scenes, by id, whose details one process prepares and compresses.
 
     It is pickled with no more of the runs than these scenes need.
     """

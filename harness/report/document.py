@@ -19,8 +19,10 @@ WIDTH, HEIGHT = 240, 22  # of a line of a forest plot
 class Table:
     """Hold a table of text to show on a page and in a terminal.
 
-    `heads` are the columns' titles, `rows` the cells; `terminal` are the indices of the columns
-    that a terminal shows, and `most` is how many rows it shows, None for all.
+    `title` stands above it and `note` below. `heads` are the columns' titles, `rows` the cells;
+    `terminal` are the indices of the columns that a terminal shows, and `most` is how many rows it
+    shows, None for all. `left` aligns all columns left and wraps none, `folded` shows the table
+    after a click, and `total` says that the last row is about all others.
     """
 
     title: str  # what stands above it
@@ -64,7 +66,9 @@ class Section:
     """Hold the text, tables and pictures of one part of a page: about a study, a suite or a run.
 
     `headline` is the outcome, `about` how it was made, and `numbers` the key figures, each with
-    `what`, `value`, `interval` and `n`.
+    `what`, `value`, `interval` and `n`. `warnings` say why there is no outcome, `caveats` what a
+    reader must know first. `pictures` has, by name, each one's address and its width in rem; `more`
+    is shown below the tables.
     """
 
     title: str  # what was run
@@ -111,7 +115,8 @@ def reach(bounded: Iterable[Bounded]) -> tuple[float, float]:
 def forest(bounded: Bounded, least: float, most: float, verdict: str = "") -> Markup:
     """Draw one row of a forest plot as SVG: a square at the value and a line for its interval.
 
-    A vertical line marks 0 where the scale contains it.
+    A forest plot shows estimates one below the other on one scale. A vertical line marks 0 where
+    the scale contains it.
 
     Args:
         bounded: the value, with its interval.

@@ -37,7 +37,10 @@ LAST = (Kind.PACE, Kind.ORIGIN)  # what stands below them
 
 @dataclass(frozen=True)
 class Finding:
-    """Hold one sentence about a run, or about some of several runs, with its kind."""
+    """Hold one sentence about a run, or about some of several runs, with its kind.
+
+    The kind says where pages and the terminal show it.
+    """
 
     kind: Kind
     sentence: str

@@ -51,9 +51,10 @@ Mark = tuple[str, Behind | None]  # of a run under a condition: the mark, and ho
 class Line:
     """Hold the results of one run under one condition: a row of the report's main table.
 
-    `scores` has its scores by metric, None where unknown. `mark` says whether it is the best run,
-    not told from it, or worse, and `behind` how far it is behind, None for the best. `headline` is
-    the headline metric and `tokens` the median numbers of prompt and answer tokens.
+    `name` is the run's, and `condition` the operating point's. `scores` has its scores by metric,
+    None where unknown. `mark` says whether it is the best run, not told from it, or worse, and
+    `behind` how far it is behind, None for the best. `headline` is the headline metric and `tokens`
+    the median numbers of prompt and answer tokens.
     """
 
     name: str  # of the run
@@ -78,7 +79,9 @@ class Line:
 class Grid:
     """Hold success under one condition as a table, prompts across and models down.
 
-    A row is a model and, for each prompt of `prompts`, the results of the runs with both.
+    A condition is an operating point by its name. `prompts` are the heads of the columns. A row is
+    a model's name and, for each prompt, the results of the runs with both: several if it was run
+    again.
     """
 
     condition: str  # operating point
@@ -192,8 +195,8 @@ def marked(
     corrected by Holm's method for all pairs of runs.
 
     Args:
-        conditions: for each condition the success (0 or 1) of each run, by (episode, seed); empty
-            for a run that was not made under it.
+        conditions: for each condition the success (0 or 1) of each run, by episode's number and
+            channel seed; empty for a run that was not made under it.
         dangerous: numbers of the episodes with a danger, if balanced success is compared.
     """
     results = [_behind_best(successes, dangerous) for successes in conditions]

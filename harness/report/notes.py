@@ -80,7 +80,10 @@ def latency_source(latency: Latency) -> str:
 
 
 def of_extensions(run: Shown) -> Iterator[str]:
-    """Yield what extensions say of the figures; one that fails says so itself."""
+    """Yield the sentences that extensions add on the figures of a run or suite.
+
+    For an extension that fails, it is its error.
+    """
     for name in NOTES:
         try:
             yield from NOTES.ask(name, partial(_lines, apart(run, NOTES.is_ours(name))))

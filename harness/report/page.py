@@ -82,7 +82,7 @@ def write_report(
 def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
     """Raise UserError if a page would replace a run's data, or lacks what the old page has.
 
-    That is prompts or pictures.
+    What a page may lack are the prompts or pictures of its scenes.
 
     Args:
         out: the file to replace.

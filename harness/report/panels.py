@@ -36,7 +36,8 @@ BUDGET = (200, 400)  # tokens of a prompt: the paper's
 class Panel:
     """Hold one chart of the report page: a Vega-Lite specification with its title and caption.
 
-    `id` is its name in the page, and `part` the part of the page in which it stands.
+    `id` is its name in the page, and `part` the part of the page in which it stands; `caption` says
+    how to read it.
     """
 
     id: str  # its name in the page, and of the files it is saved as
@@ -48,10 +49,11 @@ class Panel:
 
 @dataclass(frozen=True)
 class AddedPanel:
-    """One chart that an extension which ships adds to the report page, by `adds={"panels": ...}`.
+    """Describe a chart that a shipped extension adds to the report page, by `adds={"panels": ...}`.
 
-    `rows` returns a run's data for it, and `spec` the Vega-Lite specification of all runs' rows;
-    the other fields are those of `Panel`.
+    `part` is the part of the page in which it stands; `title` and `caption` stand beside it. `rows`
+    returns a run's data for it, empty if there is nothing to draw, and `spec` the Vega-Lite
+    specification of all runs' rows.
     """
 
     part: Part
@@ -247,8 +249,9 @@ def statuses(run: Run) -> Table:
 def reliability(run: Run) -> Table:
     """Return a reliability diagram's rows: for each condition and bin of the policy's confidence.
 
-    A row says how often the likeliest action was the only optimal one. Conditions with fewer than
-    `LEAST` decisions that have exactly one optimal action are left out.
+    The policy is the distribution over actions from which the ego acts, its confidence the greatest
+    probability. A row says how often the likeliest action was the only optimal one. Conditions with
+    fewer than `LEAST` decisions that have exactly one optimal action are left out.
     """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
@@ -273,7 +276,11 @@ def reliability(run: Run) -> Table:
 
 
 def errors(run: Run) -> Table:
-    """Return the share of unsafe decisions by condition and bin of the ego's entropy, in nats."""
+    """Return the share of unsafe decisions by condition and bin of the ego's entropy, in nats.
+
+    The entropy says how unsure the ego's own answer is. After an unsafe decision success is no
+    longer possible, though it was.
+    """
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
     return list(_shares(run, bins, nats, run.decisions["regret"], "entropy_nats"))
@@ -303,7 +310,10 @@ def _shares(
 
 
 def entropies(run: Run) -> Table:
-    """Return a histogram of the entropy of the ego's own answers, in nats; empty if none parsed."""
+    """Return a histogram of the entropy of the ego's own answers, in nats; empty if none parsed.
+
+    The entropy says how unsure an answer is: 0 is sure.
+    """
     intents = [answer.intent for answer in run.answers if answer.role == "ego" and answer.intent]
     if not intents:
         return []

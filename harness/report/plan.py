@@ -27,9 +27,13 @@ RESAMPLES = 999
 
 @dataclass(frozen=True)
 class Cost:
-    """Hold the requests, tokens and minutes that some layouts take; None where unknown."""
+    """Hold the requests, tokens and minutes that some layouts take; None where unknown.
 
-    requests: float
+    A layout is one drawn start situation of a scenario, which one episode starts from. Tokens are
+    those of prompts and answers, minutes those of all answers one after the other.
+    """
+
+    requests: float  # to the model
     tokens: float | None  # of prompts and answers
     # of all answers, one after the other; known where some were asked alone, with `--batch-size 1`
     minutes: float | None
@@ -45,8 +49,9 @@ class Cost:
 class Planned:
     """Hold the sample size for one condition: the layouts needed to find a difference.
 
-    `finds` is the smallest difference that the asked number of layouts finds, NaN if none; `cost`
-    is what the needed layouts take, None without pilot runs.
+    `layouts` is that number, with an interval over other pilots. `finds` is the smallest difference
+    that the asked number of layouts finds, NaN if none; `cost` is what the needed layouts take,
+    None without pilot runs.
     """
 
     condition: str  # its name; empty for a stated rate
@@ -60,7 +65,8 @@ class Planned:
 class Plan:
     """Hold the result of a power analysis of success, one row for each condition.
 
-    `layouts` is the number for which the smallest difference found is stated.
+    `difference` says in words what is compared, `basis` what must hold for it. `layouts` is the
+    number of start situations (episodes) for which the smallest difference found is stated.
     """
 
     difference: str  # whose of what, in words

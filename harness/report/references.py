@@ -21,9 +21,10 @@ BESIDE = (OPEN_LOOP, CONSTANT, UNIFORM)  # rows beside a model's on the terminal
 def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
     """Return the success of each reference driver, computed from a dataset's decision trees.
 
-    A reference needs no model. The result maps its name to scores by metric: success rate and,
-    where dangers are known, balanced success (mean over layouts with and without a danger) and its
-    halves.
+    A reference driver is a rule that needs no model. A decision tree has every course that actions
+    can lead to from one start situation, and how it ends. The result maps the driver's name to
+    scores by metric: success rate and, where dangers are known, balanced success (mean over layouts
+    with and without a danger) and its halves.
     """
 
     def scores(reference: str, success: Floats) -> dict[str, Score]:
@@ -73,8 +74,8 @@ def meaning(name: str, exact: bool = True) -> str:
 def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) -> str:
     """Return a caption's sentences on the references: each one's success, best first, and meaning.
 
-    Empty without references. `exact`: whether success was computed from decision trees, and not
-    estimated from a run.
+    `references` are rules that need no model, by name. Empty without references. `exact`: whether
+    success was computed from decision trees, and not estimated from a run.
     """
     if not references:
         return ""

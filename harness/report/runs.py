@@ -20,7 +20,8 @@ from harness.world.scenario import Scenario
 class Runs:
     """Hold the finished runs that one report shows: on the same scenes, in the same world.
 
-    `dataset` is None for closed-loop runs.
+    `names` has the display name of each of `runs`. `dataset` has the scenes of frozen runs; it is
+    None for closed-loop runs, which a simulator plays.
     """
 
     runs: tuple[Run, ...]  # in the order given

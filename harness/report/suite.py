@@ -36,7 +36,8 @@ MEAN = "mean over families"
 class Cell:
     """Hold the result of one family of scenes (one scenario's dataset) under one condition.
 
-    `gain` is over the condition without V2V; `verdict` is `better` or `worse` if that is
+    `success` is balanced where dangers are known. `gain` is the success less that of the condition
+    without V2V, in which the ego hears nobody; `verdict` is `better` or `worse` if that is
     significant.
     """
 
@@ -144,7 +145,10 @@ def _cells(
 
 
 def seeds_of(run: Run) -> str:
-    """Return the purpose of the run's layout seeds, such as tuning or report, by their range."""
+    """Return what a run's layout seeds are for, such as `tune` or `report`, by their range.
+
+    A layout seed fixes who stands where at the start of an episode.
+    """
     seeds = [episode.layout_seed for episode in run.episodes]
     return " and ".join(purposes(min(seeds), max(seeds) - min(seeds) + 1))
 

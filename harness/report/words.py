@@ -46,7 +46,10 @@ def cell(score: Score | None) -> Markup:
 
 
 def headline(run: Run | SuiteRun) -> str:
-    """Return the result in one sentence: success under the best condition and without V2V."""
+    """Return the result in one sentence: success under the best condition and without V2V.
+
+    Without V2V the ego hears no other vehicle.
+    """
     model = f"{run.manifest.variant.model}{run.manifest.variant.mix}"
     best, base = compared(run)
     if not best:
@@ -101,8 +104,8 @@ def judged(change: Estimate, p: float) -> str:
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
     """Return the names of the best condition and of its baseline, by the headline metric.
 
-    The baseline is the first condition without V2V, else the worst; an empty string where there is
-    none.
+    The baseline is the first condition without V2V, in which the ego hears nobody, else the worst;
+    an empty string where there is none.
     """
     metric = headline_of(run)
     values = {}
@@ -142,15 +145,20 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 
 def as_good_as(plain: Estimate, corrected: Estimate) -> str:
-    """Return a phrase on what covariate adjustment gains: as good as 1.3 times the layouts."""
+    """Return a phrase on what covariate adjustment gains: as good as 1.3 times the layouts.
+
+    `plain` is the mean as it is, `corrected` that adjusted for the difficulty of the layouts (start
+    situations of episodes).
+    """
     return f"as good as {worth(plain, corrected):.1f} times as many layouts"
 
 
 def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
     """Return success adjusted for the layouts' difficulty, and a phrase on how much that gains.
 
-    None with fewer than `SHOWN_FROM` layouts, and for a run whose intervals are valid at any
-    stopping time, since this one is not.
+    A layout is one drawn start situation, one for each episode; how hard it is, is known before
+    anybody is asked. None with fewer than `SHOWN_FROM` layouts, and for a run whose intervals are
+    valid at any stopping time, since this one is not.
     """
     plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
     if not plain or not better or plain.interval == ANY_TIME or plain.n < SHOWN_FROM:
@@ -203,9 +211,10 @@ def _value_text(run: Run | SuiteRun, condition: str, metric: str) -> str:
 
 
 def facts(value: Any, name: str = "") -> list[tuple[str, Any]]:
-    """Return a nested mapping flattened to rows of a table: dotted name and value.
+    """Return the rows of a table of a nested mapping: dotted name and value.
 
-    Items of a list of mappings are numbered from 1; any other list is joined by commas.
+    Names begin with `name`. Items of a list of mappings are numbered from 1; any other list is
+    joined by commas.
     """
     if isinstance(value, Mapping):
         lines = []

@@ -30,11 +30,15 @@ Value = float | str
 
 @dataclass(frozen=True)
 class Axis:
-    """Describe one thing that a sweep can vary: a setting of operating points, or vehicles.
+    """Describe one thing that a sweep can vary, and the values it takes unless the user gives some.
 
-    `name` is what `--over` calls it. A value times `scale` is the operating point's setting
-    `field`, which is None for the number of vehicles. `usual` is the text of the default grid, and
-    `worded` says that values are words.
+    A sweep scores a run's answers again at every point of a grid. What varies is a setting of the
+    operating point (everything a decision depends on besides scene and model, such as packet loss),
+    or the number of vehicles. `name` is what `--over` calls it, and `label` what a figure says,
+    with the unit in which values are typed. A value times `scale` is the setting `field`, which is
+    None for the number of vehicles. `usual` is the text of the default values; where it is empty,
+    `named` may return them. `worded` says that values are words, such as names of rules, and not
+    numbers.
     """
 
     name: str  # what `--over` calls it
@@ -53,8 +57,9 @@ class Axis:
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
         """Return the operating point `point` with this axis at a value, in the axis's unit.
 
-        For the number of vehicles it is unchanged. Raises UserError for a value that is not
-        allowed.
+        An operating point is everything a decision depends on besides scene and model. It is
+        unchanged for the number of vehicles, which is none of its settings. Raises UserError for a
+        value that is not allowed.
         """
         if self.field is None:
             return point
@@ -92,9 +97,9 @@ AXES = {
 
 
 def axis_of(name: str) -> Axis:
-    """Return the axis of this name, or one for any setting of that name in its own unit.
+    """Return the axis of this name, or one for any setting of that name in the setting's own unit.
 
-    Raises UserError if there is no such setting.
+    Settings are those of operating points and of radio channels. Raises UserError if there is none.
     """
     if name in AXES:
         return AXES[name]
@@ -145,7 +150,7 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
 
 
 def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
-    """Return the default values of an axis, without words that the operating point does not allow.
+    """Return the default values of an axis that an operating point allows.
 
     Raises UserError if the axis has no default grid.
     """
@@ -201,6 +206,10 @@ def _values(axis: Axis, part: str) -> Sequence[float]:
 class Setting:
     """Hold one grid point of a sweep: an operating point, the vehicle count and what was varied.
 
+    An operating point is everything a decision depends on besides scene and model. A panel is a
+    named set of grid points that are shown together: along an axis, over several crossed axes, or
+    to compare conditions.
+
     `vehicles` includes the ego. `value` is that of the axis `variable`: one for each if axes are
     crossed, None if conditions are compared.
     """
@@ -214,7 +223,7 @@ class Setting:
 
     @property
     def place(self) -> dict[str, Value | None]:
-        """Return the columns that identify it in a table: `condition`, `variable` and `value`.
+        """Return what identifies the grid point in a table: `condition`, `variable` and `value`.
 
         If several axes are crossed, there is one more column for each of them.
         """
@@ -229,7 +238,8 @@ class Setting:
 def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tuple[Value, ...]]:
     """Return all combinations of the values of several axes, one tuple for each grid point.
 
-    Raises UserError if there are more than `MOST_POINTS`.
+    `grids` has the values of each axis, in the order of `axes`, and so has each tuple one. Raises
+    UserError if there are more than `MOST_POINTS`.
     """
     values = list(product(*grids))
     if len(values) > MOST_POINTS:
@@ -241,7 +251,10 @@ def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tupl
 
 
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the grid points of all panels with every setting, as plain values for a manifest."""
+    """Return the grid points of all panels with every setting, as plain values for a manifest.
+
+    A panel is a named set of grid points; they are rows of the same name in the result.
+    """
     rows: dict[str, list[dict[str, Any]]] = {}
     for name, settings in panels.items():
         rows[name] = []

@@ -17,11 +17,11 @@ COMPARED = ("frozen", "closed", "difference", "agreement")
 
 
 def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
-    """Return estimates from the success of the same episodes in both worlds, (S, E) each.
+    """Compare success of the same episodes on frozen scenes and in closed loop, (S, E) each.
 
-    They are success in frozen scenes and in closed loop, their difference, and the share of
-    episodes that end alike, by the names in `COMPARED`. The axes are S channel seeds and E
-    episodes.
+    On frozen scenes a decision tree says what follows an action; in closed loop the simulator does.
+    The axes are S channel seeds and E episodes. The result has, by the names in `COMPARED`, success
+    in both, their difference, and the share of episodes that end alike.
     """
     return {
         "frozen": over_episodes(SUCCESS, frozen),
@@ -36,9 +36,9 @@ def rank(
 ) -> dict[str, dict[str, Estimate]]:
     """Drive a dataset's episodes with each reference driver, and compare with its frozen success.
 
-    It returns by driver the estimates of `compared`: success in frozen scenes and in closed loop,
-    their difference, and the share of episodes that end alike. `progress` is called with the number
-    of episodes just driven.
+    A reference driver is a rule that decides without a model. It returns by driver the estimates of
+    `compared`: success in frozen scenes and in closed loop, their difference, and the share of
+    episodes that end alike. `progress` is called with the number of episodes just driven.
     """
     from harness.world.reference import drive_apart
 

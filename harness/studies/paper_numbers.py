@@ -7,6 +7,9 @@ from harness.core.files import text_of
 
 
 def paper_numbers() -> list[dict[str, str]]:
-    """Return the rows of `paper_numbers.csv`, the results in the paper's text and figures."""
+    """Return the results in the paper's text and figures, the rows of `paper_numbers.csv`.
+
+    A row has the text of each cell by its column.
+    """
     text = text_of(Path(__file__).with_name("paper_numbers.csv"))
     return list(csv.DictReader(text.splitlines()))

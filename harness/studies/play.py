@@ -66,6 +66,9 @@ Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, 
 class WalkResult:
     """Hold the results of one operating point for S channel seeds and E of the episodes.
 
+    An operating point is everything a decision depends on besides scene and model. The n decisions
+    are those of all these episodes, and each row of `columns` is one of them.
+
     `ends` has outcomes by metric, (S, E); `columns` has values of the n decisions, and `places`
     each decision's index in the flattened (S, E).
     """
@@ -80,10 +83,11 @@ class WalkResult:
 
 @runtime_checkable
 class Source(Protocol):
-    """Describe where a study's intents (distributions over actions) come from.
+    """Describe where a study's intents come from: a finished run, or what an extension draws.
 
-    It is a finished run, or what an extension draws. `episodes` is the number of episodes for a
-    channel seed, and `same_episodes` says whether all seeds have the same.
+    An intent is a vehicle's probabilities of the ego's actions. `name` is the source's in tables,
+    `episodes` the number of episodes for a channel seed, and `same_episodes` whether all seeds have
+    the same ones.
     """
 
     name: str  # what figures call it
@@ -99,9 +103,9 @@ class Source(Protocol):
     ) -> Iterator[Iterable[WalkResult]]:
         """Yield for each grid point its results, in parts of some episodes.
 
-        `seeds` are channel seeds, and all grid points have the same channel draws. A grid point's
-        vehicles are the ones nearest to the ego. Its parts must be consumed before the next grid
-        point.
+        A grid point is an operating point with a number of vehicles, those nearest to the ego.
+        `seeds` are channel seeds, and all grid points have the same draws of the channel. A grid
+        point's parts must be consumed before the next grid point.
         """
         ...
 
@@ -127,7 +131,10 @@ def walk_through(
     ties: str,
     read: Read = metric_columns,
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:
-    """Yield for each operating point the columns of its decisions and the index of their episodes.
+    """Yield for each operating point the columns of its n decisions, and each one's episode.
+
+    The columns are (n, ...) by name. The episode is an index, (n,), into the (S, E) episodes of all
+    channel seeds, counted row by row.
 
     Args:
         world: where decisions come from and lead to.
@@ -137,7 +144,7 @@ def walk_through(
         episodes: numbers of the E episodes, ascending, (E,).
         ties: which of equally likely actions is taken, `drawn` or `first`.
         read: returns columns of n decisions, (n,), or (n, H) for H messages; they are rounded, and
-            NaN where a step has fewer helpers. The index is into (S, E) in row-major order.
+            NaN where a step has fewer helpers.
     """
     parts: dict[OperatingPoint, list[dict[str, Floats]]] = {point: [] for point in points}
     places: dict[OperatingPoint, list[Ints]] = {point: [] for point in points}
@@ -284,12 +291,12 @@ def _estimates(
 
 
 def over_own_episodes(name: str, values: Floats) -> Estimate:
-    """Return the mean of a metric's values (S, E) with Student's t over S seeds.
+    """Return the mean of a metric's values, (S, E), with Student's t interval over S seeds.
 
-    It is for seeds that have different episodes. A stratified share of E episodes is exact but for
-    rounding to whole ones, so that seeds may agree to the last episode and be wrong by the same.
-    Half an episode, the largest standard deviation that rounding can have, is the least that the
-    means of a yes or no count as having.
+    `name` is the metric's. It is for seeds that have different episodes, E each. A stratified share
+    of E episodes is exact but for rounding to whole ones, so that seeds may agree to the last
+    episode and be wrong by the same. Half an episode, the largest standard deviation that rounding
+    can have, is the least that the means of a yes or no count as having.
     """
     estimate = seed_interval(known_mean(values, axis=1))
     if name not in ENDS or estimate.n < 2:

@@ -186,8 +186,8 @@ class ReplayedRun:
     ) -> Iterator[Sequence[WalkResult]]:
         """Yield for each grid point the results of all episodes, with its number of vehicles.
 
-        The vehicles are the ego and the helpers nearest to it; `read` returns the columns of
-        decisions to keep.
+        A grid point is an operating point with a number of vehicles: the ego and the helpers
+        nearest to it. `read` returns the columns of decisions to keep.
 
         Raises:
             UserError: an operating point needs a fusion call, and the run's model cannot make it.
@@ -327,10 +327,12 @@ class ReplayedRun:
         return self._asker.laid_out(scenes)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
-        """Return the vehicles' intents if helpers are asked `question` instead of the plain one.
+        """Return the vehicles' intents in n scenes if helpers are asked `question`.
 
-        Missing answers are NaN, or asked for if the run asks all helpers: then in the scenes whose
-        indices are in `at`.
+        An intent is a vehicle's probabilities of the ego's actions. The question stands in place of
+        the plain one, such as in a control that shows helpers nothing. Missing answers are NaN,
+        unless the run asks all helpers: then they are asked for, in the scenes whose indices are in
+        `at`.
         """
         with self._writing():
             return self._asker.others(scenes, question, at)
@@ -340,8 +342,10 @@ class ReplayedRun:
     ) -> Fuses:
         """Return a function that gives the ego's answers after hearing messages in these scenes.
 
-        `codes` (K,) says which K sets of messages are asked about, and `rewrites` how they are
-        shown. The model is asked what is not stored. Raises UserError if it may not be.
+        In a fusion call the ego's model answers with the helpers' messages in its prompt. `codes`,
+        (K,), encode the K sets of messages that are asked about (`fusion.codes_of`), and `rewrites`
+        how they are shown. The model is asked what is not stored. Raises UserError if it may not
+        be.
         """
         if not self._asks:
             raise UserError(
@@ -352,9 +356,11 @@ class ReplayedRun:
             return self._asker.fusion_call(scenes, codes, rewrites)
 
     def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
-        """Return a function that asks agents again with the plans they heard, which `intents` has.
+        """Return a function that asks agents again, with the plans that they heard.
 
-        Frozen runs, in which only the ego decides, do not use it. `at` has indices of scenes.
+        An agent is a vehicle that decides for itself; runs in which only the ego decides do not use
+        the function. `at` has the indices of the scenes in which agents decide, and `intents` their
+        plans.
         """
         return self._asker.call_of_agents(scenes, at, intents)
 
@@ -427,6 +433,10 @@ class _Nearest:
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
-    """Return each run's rule for success: balanced if it is so for all of them, else plain."""
+    """Return how success is counted for each run, the same way for all.
+
+    It is balanced, the mean over layouts with a danger and without, if it can be so for all of
+    them, else plain.
+    """
     rules = alike([Success(run.dataset.dangerous) for run in runs])
     return dict(zip(runs, rules, strict=True))

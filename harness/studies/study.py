@@ -38,6 +38,9 @@ SOURCE = ("name", "latency")  # of a source, what makes a study another one
 class Study:
     """Hold a finished study: its texts, tables, figures, data and manifest.
 
+    A study plays answers at many operating points, and sums up. Its manifest is a JSON file that
+    says what it was made of.
+
     `kind` names its manifest's file; `headline` is the outcome, and `about` says how it was made.
     `data` has tables to write by file name, `answer` is what --json prints, and `figures` draws the
     pictures by file name.
@@ -67,7 +70,7 @@ def p_cell(p: float | None) -> str:
 
 
 def ends(e: Estimate) -> dict[str, Any]:
-    """Return an estimate as columns of a row: `value`, `ci_low`, `ci_high` and `n`."""
+    """Return an estimate as columns of a table's row: `value`, `ci_low`, `ci_high` and `n`."""
     return {"value": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n}
 
 
@@ -80,7 +83,8 @@ def corrected(p_values: Sequence[float | None]) -> list[float | None]:
 def percent(row: Any, value: str, low: str, high: str) -> str:
     """Return a share with its interval in percent, `89.0 [81.4, 93.7]`, from columns of a row.
 
-    `value`, `low` and `high` are the columns' names.
+    `row` is a row of a data frame (or a mapping), with shares from 0 to 1; `value`, `low` and
+    `high` are the columns' names.
     """
     return PERCENT.interval(row[value], row[low], row[high])
 
@@ -113,7 +117,7 @@ def write_study(study: Study, out: Path) -> Path:
 
 
 def undrawn(study: Study) -> UserError | None:
-    """Return the error that keeps a study's figures from being drawn; None if there is none.
+    """Return the error that keeps a study's figures from being drawn; None if they can be.
 
     It is that Matplotlib is not installed.
     """
@@ -169,8 +173,8 @@ def refuse_taken(out: Path, kind: str) -> None:
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
     """Raise UserError if a folder holds a run, another kind of study, or one with other settings.
 
-    `manifest` is what its `<kind>.json` must state; of sources, only name and latency count. What
-    an older study does not state is ignored.
+    `manifest` is what its `<kind>.json` must state; of sources, only name and latency count. Keys
+    that the study there does not state, since its version of the program had none, are ignored.
     """
     refuse_taken(out, kind)
     try:
@@ -232,7 +236,8 @@ class Cells:
     ) -> Mapping[str, Any]:
         """Return the stored part with this key, or compute and store it.
 
-        Its values are plain, or arrays with two axes, which are restored exactly.
+        A part is what the study computes at once, by name; `key` are the settings that tell it from
+        the others. Its values are plain, or arrays with two axes, which are restored exactly.
         """
         there = self._cells.get(tuple(key))
         if there is not None:

@@ -59,7 +59,8 @@ def settings(
 ) -> tuple[Setting, ...]:
     """Return the grid points of one axis, or of several crossed, for each condition.
 
-    A grid of None stands for the axis's default values that the condition allows.
+    A condition is an operating point by its name; `axes` are what varies, and `grids` has the
+    values of each. A grid of None stands for the axis's default values that the condition allows.
 
     Raises:
         UserError: there is no such condition, it has no channel or an axis changes nothing in it,
@@ -119,10 +120,10 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
 
 
 def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
-    """Return the paper's panels: the runs' conditions, and sweeps of vehicle count, loss and tau.
+    """Return the grid points of the paper's panels, by the panel's name.
 
-    They are grid points by the panel's name. In the sweep of vehicles, packet loss grows with their
-    density.
+    The panels are the runs' conditions, and sweeps of the number of vehicles, of packet loss and of
+    the entropy threshold tau. In the sweep of vehicles, packet loss grows with their density.
     """
     vehicles = min(run.vehicles for run in runs)
     points = {name: point for run in runs for name, point in run.points.items()}
@@ -189,8 +190,9 @@ def run_sweep(
 ) -> Study:
     """Score every source at every grid point of all panels, and return the study.
 
-    All points and sources share the channel's random numbers. `progress` is called with 1 after
-    each grid point.
+    A source is a run's answers, or what an extension draws; a panel is a named set of grid points.
+    All share the channel's random numbers, keyed by `seeds`. `out` is the study's folder;
+    `progress` is called with 1 after each grid point.
 
     Raises:
         UserError: the folder holds another sweep.
@@ -289,10 +291,10 @@ def _map(part: "pd.DataFrame") -> "Figure":
 
 
 def tables(summary: "pd.DataFrame") -> list[Table]:
-    """Return a study's main results from its summary, a table for each source and curve.
+    """Return the main results of a study as tables, one for each source and curve.
 
-    A curve is an operating point varied over an axis; the operating points themselves share a
-    table.
+    `summary` has a row for each grid point, metric and kind of interval. A curve is an operating
+    point varied over an axis; the operating points themselves share a table.
     """
     heads, rows = dict[str, tuple[str, str]](), dict[str, list[Sequence[str]]]()
     places = ["source", "panel", "condition", "value"]

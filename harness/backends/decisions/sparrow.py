@@ -20,9 +20,9 @@ SUFFIX = ".sparrow"
 
 
 def find(card: Card) -> Path:
-    """Return the file of a card's sparrow-decider weights: a path, or one that the package has.
+    """Return the file of the sparrow-decider weights that a model card names.
 
-    Raises UserError if there is none.
+    The card gives a path, or a file that the package has. Raises UserError if there is none.
     """
     weights = card.weights or ""
     if (path := Path(weights).expanduser()).suffix == SUFFIX:
@@ -45,7 +45,10 @@ def find(card: Card) -> Path:
 
 
 def open(card: Card, **_: Any) -> "Sparrow":
-    """Return the backend of a card's sparrow-decider model. Raises UserError if it has none."""
+    """Return the backend of the sparrow-decider model that a model card names.
+
+    Raises UserError if it has none.
+    """
     from sparrow_decider import Decider
 
     file = find(card)
@@ -60,7 +63,10 @@ def open(card: Card, **_: Any) -> "Sparrow":
 
 
 class Sparrow:
-    """A backend of a sparrow-decider model, which answers requests in mode `decision` in turn."""
+    """Answer requests in the answer mode `decision`, one after another, by a sparrow-decider model.
+
+    In that mode a model gives each option of a typed question a probability, and writes no text.
+    """
 
     def __init__(self, model: Any, file: Path) -> None:
         self._model, self._file = model, file

@@ -25,14 +25,20 @@ Shares = Iterable[tuple[Any, Any]]  # each option with its probability, as state
 
 
 def asked_of(request: Request) -> Question:
-    """Return the typed question of a request. Raises ValueError if it has none."""
+    """Return the typed question of a request: a text, and options to give probabilities to.
+
+    Raises ValueError if it has none.
+    """
     if request.question is None:
         raise ValueError(f"request {request.id} asks no question; only --answer decision does")
     return request.question
 
 
 def questions(request: Request) -> dict[str, Any]:
-    """Return a request's question as System One's API takes it, options in order of the actions."""
+    """Return a request's question as the JSON that System One's API takes.
+
+    That is `POST /v1/systemone`. The options are in the order of the actions.
+    """
     question = asked_of(request)
     meant: Any = {action: question.meanings[action] for action in request.actions}
     if question.kind == "score":
@@ -80,9 +86,10 @@ def _decisions(
 
 
 def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
-    """Return the completion in a reply of `POST /v1/systemone`; one with an error if malformed.
+    """Return the completion in a reply of `POST /v1/systemone`, without its time.
 
-    The completion has no time.
+    `payload` is the reply's decoded JSON; `kind` is not used. A malformed reply gives a completion
+    with an error.
     """
     try:
         shares = _shares(payload["answers"][NAME], "noul", lambda listed: listed.items())
@@ -92,9 +99,10 @@ def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Co
 
 
 def read_decisions(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
-    """Return the completion in a reply of `POST /v1/decisions`; one with an error if malformed.
+    """Return the completion in a reply of `POST /v1/decisions`, without its time.
 
-    The completion has no time.
+    `payload` is the reply's decoded JSON; `kind` is not used. A malformed reply gives a completion
+    with an error.
     """
     try:
         [answer] = payload["answers"]
@@ -155,10 +163,24 @@ DECISIONS = Wire("decisions", "/decisions", _decisions, read_decisions, _remedy,
 
 
 def open_systemone(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
-    """Return the backend of servers that answer `POST /v1/systemone`, as `OpenAIBackend` does."""
+    """Return the backend of a decision model whose servers answer `POST /v1/systemone`.
+
+    A decision model gives each option of a typed question a probability, and writes no text. `card`
+    is its model card, which has the servers' addresses; each server gets at most `batch_size`
+    requests at a time. Options for models in this process, such as `device`, are ignored. Raises
+    UserError if the servers' models differ or are no decision models, Unanswered if none answers or
+    one refuses the key.
+    """
     return OpenAIBackend(card, batch_size, SYSTEMONE)
 
 
 def open_decisions(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
-    """Return the backend of servers that answer `POST /v1/decisions`, as `OpenAIBackend` does."""
+    """Return the backend of a decision model whose servers answer OpenAI's `POST /v1/decisions`.
+
+    A decision model gives each option of a typed question a probability, and writes no text. `card`
+    is its model card, which has the servers' addresses; each server gets at most `batch_size`
+    requests at a time. Options for models in this process, such as `device`, are ignored. Raises
+    UserError if the servers' models differ or are no decision models, Unanswered if none answers or
+    one refuses the key.
+    """
     return OpenAIBackend(card, batch_size, DECISIONS)

@@ -25,7 +25,7 @@ _PERMUTED: Mapping[str, Mapping[str, str]] = {
 
 
 def find_adapter_gguf(card: Card, base: Path) -> Path | None:
-    """Return the GGUF file of a card's LoRA adapter, for the model file `base`; else None.
+    """Return the GGUF file of a model card's LoRA adapter, for the model file `base`; else None.
 
     It is the one in the adapter's folder, or made of the safetensors file there and kept in the
     cache folder. Raises UserError if it cannot be made.

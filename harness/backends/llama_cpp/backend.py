@@ -35,7 +35,7 @@ LOOK_S = 10.0  # time between two checks whether the process is stopped
 def open(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> "LlamaBackend":
-    """Return the backend of a card's GGUF file, loaded by llama.cpp in a child process.
+    """Return the backend of a model card's GGUF file, loaded by llama.cpp in a child process.
 
     Raises UserError if the file is not found, does not load, or an option is not allowed.
     """
@@ -51,7 +51,7 @@ class _Died(Exception):
 
 
 class Child:
-    """A backend that runs in a child process, so that a crash of its engine ends no run.
+    """Answer requests by a backend in a child process, so that a crash of its engine ends no run.
 
     Its seconds are measured in the child. After a death, the same requests are asked again
     together, since a different batch may move an answer by rounding. If that kills the engine, too,
@@ -172,7 +172,7 @@ class Child:
 
 
 class LlamaBackend(Child):
-    """A backend of a GGUF file that a child process has loaded; prompts are rendered here."""
+    """Answer requests by a GGUF file that a child process has loaded; prompts are rendered here."""
 
     def __init__(self, card: Card, file: Path, device: str | None, batch_size: int) -> None:
         self.batch_size = batch_size

@@ -64,9 +64,10 @@ class _Group(NamedTuple):
 
 
 class LlamaEngine:
-    """An engine of a loaded GGUF file, with memory for `batch_size` sequences.
+    """Read tokens and give distributions of next ones by a GGUF file that llama.cpp has loaded.
 
-    It also keeps some beginnings of prompts, so that later prompts read only the rest.
+    It has memory for `batch_size` sequences, and also keeps some beginnings of prompts, so that
+    later prompts read only the rest.
     """
 
     def __init__(
@@ -235,7 +236,7 @@ class LlamaEngine:
 
 
 class LlamaSession(Session):
-    """A session of sequences in a `LlamaEngine`."""
+    """Advance the sequences of one batch in a `LlamaEngine`."""
 
     def __init__(self, engine: LlamaEngine, places: list[int], logits: Logits) -> None:
         self._engine = engine

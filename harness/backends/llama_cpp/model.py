@@ -32,7 +32,7 @@ def last_error() -> str:
 
 
 class LlamaModel:
-    """A GGUF file loaded by llama.cpp, perhaps with a LoRA adapter; also its `Tokenizer`."""
+    """Hold a GGUF file loaded by llama.cpp, perhaps with a LoRA adapter; also its `Tokenizer`."""
 
     def __init__(
         self, name: str, file: Path, device: str | None, adapter: Path | None = None
@@ -89,7 +89,10 @@ class LlamaModel:
         self.device = "gpu" if c.llama_supports_gpu_offload() and device != "cpu" else "cpu"
 
     def adapt(self, context: int) -> None:
-        """Apply the LoRA adapter, if there is one, to a new llama.cpp context of this model."""
+        """Apply the LoRA adapter, if there is one, to a new llama.cpp context of this model.
+
+        `context` is the address of the context, a `llama_context` of the C library.
+        """
         if self._adapter:
             adapters = (c.llama_adapter_lora_p_ctypes * 1)(self._adapter)
             if c.llama_set_adapters_lora(context, adapters, 1, (ctypes.c_float * 1)(1.0)):

@@ -25,16 +25,21 @@ MOST_TOKENS = 1 << 16  # most tokens of a picture whose processor has no limit
 
 
 class Run(NamedTuple):
-    """Hold tokens of one text or picture, which llama.cpp reads in one call."""
+    """Hold tokens of one text or picture, which llama.cpp reads in one call.
+
+    `inputs` are n token ids, (n,) int32, or embeddings, (n, width) float32. `places`, (1, n), or
+    (4, n) for a picture with M-RoPE, are their positions in the prompt from that of the first, and
+    `span` is how many positions they take.
+    """
 
     inputs: NDArray[Any]  # token ids, (n,) int32, or embeddings, (n, width) float32
     places: NDArray[np.int32]  # relative to the first, (1, n); with M-RoPE a picture's are (4, n)
     span: int  # number of positions that they take; a picture may take fewer than it has tokens
 
     def at(self, start: int) -> NDArray[np.int32]:
-        """Return the positions of the tokens from `start`, shaped as `places`.
+        """Return the positions of the tokens in the prompt if the first is at `start`.
 
-        The fourth row, with M-RoPE, is no position and stays 0.
+        The shape is that of `places`. The fourth row, with M-RoPE, is no position and stays 0.
         """
         shifted = self.places + np.int32(start)
         shifted[3:] = 0
@@ -52,7 +57,7 @@ def text_run(ids: Sequence[int]) -> Run:
 
 
 class Projector:
-    """The loaded GGUF file of a vision encoder, which turns pictures into embeddings.
+    """Encode pictures by the loaded GGUF file of a vision encoder, to embeddings for the model.
 
     A picture is encoded when its tokens are first read, in an answer's time.
     """

@@ -35,15 +35,17 @@ _CLOSED_S = 5.0  # longest wait for connections to close
 
 
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
-    """Return the backend of a card's servers. Raises UserError if their models differ.
+    """Return the backend of the model behind the servers that a model card names.
 
-    Raises Unanswered if none answers, or one refuses the key.
+    Each server gets at most `batch_size` requests at a time; other options of engines are ignored.
+    Raises UserError if the servers' models differ, Unanswered if none answers or one refuses the
+    key.
     """
     return OpenAIBackend(card, batch_size)
 
 
 class OpenAIBackend:
-    """A backend of a model behind one or several servers with OpenAI's API.
+    """Answer requests by a model behind one or several servers with OpenAI's API.
 
     Requests are sent concurrently, at most `window` at once and each by itself, so `complete` may
     be called during another call. Connections stay open between calls.
@@ -107,12 +109,15 @@ class OpenAIBackend:
 
     @property
     def several(self) -> Sequence[str]:
-        """The servers' addresses if any of them may answer; empty if there is only one."""
+        """Return the servers' addresses if any of them may answer; empty if there is only one."""
         return self._server.urls if self._server.any_may_answer else ()
 
     @property
     def doubt(self) -> str | None:
-        """Why cached answers may be of other weights; None if servers state a digest or size."""
+        """Return why cached answers may be of other weights, or None.
+
+        It is None if servers state a digest or size of their weights.
+        """
         if self._pool.model.tells_weights:
             return None
         return (

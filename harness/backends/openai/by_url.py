@@ -35,7 +35,7 @@ class _Listed(NamedTuple):
 
 
 def served_card(text: str) -> Card:
-    """Return the card of a model at `URL`, `URL#NAME` or `openai:NAME`, by asking its server.
+    """Return the model card of a model at `URL`, `URL#NAME` or `openai:NAME`, by asking its server.
 
     The key in `OPENAI_API_KEY`, if there is one, goes to that server. Raises UserError if the text
     is no base URL or does not say which of several models is meant, Unanswered if no server answers

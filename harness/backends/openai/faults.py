@@ -17,10 +17,14 @@ _REASON = ("metadata", "raw")  # where a router puts the words of the server beh
 
 
 class Fault(NamedTuple):
-    """Hold an error in a server's own words, and the HTTP status it would have had, if known."""
+    """Hold an error that a server states, and the HTTP status it would have had, if known.
 
-    words: str
-    code: int | None = None
+    `words` are the server's, `code` is that status, and `again` says that another attempt may
+    succeed though no code says so.
+    """
+
+    words: str  # the server's own words
+    code: int | None = None  # HTTP status that fits the error; None if not known
     again: bool = False  # whether another attempt may succeed, though no code says so
 
 

@@ -39,7 +39,15 @@ _UNREACHED = (
 
 
 class Reply(Struct, frozen=True):
-    """Hold what came of one request to a server: a JSON value, or a fault in words."""
+    """Hold what came of one request to a server: a JSON value, or a fault in words.
+
+    `payload` is the JSON, `status` the HTTP status, and `url` the address of the server that
+    replied. On a fault, `fault` says why there is no payload, `unreached` that there was no
+    connection at all, and `again` whether another attempt may succeed; the server wants that
+    `after_s` seconds later. `retries` counts failed attempts before. `begun_s` and `first_at_s` are
+    when the first attempt began and the first text came, in seconds of `time.perf_counter`; `alone`
+    says that the server had no other request of this program.
+    """
 
     payload: Any = None  # the JSON value; None on a fault
     fault: str | None = None  # why there is no payload; printable and of limited length
@@ -55,9 +63,10 @@ class Reply(Struct, frozen=True):
 
 
 class Client:
-    """An HTTP client for a model's servers, which sends them one key and never shows it.
+    """Send HTTP requests to a model's servers, with one key that is never shown.
 
-    Used as an asynchronous context. Redirects are not followed, since they would carry the key.
+    It is used as an asynchronous context. Redirects are not followed, since they would carry the
+    key.
     """
 
     def __init__(self, server: Server) -> None:

@@ -24,7 +24,7 @@ class ServerKind:
     path = ""  # where it tells that it is one; empty if nowhere
 
     def is_one(self, payload: Mapping[str, Any]) -> bool:
-        """Return whether the JSON that a server has at `path` shows that it is of this kind."""
+        """Return whether a server is of this kind, by the decoded JSON that it has at `path`."""
         return False
 
     async def states(self, model: str, ask: Ask) -> Statement:
@@ -37,7 +37,7 @@ class ServerKind:
 
 
 class LlamaServer(ServerKind):
-    """The kind of llama.cpp's own server, llama-server."""
+    """Describe how llama.cpp's own server, llama-server, is recognised, and what it tells."""
 
     path = "/props"
 
@@ -68,7 +68,7 @@ class LlamaServer(ServerKind):
 
 
 class LMStudio(ServerKind):
-    """The kind of LM Studio's server."""
+    """Describe how LM Studio's server is recognised, and what it tells."""
 
     path = "/api/v0/models"
 
@@ -80,7 +80,7 @@ class LMStudio(ServerKind):
 
 
 class Ollama(ServerKind):
-    """The kind of Ollama's server."""
+    """Describe how Ollama's server is recognised, and what it tells."""
 
     path = "/api/version"
 
@@ -106,7 +106,7 @@ class Ollama(ServerKind):
 
 
 class LlamaCppPython(ServerKind):
-    """The kind of llama-cpp-python's server."""
+    """Describe how llama-cpp-python's server is recognised, and what it tells."""
 
     path = "/openapi.json"
 
@@ -115,7 +115,7 @@ class LlamaCppPython(ServerKind):
 
 
 class VLLM(ServerKind):
-    """The kind of vLLM's server, which is recognised by its list of models."""
+    """Describe what vLLM's server tells, which is recognised by its list of models."""
 
     async def states(self, model: str, ask: Ask) -> Statement:
         return fields_of(await ask("/version", None)).get("version"), {}
@@ -160,7 +160,11 @@ def fields_of(reply: Reply) -> dict[str, Any]:
 
 
 def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
-    """Return the entry of a model in a server's list at `key`, or its only entry; else None."""
+    """Return the entry of a model in the list that a server states at `key`; None if there is none.
+
+    `payload` is the decoded JSON that holds the list. An only entry is the model's by whatever
+    name.
+    """
     listed = payload.get(key) if isinstance(payload, dict) else None
     entries = (
         [entry for entry in listed if isinstance(entry, dict)] if isinstance(listed, list) else []

@@ -21,7 +21,7 @@ _FIELDS = {
 
 
 class NoText(TypeError):
-    """The error of a message whose content has a part that is no text; it says which."""
+    """Report a message whose content has a part that is no text; it says which."""
 
 
 def in_texts(message: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -99,8 +99,9 @@ def body(
 def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Return the completion in a server's reply to a chat completion request, without its time.
 
-    A malformed reply, or one that breaks the constraint that this kind of server was sent, gives an
-    error in one sentence. The text of a refusal is that of the model that refuses.
+    `payload` is the reply's decoded JSON, and `kind` the kind of server. A malformed reply, or one
+    that breaks the constraint that this kind of server was sent, gives an error in one sentence.
+    The text of a refusal is that of the model that refuses.
     """
     try:
         choice = payload["choices"][0]

@@ -49,7 +49,11 @@ _WEIGHTS = ("digest", "n_params", "size")
 
 
 class Model(NamedTuple):
-    """Hold what a server states of its model; part of the model's identity."""
+    """Hold what a server states of its model, by which models are told apart.
+
+    `listed` is its entry in the server's list of models, `version` the server's, and `states` all
+    else by dotted names; None where the server does not tell.
+    """
 
     listed: dict[str, Any] | None = None  # name, owner, root and length in the server's list
     version: str | None = None  # version of the server; None if it does not tell
@@ -57,11 +61,15 @@ class Model(NamedTuple):
 
     @property
     def tells_weights(self) -> bool:
-        """Whether it states a digest or size, which other weights of the same name would change."""
+        """Return whether it states a digest or size, which differ for other weights."""
         return any(name.rpartition(".")[2] in _WEIGHTS for name in self.states)
 
     def covers(self, earlier: "Model") -> bool:
-        """Return whether it states all that `earlier` did; a server still loading states less."""
+        """Return whether it states all that `earlier` did.
+
+        A server that is still loading states less. `earlier` is what a server stated of the same
+        model before.
+        """
         lists = earlier.listed is None or self.listed is not None
         tells_version = earlier.version is None or self.version is not None
         return lists and tells_version and earlier.states.keys() <= self.states.keys()

@@ -39,7 +39,7 @@ class Stream:
         self._last_at_s: float | None = None
 
     def take(self, data: bytes, at_s: float) -> None:
-        """Add received bytes, cut anywhere, and the time they came at, by `time.perf_counter`."""
+        """Add received bytes, cut anywhere; `at_s` is when they came, by `time.perf_counter`."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             if not self._begun:
@@ -93,7 +93,7 @@ class Stream:
 
     @property
     def first_at_s(self) -> float | None:
-        """When the first text came, by `time.perf_counter`; None if it all came at once.
+        """Return when the first text came, by `time.perf_counter`; None if it all came at once.
 
         A buffer on the way then hid the time.
         """

@@ -9,7 +9,7 @@ _EITHER = zlib.MAX_WBITS | 32  # of gzip and of deflate, by the first bytes
 
 
 class Packed(Exception):
-    """The error of a compressed reply that cannot be unpacked; its message says why."""
+    """Report a compressed reply that cannot be unpacked; its message says why."""
 
 
 class Unpacker:

@@ -16,12 +16,18 @@ from harness.core.image import Image
 
 
 class Wire(NamedTuple):
-    """Describe one API of servers: the path, how a request is written, how a reply is read."""
+    """Describe one API of servers: the path, how a request is written, how a reply is read.
+
+    `engine` is the engine of cards whose servers speak it. `body` makes the JSON of a request,
+    `read` the completion of a reply, and `remedy` says what to do about a fault. `decides` says
+    that decision models are asked, which give options probabilities and write no text.
+    """
 
     engine: str  # the engine whose servers speak it
-    path: str
+    path: str  # behind a server's base URL
+    # returns the JSON body of a request; the function that it is given returns a picture's URL
     body: Callable[[Card, Server, Request, Callable[[Image], str]], dict[str, Any]]
-    read: Callable[[Any, Request, Kind], Completion]
+    read: Callable[[Any, Request, Kind], Completion]  # returns what a reply's JSON answers
     # what to do about a fault, after its words; empty if nobody knows
     remedy: Callable[[Reply], str]
     decides: bool  # whether decision models are asked, which write nothing and render no chat

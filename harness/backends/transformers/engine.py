@@ -35,7 +35,7 @@ MOST_LAYERS = 10_000  # or experts; the largest models have some hundred
 def open(
     card: Card, *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> LanguageModel:
-    """Return the backend of a card's checkpoint, loaded by the package transformers.
+    """Return the backend of a model card's checkpoint, loaded by the package transformers.
 
     Raises UserError if the weights are not found, do not load, or an option is not allowed.
     """
@@ -51,7 +51,7 @@ def open(
 
 
 def checkpoint(card: Card) -> Path:
-    """Return the directory of a card's checkpoint; a GGUF file is first unpacked into one.
+    """Return the directory of a model card's checkpoint; a GGUF file is first unpacked into one.
 
     Raises UserError if it is not found, not complete, or not of the card's digest.
     """
@@ -69,9 +69,11 @@ def checkpoint(card: Card) -> Path:
 
 
 def load(card: Card, where: Path, *, dtype: str, device: str) -> tuple[Any, Any]:
-    """Return the tokenizer and the model of the checkpoint in `where`, on a device.
+    """Return the tokenizer and the model that the package transformers loads from a checkpoint.
 
-    Raises UserError if it does not load, lacks weights, or the two do not go together.
+    `where` is the checkpoint's folder, `dtype` and `device` the number format and the torch device
+    of the model. Raises UserError if it does not load, lacks weights, or the two do not go
+    together.
     """
     import transformers
 
@@ -174,7 +176,10 @@ def gpus() -> list[str]:
 
 
 class TransformersEngine:
-    """An engine of a loaded transformers model, its tokenizer and perhaps image processor."""
+    """Read tokens and give distributions of next ones by a model of the package transformers.
+
+    It has the loaded model, its tokenizer and perhaps its image processor.
+    """
 
     def __init__(self, card: Card, where: Path, tokenizer: Any, model: Any) -> None:
         from harness.backends.transformers.eyes import Eyes

@@ -23,7 +23,10 @@ from harness.core.image import Image
 
 
 class Processor:
-    """A checkpoint's image processor; `tokens` is how many a picture of the card's size has."""
+    """Prepare pictures by a checkpoint's image processor.
+
+    `tokens` is how many tokens a picture of the model card's size has.
+    """
 
     def __init__(self, name: str, where: Path, vision: Vision) -> None:
         """Load the image processor in `where`. Raises UserError if the checkpoint has none."""
@@ -79,7 +82,7 @@ class Processor:
 
 
 class Eyes:
-    """The image processor and vision encoder of a loaded transformers model.
+    """Encode pictures by the image processor and vision encoder of a loaded transformers model.
 
     A picture is `image_token` in the chat template.
     """
@@ -130,9 +133,10 @@ class Eyes:
         return inputs
 
     def positions(self, prompt: Sequence[int]) -> torch.Tensor | None:
-        """Return positions of a prompt's tokens in time, height and width, `(3, tokens)`.
+        """Return the positions of a prompt's tokens, `(3, tokens)`.
 
-        None if the model numbers tokens consecutively.
+        The rows are time, height and width. `prompt` has the token ids. None if the model numbers
+        tokens consecutively.
         """
         if not hasattr(self._model.model, "get_rope_index"):
             return None
@@ -172,7 +176,7 @@ def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:
 
 
 def count_tokens(card: Card) -> int:
-    """Return how many tokens a card's processor makes of a picture of the card's size.
+    """Return how many tokens a model card's processor makes of a picture of the card's size.
 
     Raises ValueError if the card takes no pictures, UserError if there is no processor.
     """

@@ -18,9 +18,10 @@ MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grou
 
 
 def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
-    """Return one key-value cache with the rows of several, which are emptied.
+    """Return one key-value cache with the rows (sequences) of several, which are emptied.
 
-    Row n is row `order[n]` of all their rows, one cache after the other. Short rows end in zeros.
+    `order` has indices into the rows of all caches, one cache after the other: row n of the result
+    is row `order[n]`. Short rows end in zeros.
     """
     columns = max(cache.get_seq_length() for cache in caches)
     for layers in zip(*(cache.layers for cache in caches), strict=True):
@@ -56,9 +57,10 @@ class Prefixes:
         self._kept: list[Prefix] = []
 
     def longest(self, ids: list[int], but: Sequence[int] = ()) -> Prefix:
-        """Return the longest kept beginning of `ids`; an empty one if below `LEAST_TOKENS` tokens.
+        """Return the longest kept beginning of the token ids `ids`, a prompt.
 
-        `but` is a whole prompt that is ignored although it was read before.
+        It is empty if that is shorter than `LEAST_TOKENS`. `but` is a whole prompt that is ignored
+        although it was read before.
         """
         kept = [prefix for prefix in self._kept if prefix.ids != list(but)]
         shared = [common_length([prefix.ids, ids]) for prefix in kept]

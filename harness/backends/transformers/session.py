@@ -151,9 +151,9 @@ class Reader:
         return DynamicCache(config=self._model.config)
 
     def positions(self, prompts: Sequence[Sequence[int]]) -> list[Any] | None:
-        """Return the positions of each prompt's tokens, `(3, tokens)`.
+        """Return the positions of each prompt's tokens, one array `(3, tokens)` a prompt.
 
-        None if all are consecutive, as without pictures.
+        The rows are time, height and width. None if all are consecutive, as without pictures.
         """
         if self._eyes is None or not any(token < 0 for prompt in prompts for token in prompt):
             return None
@@ -192,7 +192,7 @@ class Reader:
 
 
 class Rows:
-    """A session whose sequences are rows of one padded batch."""
+    """Advance sequences that are rows of one padded batch of a transformers model."""
 
     def __init__(self, reader: Reader, cache: Cache, mask: Any, logits: Any, places: Any) -> None:
         """Hold a batch that was read, and the logits after each sequence, `(n, vocabulary)`.
@@ -241,7 +241,7 @@ class Rows:
         return Rows(self._reader, deepcopy(self._cache), self._mask, self._logits, self._places)
 
     def layers(self) -> list[tuple[Any, Any]]:
-        """Return each layer's keys and values, `(n, heads, tokens, dim)`; they stay valid."""
+        """Return each layer's keys and values, `(n, heads, tokens, dim)`, which stay valid."""
         return [(layer.keys, layer.values) for layer in self._cache.layers]
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
@@ -360,9 +360,9 @@ def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
 
 
 class Apart(Session):
-    """A session whose sequences are each read on their own.
+    """Advance sequences of a transformers model that are each read on their own.
 
-    For models with a sliding window or a recurrent state, which padding would change.
+    It is for models with a sliding window or a recurrent state, which padding would change.
     """
 
     def __init__(self, sessions: Sequence[Rows]) -> None:

@@ -39,8 +39,9 @@ LOST_BY = ("B", "A", None)
 class DecisionFlip:
     """Hold a scene in which runs A and B take different actions, with the seeds where they do.
 
-    `lost_by` is the run whose action alone made success impossible; None for neither, both or
-    unknown.
+    `scene` is the scene's id, `episode` the number of its episode, `seeds` are channel seeds, and
+    `a` and `b` the names of the actions. `lost_by` is the run whose action alone made success
+    impossible; None for neither, both or unknown.
     """
 
     scene: str  # its id
@@ -57,8 +58,8 @@ class Difference:
     """Hold how one metric differs in one condition, in the metric's unit (shares 0 to 1).
 
     `a` and `b` are its means in runs A and B, `change` is B - A with its 95 % interval. The
-    p-values are of no difference: as computed, and corrected for multiple testing; None where there
-    is none.
+    p-values are of no difference: `p_value` as computed, `p_corrected` corrected for multiple
+    testing, which only primary metrics are; None where there is none.
     """
 
     metric: str  # its name
@@ -82,7 +83,8 @@ class Difference:
 class Flip:
     """Hold an episode that succeeds in one run and fails in the other, and in which seeds.
 
-    `a` and `b` are its outcomes in the two runs: `success`, or the kind of failure.
+    `episode` is its number, `seeds` are channel seeds. `a` and `b` are its outcomes in the two
+    runs: `success`, or the kind of failure.
     """
 
     episode: int  # its number
@@ -93,10 +95,11 @@ class Flip:
 
 @dataclass(frozen=True)
 class InCondition:
-    """Hold what differs between two runs in one condition: metrics, episodes and decisions.
+    """Hold what differs between runs A and B in one condition: metrics, episodes and decisions.
 
-    `gained` are episodes that fail in A and succeed in B, `lost` the reverse; `decisions` counts
-    those in both runs, and `flips` are those of them with another action.
+    A condition is an operating point by its name. `gained` are episodes that fail in A and succeed
+    in B, `lost` the reverse; `decisions` counts those in both runs, and `flips` are those of them
+    with another action.
     """
 
     condition: str  # its name
@@ -109,7 +112,11 @@ class InCondition:
 
 @dataclass(frozen=True)
 class AnswersFlipped:
-    """Hold the ids of requests whose answers changed from parse verdict `a` to verdict `b`."""
+    """Hold the ids of requests whose answers changed from parse verdict `a` to verdict `b`.
+
+    A verdict is `strict`, `recovered` or `failed`: how run A's and run B's answer could be read.
+    `role` is that of the answers: `ego`, `helper` or `merge`.
+    """
 
     role: str  # of who answered: `ego`, `helper` or `merge`
     a: str  # verdict in A: `strict`, `recovered` or `failed`
@@ -119,7 +126,11 @@ class AnswersFlipped:
 
 @dataclass(frozen=True)
 class AnswerChanged:
-    """Hold two answers to the same prompt and picture that differ in text or parse verdict."""
+    """Hold two answers to the same prompt and picture that differ in text or parse verdict.
+
+    `request` is the request's id, `a` and `b` are the texts of run A's and run B's answer.
+    `verdicts` says how each was read: `strict`, `recovered` or `failed`.
+    """
 
     request: str  # its id
     role: str  # of who answered, as in `AnswersFlipped`
@@ -133,7 +144,8 @@ class AnswersHeld:
     """Hold the comparison of both runs' answers to the same questions.
 
     A question is the same if its chat messages and picture are: `same` counts these, `other` the
-    rest, which are not compared. Under another prompt none is the same.
+    rest, which are not compared. Under another prompt none is the same. `changed` has the pairs of
+    answers that differ.
     """
 
     same: int  # how many questions were the same
@@ -150,9 +162,11 @@ class AnswersHeld:
 class Comparison:
     """Hold everything that differs between run A and run B, as `compare` finds it.
 
+    `pair` are the runs, and `conditions` what differs in each condition (operating point).
     `settings` has the name of each that differs, with A's value and B's. `answers` has the answers
-    that changed their parse verdict, `held` those to the same question that changed at all.
-    `prompts` is what differs between the prompts: None for nothing, a sentence if it is not known.
+    that changed their parse verdict, of the `answers_in_both` by role, and `held` those to the same
+    question that changed at all. `prompts` is what differs between the prompts: None for nothing, a
+    sentence if it is not known.
     """
 
     pair: Pair  # the two runs

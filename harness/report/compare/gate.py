@@ -29,7 +29,9 @@ ENDS = ("low", "high")
 class Gate:
     """Hold one test of --fail-if: a comparison fails if B - A satisfies it in some condition.
 
-    `end` chooses the difference itself or an end of its interval, which is compared with `number`.
+    A gate is such as `6g:success_rate < -0.01`. `condition` is the operating point that it is
+    about, None for all. `end` chooses the difference itself (`value`) or an end of its interval
+    (`low`, `high`), which is compared with `number`, in the metric's unit, by `op`.
     """
 
     text: str  # as it was typed
@@ -42,10 +44,14 @@ class Gate:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Hold the result of a gate: where it failed, as pairs of condition and failing value."""
+    """Hold the result of a gate, a test that a comparison may fail.
 
-    gate: str
-    failed: tuple[tuple[str, float], ...]
+    `gate` is its text, and `failed` has each condition in which it failed with the value that did
+    it; empty if it passed.
+    """
+
+    gate: str  # its text, as it was typed
+    failed: tuple[tuple[str, float], ...]  # condition and value, wherever it failed
 
 
 def gate(

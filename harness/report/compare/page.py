@@ -28,8 +28,8 @@ Place = Callable[[Run], str | None]  # where the page of a run is, as a link
 def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place: Place) -> str:
     """Return the HTML page of a comparison with its gates' verdicts.
 
-    `most` is how many episodes and requests a list shows; `place` returns the link to a run's page,
-    or None.
+    A gate is a test that the comparison may fail. `most` is how many episodes and requests a list
+    shows; `place` returns the link to a run's page, or None.
     """
     pair = comparison.pair
     sides = {"A": pair.a, "B": pair.b}

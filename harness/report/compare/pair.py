@@ -58,8 +58,8 @@ def where(run: Run) -> str:
 class Side:
     """Hold one of the two compared runs with its settings and its metrics as arrays.
 
-    `values` has each metric for C conditions, S channel seeds and E episodes, (C, S, E); NaN where
-    unknown.
+    `settings` has the text of each setting by its dotted name. `values` has each metric for C
+    conditions, S channel seeds and E episodes of the run, (C, S, E); NaN where unknown.
     """
 
     run: Run  # as it was read
@@ -69,18 +69,22 @@ class Side:
 
     @cached_property
     def ends(self) -> Mapping[tuple[str, int, int], Episode]:
-        """Return each episode's record by (condition, seed, episode number)."""
+        """Return the record of each episode, by its condition's name, channel seed and number."""
         return {(e.condition, e.seed, e.episode): e for e in self.run.episodes}
 
     @property
     def prompts(self) -> list[dict[str, Any]]:
-        """Return the manifest's records of the prompts of the ego and of the first helper."""
+        """Return what the manifest records of the prompts of the ego and of the first helper."""
         return [self.run.manifest.agent(place)["prompt"] for place in (0, 1)]
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Hold two runs that can be compared, and the conditions, seeds and episodes they share."""
+    """Hold two runs that can be compared, and the conditions, seeds and episodes they share.
+
+    `a` is the run that is compared with, `b` the one that is judged. `conditions` are names of
+    operating points, `seeds` channel seeds, and `episodes` episodes' numbers, ascending.
+    """
 
     a: Side  # the one that is the base
     b: Side  # the one that is compared with it
@@ -103,7 +107,8 @@ class Pair:
     def pool(self) -> Pool | None:
         """Return all layouts that both runs' episodes were sampled from, with their difficulty.
 
-        None if there are no more of them than the shared episodes, or if the runs disagree on them.
+        A layout is one drawn start situation of a scenario, one for each episode. None if there are
+        no more of them than the shared episodes, or if the runs disagree on them.
         """
         a = {layout.episode: layout for layout in self.a.run.layouts}
         b = {layout.episode: layout for layout in self.b.run.layouts}
@@ -116,7 +121,8 @@ class Pair:
     def judged(self, side: Side, condition: str) -> Judged:
         """Return the shared decisions with exactly one optimal action, for calibration metrics.
 
-        `Judged.episode` holds each decision's index in `self.episodes`.
+        They are those of the run `side` under one condition. `Judged.episode` holds each decision's
+        index in `self.episodes`.
         """
         rows, place = self._rows(side, condition)
         policy = side.run.decisions.of_actions("fused")[rows]

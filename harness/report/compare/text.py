@@ -37,8 +37,9 @@ def terminal(
 ) -> str:
     """Return a comparison and its gates' verdicts as text of at most `WIDTH` columns.
 
-    `most` is how many episodes and requests a list shows; `whole` also shows all exploratory
-    metrics.
+    A gate is a test that a comparison may fail. `most` is how many episodes and requests a list
+    shows; `whole` also shows all exploratory metrics, those that are not corrected for multiple
+    testing.
     """
     lines = []
     for text in _lines(comparison, verdicts, most, whole):
@@ -173,7 +174,10 @@ def _table(condition: InCondition, whole: bool) -> list[str]:
 
 
 def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
-    """Return the gates' verdicts as test cases in JUnit's XML."""
+    """Return the verdicts of a comparison's gates as test cases in JUnit's XML.
+
+    A gate is a test that a comparison may fail.
+    """
     pair = comparison.pair
     runs = f"{printable(words.who(pair.b))} against {printable(words.who(pair.a))}"
     cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
@@ -181,9 +185,10 @@ def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
 
 
 def junit_of_none(gates: Sequence[str], reason: str) -> str:
-    """Return the gates as test cases with an error, in JUnit's XML.
+    """Return gates as test cases with an error, in JUnit's XML.
 
-    It is for a comparison that is impossible because a model did not answer; `reason` says so.
+    It is for a comparison that is impossible because a model did not answer; `reason` says why.
+    `gates` are their texts.
     """
     cases = [Case("harness compare", gate, error=reason) for gate in gates]
     return test_suite("harness compare", cases)

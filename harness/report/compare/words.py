@@ -38,10 +38,12 @@ EXCERPT = 140  # characters of an answer in a line
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one row of a comparison's table as text: metric, means of A and B, B - A, interval, p.
+    """Hold one row of a comparison's table as text: a metric in runs A and B.
 
-    `verdict` is `better` or `worse` if the metric is primary and its corrected p is at most 0.05,
-    `hint` if it is exploratory and its uncorrected p is, else empty.
+    `a` and `b` are its means there, `change` is B - A and `interval` that of the change; `p` is its
+    p-value. Shares are in percent. `verdict` is `better` or `worse` if the metric is primary and
+    its corrected p is at most 0.05, `hint` if it is exploratory and its uncorrected p is, else
+    empty.
     """
 
     verdict: str
@@ -54,7 +56,10 @@ class Line:
 
 
 def line(d: Difference) -> Line:
-    """Return a difference as text, with four significant figures at most; shares in percent."""
+    """Return a metric's difference between runs as the text of a table's row.
+
+    Numbers have four significant figures at most; shares are in percent.
+    """
     unit, change = entry(d.metric).unit, d.change
     interval = "–"
     if not math.isnan(change.low):
@@ -89,8 +94,9 @@ def _visible(d: Difference) -> bool:
 
 
 def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
-    """Return the primary metrics and the most significant exploratory ones, `SHOWN` in all at most.
+    """Return which differences in a condition are shown first: `SHOWN` in all at most.
 
+    They are all of primary metrics, and the most significant ones of exploratory metrics.
     Exploratory metrics with a preferred direction come first, percentiles of latency last. If one
     of them is over decisions with one optimal action alone, the number of these is added.
     """
@@ -114,7 +120,7 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
 
 
 def rest(c: InCondition) -> list[Difference]:
-    """Return the differences that `first` leaves out."""
+    """Return the differences in a condition that `first` leaves out."""
     primary, striking = first(c)
     return [d for d in c.differences if d not in (*primary, *striking)]
 
@@ -141,7 +147,7 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def who(side: Side) -> str:
-    """Return a run's model, prompt and answer mode as text."""
+    """Return a run's model, prompt version and answer mode as text."""
     variant = side.run.manifest.variant
     return f"{variant.model} · prompt {variant.prompt} · {variant.answer}{variant.mix}"
 
@@ -217,9 +223,10 @@ def success(c: InCondition, pair: Pair) -> str:
 
 
 def adjusted(c: InCondition) -> Iterator[str]:
-    """Yield how success changed after adjustment for layout difficulty.
+    """Yield how success in a condition changed, adjusted for how hard the layouts are.
 
-    It yields nothing for fewer than `SHOWN_FROM` layouts.
+    A layout is one drawn start situation, one for each episode. It yields nothing for fewer than
+    `SHOWN_FROM` of them.
     """
     changes = {d.metric: d.change for d in c.differences}
     for metric, name in IN_WORDS.items():
@@ -421,7 +428,8 @@ def settings(comparison: Comparison) -> list[str]:
 def judged(verdict: Verdict, sign: str = "+") -> str:
     """Return a sentence on whether a gate passed or failed, and where.
 
-    `sign` is the sign option of the format of values: `+` for differences, `-` for plain values.
+    A gate is a test that a comparison may fail. `sign` is the sign option of the format of values:
+    `+` for differences, `-` for plain values.
     """
     gate = printable(verdict.gate)
     if not verdict.failed:

@@ -52,7 +52,10 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def conditions(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each condition: the paper's operating points keep their own."""
+    """Return a colour for each condition, an operating point by its name.
+
+    The paper's operating points keep their own.
+    """
     chosen: dict[str, str] = {}
     for name in dict.fromkeys(names):
         free = [

@@ -24,9 +24,9 @@ NEAR_M = VIEW_M - MARGIN_M
 
 
 def north_up(points: Floats) -> Floats:
-    """Return points (..., 2), m, of the frame of `harness.world.road` with y to the north.
+    """Return points (..., 2), m east and south, as m east and north.
 
-    In that frame y points to the south.
+    The frame of `harness.world.road`, in which they are given, has y to the south.
     """
     return points * [1.0, -1.0]
 
@@ -76,12 +76,15 @@ def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
 
 @dataclass(frozen=True)
 class View:
-    """Hold the rectangle of the world that a picture shows, m to the east and to the north."""
+    """Hold the rectangle of the world that a picture shows, m to the east and to the north.
 
-    west_m: float
-    south_m: float
-    width_m: float
-    height_m: float
+    `west_m` and `south_m` are its corner, from the origin of the scenario.
+    """
+
+    west_m: float  # its west edge, east of the origin
+    south_m: float  # its south edge, north of the origin
+    width_m: float  # from west to east
+    height_m: float  # from south to north
 
     @property
     def edges(self) -> Floats:

@@ -17,9 +17,10 @@ NOWHERE = np.zeros(2)
 
 
 def covered(spots: Floats, half: Floats, boxes: Sequence[Floats]) -> Floats:
-    """Return for each centre (n, 2), m, how many boxes a label there would overlap, (n,).
+    """Return for a label at each of n centres how many boxes it would overlap, (n,).
 
-    `half` is half the label's width and height (2,); a box is its two opposite corners (2, 2).
+    `spots` are the centres (n, 2), m east and north; `half` is half the label's width and height
+    (2,), m; a box is its two opposite corners (2, 2).
     """
     if not boxes:
         return np.zeros(len(spots))
@@ -30,9 +31,10 @@ def covered(spots: Floats, half: Floats, boxes: Sequence[Floats]) -> Floats:
 
 
 def cut(spots: Floats, half: Floats, view: View) -> Floats:
-    """Return how far a label at each centre (n, 2) would stick out of the view, (n,), m.
+    """Return how far a label at each of n centres would stick out of the view, (n,), m.
 
-    `half` is half the label's width and height, (2,).
+    `spots` are the centres (n, 2), m east and north, and `half` is half the label's width and
+    height, (2,), m.
     """
     low, high = view.edges
     out: Floats = np.maximum(low - (spots - half), spots + half - high).max(axis=1).clip(0.0)
@@ -40,7 +42,11 @@ def cut(spots: Floats, half: Floats, view: View) -> Floats:
 
 
 def crossed(at: Floats, ends: Floats, lines: Sequence[Floats]) -> Floats:
-    """Return how many of the lines (2, 2) a line from `at` (2,) to each end (n, 2) crosses."""
+    """Return how many of some lines a straight line from a point to each of n ends crosses, (n,).
+
+    `at`, (2,), is the point, and `ends`, (n, 2), are the ends; a line of `lines` is its two ends
+    (2, 2), all m east and north.
+    """
     if not lines:
         return np.zeros(len(ends))
     a, b = np.swapaxes(np.array(lines), 0, 1)

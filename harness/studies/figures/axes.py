@@ -18,10 +18,11 @@ ROOM_IN = 0.5  # for names below a figure, in its height
 def paper_values(
     marks: "pd.DataFrame | None", panel: str, metric: str, **place: str
 ) -> "pd.DataFrame":
-    """Return the paper's values of a metric in a panel, as rows with `value`, `low` and `high`.
+    """Return the rows of the paper's values of a metric in a panel of its figures.
 
-    `marks` is the table of the paper's values, and `place` selects rows of it by further columns.
-    It is empty if `marks` is None.
+    `marks` is the table of all of the paper's values; None gives no rows. `place` selects rows by
+    further columns, such as `condition`. Columns are `value`, `low` and `high`, in the metric's
+    unit.
     """
     import pandas as pd
 
@@ -36,7 +37,8 @@ def paper_values(
 def cross(axes: Any, paper_rows: "pd.DataFrame", x: Any) -> None:
     """Draw the paper's values at `x`: a cross for one value, an error bar for a range.
 
-    `axes` are Matplotlib's; `paper_rows` has the ends of each value in `low` and `high`.
+    `axes` are Matplotlib's; `paper_rows` has the ends of each value in `low` and `high`. `x` is one
+    place for all rows, or an array with one for each.
     """
     low, high = (paper_rows[end].to_numpy(dtype=float) for end in ("low", "high"))
     x, single = np.broadcast_to(x, low.shape), low == high
@@ -51,12 +53,18 @@ def cross(axes: Any, paper_rows: "pd.DataFrame", x: Any) -> None:
 
 
 def lead_in(rows: "pd.DataFrame") -> str:
-    """Return the headline metric of a summary's rows: balanced success if all sources have it."""
+    """Return the name of the metric that figures of a summary's rows show: balanced success.
+
+    It is plain success unless all sources (`source`, such as runs) have the balanced one.
+    """
     return headline_metric(*(set(of.metric) for _, of in rows.groupby("source")))
 
 
 def interval_of(rows: "pd.DataFrame") -> str:
-    """Return the kind of interval to draw: `episodes` if the rows have it, else `seed means`."""
+    """Return which kind of interval of a summary's rows is drawn.
+
+    It is `episodes`, over episodes, if the rows have it, else `seed means`, over channel seeds.
+    """
     return "episodes" if (rows.interval == "episodes").any() else "seed means"
 
 
@@ -92,6 +100,9 @@ def key(figure: "Figure", named: Mapping[str, Any], most: int = 4) -> None:
 
 
 def lettered(drawn: Any) -> None:
-    """Title the axes (a), (b) and so on."""
+    """Title Matplotlib axes (a), (b) and so on.
+
+    `drawn` is an array or a sequence of them, in reading order.
+    """
     for axes, letter in zip(drawn, "abcdefg", strict=False):
         axes.set_title(f"({letter})", loc="left", fontsize=8)

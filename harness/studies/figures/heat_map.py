@@ -22,9 +22,10 @@ def heat_map(
     row: str = "",
     column: str = "",
 ) -> Figure:
-    """Draw heat maps of percentages, (R, C) for R rows and C columns, one panel for each title.
+    """Draw heat maps of percentages, one panel for each array of `panels`, by its title.
 
-    `rows` and `columns` are the names along both axes, `row` and `column` the titles of the axes.
+    An array is (R, C), of R rows and C columns. `rows` and `columns` are the names along both axes,
+    `row` and `column` the titles of the axes.
     """
     room = COLUMN_IN * len(columns) / CHARACTER_IN
     beside = len(columns) <= MOST_BESIDE and max(map(len, panels)) <= room

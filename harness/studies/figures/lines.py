@@ -40,10 +40,12 @@ def along(
 ) -> Figure:
     """Draw success along an axis, a panel for each axis, with loss or trigger rate beside it.
 
-    Panels are parts of a study's summary, and each may have several sources. `paper` is the table
-    of the paper's values, None to draw none; with it, its best range of tau is drawn. `colours`
-    gives colours to conditions; None for the usual ones. If there are several sources, each curve
-    has a colour of its own.
+    An axis is what a sweep varies, such as packet loss; the trigger rate is the share of decisions
+    in which the ego asks helpers. Panels are parts of a study's summary, and each may have several
+    sources (runs). `paper` is the table of the paper's values, None to draw none; with it, its best
+    range of tau, the entropy threshold, is drawn. `colours` gives colours to conditions (operating
+    points); None for the usual ones. If there are several sources, each curve has a colour of its
+    own.
     """
     width = max(2.5 * len(panels) + 0.2, LEAST_IN)
     figure = Figure(figsize=(width, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))

@@ -18,25 +18,31 @@ from harness.studies.figures.axes import key, lettered, plain
 
 @dataclass(frozen=True)
 class Steps:
-    """Describe a step curve of a figure: its points, ascending in x and y, label and line style."""
+    """Describe a step curve of a figure, whose points ascend in x and y.
 
-    label: str
-    x: Sequence[float]
-    y: Sequence[float]
+    `label` is its name in the legend, `look` has Matplotlib's arguments for how the line is drawn,
+    and `name` is written beside its last point.
+    """
+
+    label: str  # the curve's name in the legend; empty for none
+    x: Sequence[float]  # where each step begins, ascending, in the axis's unit
+    y: Sequence[float]  # the height of each step, ascending
+    # how it is drawn: keyword arguments of Matplotlib's `Axes.plot`
     look: Mapping[str, Any] = field(default_factory=dict)
     name: str = ""  # beside the last place
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Describe a panel of estimates: a row for each name, an estimate or None for each series.
+    """Describe a panel of estimates: a row for each of `names`, and in it one of each series.
 
-    An estimate is drawn times `scale`, 100 for percent; `quantity` is what it is, with its unit.
+    `series` has a series' estimates by its name, in the order of the rows. An unknown one is None;
+    each is drawn times `scale`, 100 for percent; `quantity` is what it is, with its unit.
     """
 
     quantity: str  # along the panel, with its unit
     names: Sequence[str]  # of the rows, from top to bottom
-    series: Mapping[str, Sequence[Estimate | None]]
+    series: Mapping[str, Sequence[Estimate | None]]  # by its name, an estimate for each row
     scale: float = 100.0  # what an estimate is multiplied with: 100 for percent
 
 
@@ -89,8 +95,8 @@ def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
 def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> Figure:
     """Draw success in percent against a cost, as step curves.
 
-    A panel is its title, the label of the cost with its unit, and its curves; `success` is the
-    metric's name for people.
+    A panel is its title, the label of the cost with its unit, and its curves, whose y is success in
+    percent; `success` is the metric's name for people.
     """
     width = max(3.6 * len(panels), 4.4)
     figure = Figure(figsize=(width, 3.6), layout=ConstrainedLayoutEngine(w_pad=0.1))
