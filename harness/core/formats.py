@@ -15,7 +15,7 @@ DATA = frozenset(
     {
         *("run.json", "run.toml", "decisions.parquet", "episodes.csv", "answers.jsonl"),
         *("more-answers.jsonl", "summary.csv", "difficulty.csv", SUITE, "manifest.json"),
-        "layouts.zip",
+        *("layouts.zip", "notes.json", "servers.jsonl", "costs.jsonl", CONFIG),
     }
 )
 # Every kind of study, and what lists call it; `<kind>.json` marks its folder. Who makes a kind adds
@@ -28,7 +28,8 @@ def refuse_data(option: str, out: Path) -> None:
 
     A page or an export that is written over it would lose the run.
     """
-    if out.name in DATA and os.path.lexists(out):
+    is_source = SOURCES in out.absolute().parts[-5:]
+    if (out.name in DATA or is_source) and os.path.lexists(out):
         raise UserError(
             f"{option} {printable(out)} is a file of a run, suite or dataset, which would be lost; "
             "name another file"

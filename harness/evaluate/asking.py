@@ -76,6 +76,7 @@ OF_RULES = (
     "first_token_s",
     "token_s",
 )
+SENT = Path("answers")  # what messages call a file of another machine
 WITH_EXAMPLES = "v10"  # the prompt for every scenario that small models answer in its form
 
 
@@ -118,6 +119,7 @@ class Asker:
         progress: Callable[[int], None] = lambda count: None,
         more: Callable[[int], None] = lambda count: None,
         earlier: Path | None = None,
+        sent: Mapping[str, Answer] | None = None,
     ) -> None:
         """Create an asker. `backend` opens the backend, at the first request.
 
@@ -125,14 +127,17 @@ class Asker:
         the number of new answers, those kept by a stopped run included; `more` that of requests
         before they are made. An answer of the file counts only once its question is asked here,
         and UserError is raised if it cannot be the answer to that. `earlier` is
-        another file of kept answers, to which none are added.
+        another file of kept answers, to which none are added, and `sent` has those of a file that
+        lies on another machine.
         """
         self.spec, self._backend, self.latency = spec, backend, latency
         self._kept = KeptAnswers(kept) if kept else None
         self._earlier = KeptAnswers(earlier) if earlier else None
         self._progress, self._more = progress, more
         self._given, self.served = frozenset(answers or {}), list[Served]()
-        recalled = self._recalled()
+        recalled = {**(sent or {}), **self._recalled()}
+        agents, actions = spec.agents, spec.actions
+        refuse_other_kept(SENT, (sent or {}).values(), agents, actions)
         self.answers = {**recalled, **(answers or {})}
         # Kept answers whose question was not asked here yet.
         self._unasked = set(recalled.keys() - (answers or {}).keys())
@@ -210,7 +215,7 @@ class Asker:
     def _refused(self, request: Request, fault: str) -> UserError:
         """Return the error of a kept answer, of which a phrase says what is wrong with it."""
         files = [each.file for each in (self._kept, self._earlier) if each]
-        file = next(file for file in files if request.id in read_kept(file))
+        file = next((file for file in files if request.id in read_kept(file)), SENT)
         where = f"{printable(file)}: answer {printable(request.id)}"
         return UserError(f"{where} {fault}; {ASKED_AGAIN}")
 

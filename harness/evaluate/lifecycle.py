@@ -134,7 +134,7 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
         now = {**_comparable(spec.record()), "shard": shard}
         stored = {**_comparable(run_start.settings), "shard": run_start.shard}
         work.same(out, now, stored, partial(_options, spec, shlex.join(run_start.command)))
-        work.same(out, _rules(versions()), _rules(run_start.versions))
+        work.same(out, rules(versions()), rules(run_start.versions))
     return run_start
 
 
@@ -148,7 +148,7 @@ def _options(spec: Spec, command: str) -> str:
     return ""
 
 
-def _rules(versions: Mapping[str, str]) -> dict[str, str]:
+def rules(versions: Mapping[str, str]) -> dict[str, str]:
     """Return the versions of the rules that make decisions of answers:
     parts of a run have the same.
     """

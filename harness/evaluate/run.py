@@ -21,7 +21,7 @@ from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
 from harness.core.errors import Unanswered, UserError, in_range, printable
-from harness.core.files import bytes_of, write_whole
+from harness.core.files import bytes_of, folder_in, write_whole
 from harness.core.formats import CONFIG, WORK
 from harness.core.memory import uncollected
 from harness.core.parallel import Workers, each, spread
@@ -29,6 +29,7 @@ from harness.core.progress import Progress
 from harness.core.seals import is_sealed, say_unsealed, write_seal
 from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
+from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.dataset.select import recorded
 from harness.evaluate import costs, servers, timing
@@ -45,6 +46,7 @@ from harness.evaluate.lifecycle import (
     finished,
     finished_with,
     refuse_finished,
+    rules,
     unfinished,
 )
 from harness.evaluate.sources import sources
@@ -723,6 +725,7 @@ def read_or_evaluate(
     """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         return finished_run(spec, out)
+    folder_in(out.parent, out.name)
     evaluate(spec, out, progress, cache, progress.more, opens=opens, given=given)
     work.tidy(out)
     return folder.read(out)
@@ -736,8 +739,10 @@ def finished_run(spec: Spec, out: Path) -> folder.Run:
     """
     from harness.evaluate.recompute import refuse_otherwise  # which evaluates a run again
 
+    folder_in(out.parent, out.name)
     finished(spec, out)
     run = sound(out)
+    work.same(out, rules(versions()), rules(run.manifest.versions))
     refuse_others(run)
     refuse_otherwise(run, spec)
     return run

@@ -362,7 +362,7 @@ class Reader:
             says(self.rule(r), "ego" if r.answer == "readout" else r.role, r.actions) for r in asked
         ]
         return [
-            Completion(r.id, t, 9, 9, "stop", None, 1) for r, t in zip(asked, texts, strict=True)
+            Completion(r.id, t, 900, 90, "stop", None, 1) for r, t in zip(asked, texts, strict=True)
         ]
 
     def identity(self) -> dict[str, Any]:

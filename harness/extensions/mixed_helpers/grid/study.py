@@ -20,6 +20,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import PLAIN, crossed, interval_of
+from harness.core.files import folder_in
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled_estimate
@@ -193,7 +194,7 @@ def run_cells(
         for (role, of_agent), of_role in answers.items():
             if of_agent == (helper.name if is_helper(role) else ego.name):
                 stored |= of_role
-        folder = out / "cells" / f"{i}-{j}"
+        folder = folder_in(out, "cells") / f"{i}-{j}"
         run = read_or_evaluate(both, folder, progress, cache_file, opens, stored)
         for answer in run.answers:
             if answer.role != "merge" and answer.error is None:

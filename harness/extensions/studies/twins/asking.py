@@ -221,7 +221,8 @@ def _ask_episode(
     def backend() -> Backend:
         return cached(opened(spec.ego.card, **spec.opening), spec.ego.card, cache)
 
-    asker = Asker(spec, backend, PAPER, place and _answers_file(place, number), kept)
+    file = place and _answers_file(place, number)
+    asker = Asker(spec, backend, PAPER, file, sent=None if file else kept)
     every_twin = [TWINS[name] for name in questions.twins]
     twins = [twin for twin in every_twin if lack(spec, twin) is None]
     of_scenes = {scene.id: list(requests(spec, [scene])) for scene in scenes}
