@@ -12,29 +12,33 @@ from harness.core.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Claims:
-    """Hold the positions and speeds that H helpers claim, and what the ego can check them by."""
+    """Hold the positions and speeds that H helpers claim, and what the ego can check them by.
+
+    Arrays are of decisions of any shape `(...)`. On an axis of length 1+H index 0 is the ego and
+    1+h is helper h; on one of length H, index h is helper h.
+    """
 
     # claimed place, m to the east and to the south of the centroid of the conflict zone, `(...,
     # 1+H, 2)`, the ego first; NaN for a helper that is absent
     xy_m: Floats
-    speed_mps: Floats  # claimed speed, `(..., H)`
-    time_s: Floats  # time of the claim since the start of the episode, `(...)`
-    # standard deviation on each axis by which the beacons' declared noise moves a true place,
+    speed_mps: Floats  # each helper's claimed speed, `(..., H)`
+    time_s: Floats  # when the claims were made, seconds since the start of the episode, `(...)`
+    # standard deviation on each axis, m, by which the beacons' declared noise moves a true place,
     # `(...)`
     error_m: Floats
-    # the helper's distance to that centroid by the ego's own sensors, `(..., H)`; NaN if they do
-    # not see it
+    # each helper's distance to that centroid by the ego's own sensors, m, `(..., H)`; NaN if they
+    # do not see it
     sensed_m: Floats
     # the map: returns metres from places `(..., 2)` to the middle of the nearest lane
     from_road_m: Callable[[Floats], Floats]
 
     @cached_property
     def off_road_m(self) -> Floats:
-        """Metres from each helper's claimed position to the nearest lane's middle, `(..., H)`."""
+        """Return metres from each claimed position to the nearest lane's middle, `(..., H)`."""
         return self.from_road_m(self.xy_m[..., 1:, :])
 
     def take(self, at: Any) -> "Claims":
-        """Return the claims at indices `at` of the leading (decision) dimension."""
+        """Return the claims of the decisions at `at`, indices or a mask of the leading axis."""
         return Claims(
             self.xy_m[at],
             self.speed_mps[at],
@@ -45,9 +49,9 @@ class Claims:
         )
 
     def of_helpers(self, places: Ints) -> "Claims":
-        """Return the claims of the helpers at indices `places`, `(..., H')`, from 0.
+        """Return the claims of other helpers: in each decision those that `places` names.
 
-        An index may be repeated.
+        `places`, `(..., H')`, are indices of helpers here, from 0; one may be repeated.
         """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return replace(

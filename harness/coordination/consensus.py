@@ -17,19 +17,26 @@ from harness.core.arrays import Bools, Floats, summed
 
 @dataclass(frozen=True)
 class Messages:
-    """Hold what a consensus rule fuses in each decision: index 0 is the ego, 1+h is helper h."""
+    """Hold what a consensus rule fuses: the ego's intent and its helpers' messages.
 
-    # what each vehicle intends, `(..., 1+H, A)`; the row of a helper not heard may hold anything
+    Arrays are of decisions of any shape `(...)`, with H helpers and A actions. On an axis of
+    length 1+H index 0 is the ego and 1+h is helper h; on one of length H, index h is helper h.
+    """
+
+    # the probabilities that each vehicle gives to the ego's actions, `(..., 1+H, A)`, each row
+    # summing to 1; the row of a helper not heard may hold anything
     intents: Floats
-    weights: Floats  # paper Eq. 2, `(..., 1+H)`, summing to 1; 0 for a helper not heard
-    heard: Bools  # which replies came in time, `(..., H)`
-    # when they came, from the start of the decision, `(..., H)`; inf if lost or not asked. This is
-    # also a message's age, since every vehicle sees the scene at 0
+    # each vehicle's weight by distance (paper Eq. 2), `(..., 1+H)`, summing to 1; 0 for a helper
+    # not heard
+    weights: Floats
+    heard: Bools  # whether each helper's reply came within the decision window, `(..., H)`
+    # seconds from the start of the decision until each reply came, `(..., H)`; inf if it was lost
+    # or not asked for. This is also a message's age, since every vehicle sees the scene at 0
     arrival_s: Floats
-    # distance to the centroid of the conflict zone, `(..., 1+H)`; the ego's is what its operating
-    # point declares, if it declares one
+    # each vehicle's distance to the centroid of the conflict zone, m, `(..., 1+H)`; the ego's is
+    # what its operating point declares, if it declares one
     distance_m: Floats
-    range_m: Floats  # distance to the ego, `(..., H)`
+    range_m: Floats  # each helper's distance to the ego, m, `(..., H)`
     # what helpers claim about themselves, for a rule whose `needs` names it; else None
     claims: Claims | None = None
     # what agents say of themselves, for a rule whose `needs` names it; `intents` are then plans.
@@ -38,12 +45,14 @@ class Messages:
 
 
 class Fused(NamedTuple):
-    """Hold what a consensus rule returns for each decision."""
+    """Hold what a consensus rule returns for decisions `(...)` with H helpers and A actions."""
 
-    policy: Floats  # the distributions after fusion, `(..., A)`
-    # each vehicle's weight in the policy, `(..., 1+H)`; NaN if the rule has no weights
+    policy: Floats  # probabilities of the ego's actions after fusion, `(..., A)`
+    # each vehicle's weight in the policy, `(..., 1+H)`, the ego first; NaN if the rule has none
     weights: Floats
-    state: Floats  # the rule's memory at the next step, `(..., K)`; K may be 0
+    # the rule's memory for the next decision of the same episode, `(..., K)`, K numbers of the
+    # rule's own; K may be 0
+    state: Floats
     # how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it
     # treats the helper as an attacker. NaN for a helper not heard. None if the rule rates no trust
     trust: Floats | None = None
@@ -112,10 +121,11 @@ def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: f
 
 
 def capped(weights: Floats, most: float) -> Floats:
-    """Return weights `(..., 1+H)` in which no helper has more than the share `most`, from 0 to 1.
+    """Return weights in which no helper has more than the share `most` (0 to 1), `(..., 1+H)`.
 
-    What a capped helper loses goes to the other vehicles in proportion to their weights, so the sum
-    stays 1. The ego (index 0) is never capped and may end above `most`.
+    `weights`, `(..., 1+H)`, are of the ego (index 0) and H helpers and sum to 1. What a capped
+    helper loses goes to the other vehicles in proportion to their weights, so the sum stays 1. The
+    ego is never capped and may end above `most`.
     """
     is_capped = np.zeros(weights.shape, dtype=bool)
     scaled = weights
@@ -202,9 +212,10 @@ def _pick(values: Floats, reached: Bools) -> Floats:
 
 
 def scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
-    """Return `pooled`, `(..., A)`, scaled to sum to 1; a row of zeros becomes the linear pool.
+    """Return the probabilities `pooled` of A actions, scaled to sum to 1, `(..., A)`.
 
-    That pool is of the intents `p`, `(..., 1+H, A)`, by `weights`, `(..., 1+H)`.
+    A row of zeros becomes the linear pool: the mean of the intents `p`, `(..., 1+H, A)`, of the ego
+    and H helpers, by `weights`, `(..., 1+H)`.
     """
     total = np.sum(pooled, axis=-1, keepdims=True)
     return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))

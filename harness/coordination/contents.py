@@ -58,8 +58,8 @@ class Call:
     ) -> Sequence["SceneGraph | None"]:
         """Return the scene graph to show the ego in each case, or None where its own graph stays.
 
-        Each case has what one ego sees and has heard. All egos are of `scenario`: they come from
-        the same approach, with the same route.
+        A scene graph is what one vehicle knows of a scene. Each case has what one ego sees and has
+        heard. All egos are of `scenario`: they come from the same approach, with the same route.
         """
         return [None] * len(cases)
 
@@ -69,15 +69,18 @@ class Call:
 
 
 class Content:
-    """Describe what helpers' messages hold, an operating point's setting `content`.
+    """Describe what helpers' messages hold: the setting `content` of an operating point.
 
-    This base class is a helper's intent with its words; subclasses hold objects, words alone, or
-    plans.
+    An operating point is the settings of radio, asking and fusion. Contents hold helpers' intents
+    with their words, words alone, lists of detected objects, or senders' own plans. Methods of this
+    base class are right for a helper's intent with its words.
     """
 
-    holds: frozenset[str]  # what it holds, some of `KINDS`
-    needs: tuple[str, ...] = ()  # what it needs of the world, some of `NEEDS`
-    call: Call | None = None  # second question to the ego's model; None without one
+    holds: frozenset[str]  # the kinds of what such a message holds, some of `KINDS`
+    # what the world must know to make such messages, some of `NEEDS`
+    needs: tuple[str, ...] = ()
+    # second question to the ego's model, which shows it what it has heard; None without one
+    call: Call | None = None
 
     @property
     def of_agents(self) -> bool:
@@ -90,31 +93,33 @@ class Content:
         return not self.holds.isdisjoint(BY_MODELS)
 
     def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
-        """Return why this content cannot be used under `point` in `run`; None if it can.
+        """Return why this content cannot be used under an operating point in a run, or None.
 
-        The text also says what to do instead.
+        The text also says what to do instead. `run` has the run's agents, scenario and world.
         """
         return None
 
     def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-        """Return `intents` of n decisions; only helpers that can send this content stay valid.
+        """Return what vehicles intend in n decisions, with only those helpers valid that can send.
 
-        `senders`, `(n, H)`, is needed where messages hold plans: row of the decision that each
-        helper makes itself at this time, -1 for none. May also change helpers' inference times.
-        Raises UserError if it needs `senders` and they are None.
+        A helper that has nothing of this content is not valid in the result. `senders`, `(n, H)`,
+        is needed where messages hold plans: the row, among the n, of the decision that each helper
+        makes itself at this time, -1 for none. May also change helpers' inference times. Raises
+        UserError if it needs `senders` and they are None.
         """
         return intents
 
     def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
         """Return the size of each helper's reply in bits, `(..., H)`.
 
-        `encoding` is one of `encodings.ENCODINGS`; `headers` adds those of network and transport.
+        `encoding` is how messages are written, `json` or one of `encodings.ENCODINGS`; `headers`
+        says whether those of network and transport count.
         """
         return intent_bits(encoding, intents, headers)
 
 
 class OfIntent(Content):
-    """The paper's content: a helper's intent for the ego, with its words."""
+    """Describe the paper's content: what a helper intends in the ego's place, with its words."""
 
     holds = frozenset((INTENTS, WORDS))
 
@@ -172,14 +177,15 @@ def _own_calls() -> frozenset[str]:
 
 
 def is_ours(call: Call) -> bool:
-    """Return whether a call is of a content that ships."""
+    """Return whether a second question to the ego's model is one of a content that ships."""
     return call.name in _own_calls()
 
 
 def of_any_model() -> list[str]:
-    """Return the names of contents that work with every backend, language model or not.
+    """Return the names of contents of messages that work with every backend.
 
-    Left out are plans, and contents whose words the ego's model must read.
+    Backends that are no language model, such as rules, read no words: contents whose words the
+    ego's model must read are left out, and so are plans.
     """
     names = []
     for name, content in CONTENTS.usable().items():

@@ -33,9 +33,10 @@ MOST_CHARACTERS = 10_000  # of a helper's words
 
 
 def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
-    """Return why the point's content cannot be used in `run`, in one line; None if it can.
+    """Return why what messages hold at an operating point cannot be used in a run, or None.
 
-    Raises UserError if a package's content fails or returns no text.
+    The text is one line; `run` has the run's agents, scenario and world. Raises UserError if a
+    package's content fails or returns no text.
     """
     content, prompt = point.content, run.agents[0].prompt
     if point.has_fusion_call and content.call and content.call.in_words and not prompt.shows_words:
@@ -49,11 +50,12 @@ def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
 
 
 def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
-    """Return `intents` with `valid` true only for helpers that can send the point's content.
+    """Return what vehicles intend in n decisions, with only those helpers valid that can send.
 
-    `senders`, `(n, H)`, has the row of the decision that each helper makes itself at this time, -1
-    for none; needed where messages hold plans. Of a package's content only `valid`, helpers'
-    inference times and `unasked` may change; raises UserError if it fails or changes anything else.
+    What they send is the content of the operating point `point`. `senders`, `(n, H)`, has the row,
+    among the n, of the decision that each helper makes itself at this time, -1 for none; needed
+    where messages hold plans. Of a package's content only `valid`, helpers' inference times and
+    `unasked` may change; raises UserError if it fails or changes anything else.
     """
     content = point.content
     if CONTENTS.is_ours(point.ask.content):
@@ -80,9 +82,10 @@ def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Int
 
 
 def bits(point: "OperatingPoint", intents: Intents) -> Floats:
-    """Return the size in bits of each helper's reply with the point's content, `(..., H)`.
+    """Return the size in bits of each helper's reply at an operating point, `(..., H)`.
 
-    Raises UserError if a package's content fails or gives sizes outside 0 to `MOST_BITS`.
+    It depends on what messages hold there, and on how they are encoded. Raises UserError if a
+    package's content fails or gives sizes outside 0 to `MOST_BITS`.
     """
     content, encoding, headers = point.content, point.radio.encoding, point.physical is not None
     if CONTENTS.is_ours(point.ask.content):

@@ -48,10 +48,11 @@ TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 class FusionInputs:
     """Hold what `coordinate` and `fuse` need besides intents and draws; each may be None."""
 
-    # the fusion call; required if the point's consensus is `ego-prompt`
+    # asks the ego's model once more, with what the ego has heard; required where the operating
+    # point makes such a fusion call, as with consensus `ego-prompt`
     call: FusionCall | None = None
-    # the rule's memory of each decision's episode, `(..., K)`: `Coordination.state` of the
-    # episode's last step. None at the first step
+    # the consensus rule's memory of each decision's episode, `(..., K)`, K numbers of the rule's
+    # own: `Coordination.state` of the episode's last decision. None at the first decision
     state: Floats | None = None
     # the draws that decide between actions that are equally likely; None takes the first of them
     ties: TieDraws | None = None
@@ -61,12 +62,13 @@ class FusionInputs:
 class Coordination(Exchange):
     """Hold all that happened in each decision: exchange, fused policy, action and latency.
 
-    Made by `coordinate` and `fuse`. Times are seconds from the start of the decision.
+    Made by `coordinate` and `fuse`. Times are seconds from the start of the decision. Arrays are of
+    decisions of any shape `(...)`, with H helpers and A actions; of 1+H vehicles the ego is first.
     """
 
     # each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered
     weights: Floats
-    fused: Floats  # the policy, `(..., A)`
+    fused: Floats  # the policy: probabilities of the ego's actions after fusion, `(..., A)`
     # index of its most probable action, `(...)`. A tie is drawn; without draws it goes to the
     # earlier action, the more careful one
     action: Ints
@@ -77,23 +79,29 @@ class Coordination(Exchange):
     # the ego's inference time is unknown
     latency_s: Floats
     deadline_missed: Bools  # whether that is after the window, `(...)`
-    # the rule's memory at the episode's next step, `(..., K)`; K is 0 for a rule without memory
+    # the rule's memory for the episode's next decision, `(..., K)`, K numbers of the rule's own; K
+    # is 0 for a rule without memory
     state: Floats
-    # how far the rule trusts each helper, `(..., H)`; NaN if it rates none (`consensus.Fused`)
+    # how far the rule trusts each helper, from 0 to 1, `(..., H)`; NaN for one that was not heard,
+    # and if the rule rates none (`consensus.Fused`)
     trust: Floats
 
     @property
     def fusion_s(self) -> Floats:
-        """Seconds that fusion takes after the exchange, `(...)`; 0 without a fusion call."""
+        """Return the seconds that fusion takes after the exchange, `(...)`; 0 for a rule.
+
+        Only a fusion call, a second question to the ego's model, takes time.
+        """
         return self.latency_s - self.exchange_s
 
 
 def coordinate(
     point: OperatingPoint, intents: Intents, draws: Draws, fusion: FusionInputs | None = None
 ) -> Coordination:
-    """Play decisions `(...)` under one operating point, from asking helpers to the ego's action.
+    """Play decisions of any shape `(...)`, from asking helpers to the ego's action.
 
-    `intents` has up to H helpers and A actions in each decision; `draws` are the channel's random
+    `point` is the operating point: the settings of radio, asking and fusion. `intents` has what the
+    ego and up to H helpers intend over A actions in each decision; `draws` are the channel's random
     numbers. `fusion` is needed where the point makes a fusion call (the ego's model answers once
     more, with what it has heard), its rule has memory, or ties are drawn. Raises UserError if a
     package's plug-in fails.
@@ -104,11 +112,11 @@ def coordinate(
 def fuse(
     point: OperatingPoint, heard: Exchange, intents: Intents, fusion: FusionInputs | None = None
 ) -> Coordination:
-    """Return the fused policies, actions and latencies, given an exchange of messages.
+    """Fuse what egos intend with what they heard, and return policies, actions and latencies.
 
-    The second half of `coordinate`: `heard` is the result of `exchange` on the same point and
-    intents. Raises ValueError if the point makes a fusion call and `fusion` has none, and UserError
-    if a package's rule fails.
+    The second half of `coordinate`: `heard` is the result of `exchange` on the same operating point
+    and intents, and `fusion` what else is needed. Raises ValueError if the point makes a fusion
+    call and `fusion` has none, and UserError if a package's rule fails.
     """
     fusion = fusion or FusionInputs()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)

@@ -19,10 +19,13 @@ COUNTERPARTS = Plugins[Callable[[str], str]]("swarmdrive.counterparts", Callable
 def counterparts(
     points: Sequence[OperatingPoint], settings: Mapping[str, Any]
 ) -> Iterator[OperatingPoint]:
-    """Yield the counterparts of operating points by a run's settings of extensions, by name.
+    """Yield for each operating point those that differ from it in one setting, its counterparts.
 
-    They are in the order of the settings' texts, and within one in that of the points; a point that
-    states the setting itself has none. Raises UserError for a text that is not allowed.
+    `settings` are a run's settings of extensions, values by name; each text of one that is in
+    `COUNTERPARTS` stands for one setting that a counterpart has in addition, such as `loss=1`.
+    Counterparts are in the order of these texts, and within one in that of the points. A point
+    without a channel has none, nor one that states the setting itself. Raises UserError for a text
+    that is not allowed.
     """
     additions = dict[str, None]()  # each once, in their order
     for name in COUNTERPARTS:

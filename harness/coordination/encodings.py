@@ -81,9 +81,9 @@ def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 
 
 def request_bits(encoding: str, helpers: int, headers: bool) -> float:
-    """Return the size in bits of a request to `helpers` vehicles.
+    """Return the size in bits of one request that asks so many helpers.
 
-    `encoding` is one of `ENCODINGS`. `headers` adds those of network and transport.
+    `encoding` is one of `ENCODINGS`. `headers` says whether those of network and transport count.
     """
     return float(ENCODINGS[encoding].packet_bits("request", headers, helpers=helpers))
 

@@ -50,15 +50,15 @@ from harness.radio.wrapped import broadcast, delivered, heard_s, is_ours
 class Exchange:
     """Hold who was asked, what was sent and who was heard in each decision.
 
-    Made by `exchange`. Times are seconds from the start of the decision. Shapes are of decisions
-    `(...)` with H helpers and A actions. A unit is an antenna beside the road, which may ask the
-    helpers for the ego and fuse what they reply.
+    Made by `exchange`. Times are seconds from the start of the decision. Arrays are of decisions of
+    any shape `(...)`, with H helpers, index h for helper h, and A actions. A unit is an antenna
+    beside the road, which may ask the helpers for the ego and fuse what they reply.
     """
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`
     # whether the ego's answer was unusable, so that `own` is the fallback, `(...)`
     own_failed: Bools
-    entropy_nats: Floats  # entropy of `own`, `(...)`
+    entropy_nats: Floats  # entropy of `own`, `(...)`: how unsure the ego is
     # whether the ego asks at least one helper, `(...)`. By default it asks those in the radius if
     # the entropy is above tau. Without a channel, or with nobody in the radius, it asks nobody
     triggered: Bools
@@ -70,11 +70,11 @@ class Exchange:
     # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit that
     # asks for the ego; 0 if nobody is asked
     requests: Ints
-    request_bits: Floats  # size of the requests, `(...)`; 0 if nobody is asked
-    # size of all scheduled replies, and of the policy that a unit sends, `(...)`
+    request_bits: Floats  # size of all requests, bits, `(...)`; 0 if nobody is asked
+    # size of all scheduled replies, and of the policy that a unit sends, bits, `(...)`
     reply_bits: Floats
-    # total time on air of the request and the scheduled replies, `(...)`; NaN if the channel model
-    # does not have it
+    # seconds that the request and the scheduled replies are on air, `(...)`; NaN if the channel
+    # model does not know it
     airtime_s: Floats
     # packet loss, the probability that one transmission was lost, `(...)`: the mean over the
     # helpers asked if links differ; NaN without a channel
@@ -82,34 +82,51 @@ class Exchange:
     # whether the helper was asked, and request and reply arrived, `(..., H)`; if a unit fuses, its
     # policy must have arrived, too
     delivered: Bools
-    arrival_s: Floats  # end of the reply at whoever fuses, `(..., H)`; inf if lost or not asked
-    on_time: Bools  # whether it arrived within the window and so is fused, `(..., H)`
+    # when each helper's reply ends where it is fused, by the ego or a unit, `(..., H)`; inf if it
+    # is lost or not asked for
+    arrival_s: Floats
+    # whether it arrived within the decision window and so is fused, `(..., H)`
+    on_time: Bools
     exchange_s: Floats  # end of the whole exchange, `(...)`
-    repeats: Ints  # scheduled replies of further rounds, `(...)`
+    # number of scheduled replies in further rounds of asking, as where agents answer each other's
+    # plans, `(...)`
+    repeats: Ints
 
     @cached_property
     def normalised_entropy(self) -> Floats:
-        """Entropy of the ego's intent `own` over ln A, from 0 (sure) to 1 (uniform), `(...)`."""
+        """Return how unsure the ego is, from 0 (sure) to 1 (uniform), `(...)`.
+
+        It is the entropy of its intent `own` over A actions, divided by ln A.
+        """
         return normalised_entropy(self.own)
 
     @cached_property
     def messages(self) -> Ints:
-        """Number of scheduled replies of all rounds, `(...)`; like the paper, without requests."""
+        """Return the number of scheduled replies of all rounds, `(...)`.
+
+        Like the paper, this counts no requests.
+        """
         return count_of(self.asked) + self.repeats
 
     @cached_property
     def lost(self) -> Ints:
-        """Number of asked helpers whose reply did not reach the ego, `(...)`."""
+        """Return the number of asked helpers whose reply did not reach the ego, `(...)`."""
         return count_of(self.asked & ~self.delivered)
 
     @cached_property
     def late(self) -> Ints:
-        """Number of replies that arrived after the decision window and are not fused, `(...)`."""
+        """Return the number of replies that came after the decision window, `(...)`.
+
+        They are not fused.
+        """
         return count_of(self.delivered & ~self.on_time)
 
     @cached_property
     def observed_loss(self) -> Floats:
-        """Share of asked helpers whose reply did not arrive, `(...)`; NaN if nobody was asked."""
+        """Return the share of asked helpers whose reply did not arrive, `(...)`.
+
+        NaN if nobody was asked.
+        """
         n_asked = count_of(self.asked)
         return np.where(n_asked > 0, self.lost / np.maximum(n_asked, 1), np.nan)
 
@@ -117,11 +134,13 @@ class Exchange:
 def exchange(
     point: OperatingPoint, intents: Intents, draws: Draws, asked_helpers: Bools | None = None
 ) -> Exchange:
-    """Play schedule and radio channel for decisions `(...)` with up to H helpers; nothing is fused.
+    """Play whom the ego asks, and which replies arrive when, in decisions of any shape `(...)`.
 
-    The point's schedule chooses whom the ego asks, unless `asked_helpers`, `(..., H)`, is given:
-    then it asks these of the helpers in the radius. An unknown inference time counts as 0 s. Raises
-    UserError if the point needs what `intents` or `draws` lack, or if a package's plug-in fails.
+    Nothing is fused. `point` is the operating point: the settings of radio, asking and fusion. Its
+    schedule, the rule for whom to ask, chooses among up to H helpers, unless `asked_helpers`, a
+    mask `(..., H)`, is given: then the ego asks these, as far as they are in its radius. An unknown
+    inference time counts as 0 s. Raises UserError if the point needs what `intents` or `draws`
+    lack, or if a package's plug-in fails.
     """
     own_failed, inputs = _base_knowledge(point, intents)
     in_radius = inputs.may_ask
@@ -164,7 +183,7 @@ def exchange(
 
 
 def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
-    """Return which helpers' answers can change the outcome of each decision, `(..., H)`.
+    """Return a mask of the helpers whose answers can change each decision's outcome, `(..., H)`.
 
     For asking models lazily: once the models of all these have answered, the answers of others
     change nothing. They are the helpers that are asked; all in the radius, if the channel's load or
@@ -244,10 +263,11 @@ def _ask_helpers(
 
 
 def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
-    """Return the worth, by the point's schedule and in its unit, of asking each helper.
+    """Return what asking each helper is worth, by the operating point's schedule and in its unit.
 
-    The shape is `(..., H)`, or `(..., 1)` if it is the same for all helpers of a decision. The
-    schedule asks those above its threshold. Raises UserError if a package's schedule fails.
+    A schedule is the rule for whom to ask: helpers whose worth is above its threshold. The shape is
+    `(..., H)`, or `(..., 1)` if it is the same for all helpers of a decision. Raises UserError if a
+    package's schedule fails.
     """
     return _worth(point, known_of(point, intents, draws))
 
@@ -265,10 +285,10 @@ def _worth(point: OperatingPoint, inputs: ScheduleInputs) -> Floats:
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleInputs:
-    """Return what the point's schedule is given: what the ego knows before it asks anybody.
+    """Return what the ego knows before it asks anybody, the input of the point's schedule.
 
-    Raises UserError if the schedule needs positions and the decisions have none (the paper's
-    study).
+    The schedule of the operating point `point` is the rule for whom to ask. Raises UserError if it
+    needs positions and the decisions have none, as in the paper's study.
     """
     return _with_schedule_needs(point, _base_knowledge(point, intents)[1], intents, draws)
 

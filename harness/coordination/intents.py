@@ -17,28 +17,32 @@ from harness.radio.channel import Site
 
 @dataclass(frozen=True)
 class Intents:
-    """Hold, for decisions `(...)` with H helpers and A actions, each vehicle's answer and its cost.
+    """Hold what vehicles intend in decisions, and what else coordination needs to play these.
 
-    The intent of a vehicle is its probabilities of the ego's actions. Beside them are distances,
-    sizes of replies, inference times, and what optional parts of coordination need.
+    An intent is the probabilities that a vehicle gives to the ego's actions: what the ego should
+    do, as that vehicle sees it. Arrays are of decisions of any shape `(...)`, with H helpers and A
+    actions. On an axis of length 1+H index 0 is the ego and 1+h is helper h; on one of length H,
+    index h is helper h.
     """
 
     own: Floats  # the ego's intent, `(..., A)`; a row with a NaN is a failed answer
-    helpers: Floats  # helpers' intents, `(..., H, A)`
+    helpers: Floats  # each helper's intent, `(..., H, A)`
     # whether the helper exists and its answer parsed, `(..., H)`. Any other helper sends nothing,
-    # takes no slot, and may hold NaN in every array
+    # takes no slot on air, and may hold NaN in every array
     valid: Bools
-    # distance to the centroid of the conflict zone, `(..., 1+H)`, the ego first; that of a helper
-    # is as the ego knows it, from beacons
+    # each vehicle's distance to the centroid of the conflict zone, m, `(..., 1+H)`, the ego first;
+    # that of a helper is as the ego knows it, from beacons
     distance_m: Floats
-    range_m: Floats  # distance to the ego, `(..., H)`, as the ego knows it
-    payload_bits: Floats  # size of the reply, `(..., H)`
-    inference_s: Floats  # seconds of inference, `(..., 1+H)`, the ego first; NaN where unknown
+    range_m: Floats  # each helper's distance to the ego, m, `(..., H)`, as the ego knows it
+    payload_bits: Floats  # size of each helper's reply, `(..., H)`
+    # seconds that each vehicle's model takes to answer, `(..., 1+H)`, the ego first; NaN where
+    # unknown
+    inference_s: Floats
     site: Site | None = None  # where the vehicles truly are, if the channel needs it; else None
     # whether the helper, if asked, sends nothing in its slot, `(..., H)`. None if no helper is
     silent: Bools | None = None
-    # index of the vehicle behind each of the H voices, `(..., H)`. None if each vehicle has one
-    # voice
+    # index from 0 of the helper that is behind each of the H voices, `(..., H)`: an attacker may
+    # send as several. None if each helper has one voice
     voice_of: Ints | None = None
     # what the ego sees and what helpers would add, if a schedule needs it; else None
     outlook: Outlook | None = None
@@ -52,16 +56,16 @@ class Intents:
     # whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None
     # if the models of all were
     unasked: Bools | None = None
-    # what agents say of themselves, if messages hold plans; of the agent alone, `(..., 1)`, until
-    # it is known whom it hears. Else None
+    # what agents, the vehicles that decide for themselves, say of their own motion, if messages
+    # hold plans; of the ego of each decision alone, `(..., 1)`, until it is known whom it hears.
+    # Else None
     plans: Plans | None = None
-    # size of the agent's own answer as a reply, and bytes of its text, `(...)`, if messages hold
-    # plans
+    # size of the ego's own answer if it is sent as a message, `(...)`, where messages hold plans
     own_bits: Floats | None = None
-    own_text_bytes: Floats | None = None
+    own_text_bytes: Floats | None = None  # bytes of the text in it, `(...)`
 
     def take(self, at: Any) -> "Intents":
-        """Return the decisions at indices `at` of the leading dimension."""
+        """Return the decisions at `at`, indices or a mask, of the leading axis of all arrays."""
         return replace(
             self,
             site=self.site and self.site.take(at),
@@ -72,9 +76,9 @@ class Intents:
         )
 
     def replaced(self, at: Ints, newer: "Intents") -> "Intents":
-        """Return a copy whose decisions at indices `at` have the arrays of `newer`.
+        """Return a copy in which the decisions at indices `at`, `(k,)`, have the arrays of `newer`.
 
-        `site`, `outlook`, `claims` and `plans` stay those of this object.
+        `newer` has k decisions. `site`, `outlook`, `claims` and `plans` stay those of this object.
         """
         arrays = {name: array.copy() for name, array in self.arrays().items()}
         for name, values in newer.arrays().items():
@@ -104,11 +108,19 @@ class Intents:
         return replace(self, valid=self.valid & ((text_bytes > 0) | unasked))
 
     def planned(self, senders: Ints) -> "Intents":
-        """Return the intents of n agents, each with the plans of the H agents that it hears.
+        """Return a copy in which what helpers send are their own plans, not intents for the ego.
 
-        Decisions are of agents that decide at one time, one a row; `senders`, `(n, H)`, has the row
-        of each sender, -1 for a vehicle that does not decide now. Such a vehicle, and an agent
-        whose answer did not parse, is not valid. Needs `plans`, `own_bits` and `own_text_bytes`.
+        Here each of the n decisions, a row, is of another agent: a vehicle that decides for itself
+        and is the ego of its row. All decide at one time, so that each hears, as a helper, other
+        agents of these rows. What a helper plans is `own` of its row; its size, its text and its
+        inference time are taken from there, too. A helper that does not decide now is not valid,
+        nor is one whose answer did not parse.
+
+        Needs `plans`, `own_bits` and `own_text_bytes`.
+
+        Args:
+            senders: row, 0 to n-1, of the decision that each of the H helpers makes itself,
+                `(n, H)`; -1 for one that does not decide now.
         """
         assert self.plans is not None
         assert self.own_bits is not None
@@ -129,9 +141,10 @@ class Intents:
 
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
-        """Return the decisions of all `parts`, concatenated along the leading dimension.
+        """Return the decisions of several objects as one, concatenated along the leading axis.
 
-        All must have the same number of vehicles and no `site`, `outlook`, `claims` or `plans`.
+        All must have the same numbers of helpers and actions, and no `site`, `outlook`, `claims` or
+        `plans`.
         """
         arrays = [part.arrays() for part in parts]
         joint: dict[str, Any] = {}
@@ -152,9 +165,10 @@ class Intents:
         return replace(self, helpers=self.helpers[..., :helpers, :], **cut)
 
     def of_helpers(self, places: Ints) -> "Intents":
-        """Return decisions `(n, H)` with the helpers at indices `places`, `(n, H')`, from 0.
+        """Return the n decisions with other helpers: in each those that `places`, `(n, H')`, names.
 
-        An index may be repeated: one vehicle then speaks with several voices.
+        A place is the index of a helper here, from 0. It may be repeated: one vehicle then speaks
+        with several voices.
         """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         selected = {

@@ -28,7 +28,10 @@ CLOUD = OperatingPoint("cloud", cloud=Cloud(round_trip_s=0.51))
 
 
 def named_point(text: str) -> OperatingPoint:
-    """Return an operating point by text, such as `6g:consensus=ego-prompt,window_s=0.4`.
+    """Return the operating point that a text states, as `6g:consensus=ego-prompt,window_s=0.4`.
+
+    An operating point is the settings of radio, asking and fusion, under which a run's decisions
+    are played.
 
     Before the colon is one of the paper's points, or a channel profile, which stands for a point
     with that profile and the defaults. A setting may have its short name of `SHORT`, and may be one
@@ -88,9 +91,10 @@ def named_point(text: str) -> OperatingPoint:
 
 
 def misnamed(settings: Mapping[str, Any]) -> list[str]:
-    """Return the recorded settings of a condition that differ from what its name stands for.
+    """Return the names of a condition's recorded settings that its own name does not stand for.
 
-    The list is empty for a name that `named_point` cannot read, as of a point made in Python.
+    `settings` are flat, with the condition's `name`, such as `6g:window_s=0.4`. The list is empty
+    for a name that `named_point` cannot read, as of a point made in Python.
     """
     name = str(settings["name"])
     try:
@@ -108,8 +112,9 @@ SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("la
 
 
 def setting_of(key: str, text: str) -> object:
-    """Return the value of setting `key` from its text, converted to the type of its default.
+    """Return the value of an operating point's setting from its text, in the type of its default.
 
-    A text that cannot be converted is returned as it is, and refused where the point is made.
+    `key` is the setting's name. A text that cannot be converted is returned as it is, and refused
+    where the point is made.
     """
     return value_of(POINTS["6g"].setting(key), text)

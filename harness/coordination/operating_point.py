@@ -78,11 +78,12 @@ LONGEST_NAME = 1000
 class Rewrites(NamedTuple):
     """Describe how a fusion call shows helpers' messages to the ego's model.
 
-    It becomes part of the key under which the call's answer is kept.
+    A fusion call is a second question to that model, with what the ego has heard. This becomes part
+    of the key under which its answer is kept.
     """
 
     question: str = ""  # name of the question that helpers were asked; empty for the ordinary one
-    changes: Changes = Changes()  # changes by attacks and defences
+    changes: Changes = Changes()  # what attacks and defences change of messages, by name
     call: str = ""  # name of the content's second question (`contents.Call`); empty for none
     whole: bool = True  # whether the prompt shows all of each message
     elsewhere: bool = False  # whether messages come from other scenes
@@ -100,7 +101,7 @@ class OperatingPoint:
     stands in records and conditions. Raises UserError if they contradict.
     """
 
-    name: str  # in reports
+    name: str  # its name in reports and records, such as `6g:window_s=0.4`
     radio: Radio = Radio()  # noqa: RUF009 (parts are frozen)
     ask: Ask = Ask()  # noqa: RUF009
     fusion: Fusion = Fusion()  # noqa: RUF009
@@ -248,10 +249,10 @@ class OperatingPoint:
 
     @cached_property
     def channel(self) -> Channel:
-        """The radio channel: that of the profile with this point's overrides, or one without V2V.
+        """Return the model of the radio channel: the profile's with this point's overrides.
 
-        Read once, when the point is made. Raises UserError for an override of a setting that the
-        profile does not have.
+        Without a profile it is one on which nothing is received. Made once, with the point. Raises
+        UserError for an override of a setting that the profile does not have.
         """
         radio = self.radio
         if radio.profile is None:
@@ -290,7 +291,7 @@ class OperatingPoint:
 
     @cached_property
     def physical(self) -> Physical | None:
-        """The channel, if its losses follow from vehicles' positions; None if links are alike."""
+        """Return the channel if its losses follow from vehicles' positions, else None."""
         return self.channel if isinstance(self.channel, Physical) else None
 
     def _relayed(self, channel: Channel) -> Channel:
@@ -315,17 +316,19 @@ class OperatingPoint:
 
     @property
     def unit(self) -> Unit | None:
-        """Position and antenna height of the roadside unit; None without one, or without positions.
+        """Return position and antenna height of the roadside unit, an antenna beside the road.
 
-        Links have positions only where the channel is `physical`.
+        None without one, and where the channel is not `physical`, since links then have no
+        positions.
         """
         return self._unit if self.radio.edge != "none" and self.physical else None
 
     @cached_property
     def network(self) -> Network | None:
-        """The network between the ego and its model in a cloud; None if round trips are not drawn.
+        """Return the network between the ego and its model in a cloud; None without one.
 
-        Raises UserError if the setting `round_trip` names none.
+        Round trips over it are drawn. Raises UserError if there is none of the name in the setting
+        `round_trip`.
         """
         return network(self.cloud.round_trip) if self.cloud.round_trip else None
 
@@ -377,9 +380,10 @@ class OperatingPoint:
         return None
 
     def prepared(self, intents: Intents) -> Intents:
-        """Return the intents of n decisions after each part of an extension has corrected them.
+        """Return what vehicles intend in n decisions after extensions' parts have corrected it.
 
-        This is done first, before fallback, schedule and fusion: a calibration is such a part.
+        A calibration is such a part. This is done first, before a fallback replaces a failed
+        answer, a helper is asked, or intents are fused.
         """
         for part in self.more:
             intents = prepared(part, intents)
@@ -387,7 +391,10 @@ class OperatingPoint:
 
     @property
     def asks(self) -> bool:
-        """Whether an ego may ask helpers at all: there are a channel and a schedule that asks."""
+        """Return whether an ego may ask helpers at all: it has a channel and a schedule that asks.
+
+        A schedule is the rule for whom to ask.
+        """
         return (
             self.radio.profile is not None
             and self.ask.max_helpers > 0
@@ -417,7 +424,7 @@ class OperatingPoint:
 
     @cached_property
     def needs_all(self) -> bool:
-        """Whether some part, such as an attack, needs the intents of all present helpers."""
+        """Return whether some part, such as an attack, needs the intents of all helpers."""
         needing = []
         for part in self.more:
             with worded_part(part):
@@ -426,24 +433,24 @@ class OperatingPoint:
 
     @property
     def content(self) -> Content:
-        """The content of helpers' messages, by the setting `content`."""
+        """Return what helpers' messages hold, such as an intent with words, by `ask.content`."""
         return CONTENTS[self.ask.content]
 
     @property
     def request_bits(self) -> float:
-        """Size of a request to helpers, in bits."""
+        """Return the size in bits of a request to helpers, by how messages are encoded."""
         if self.radio.encoding == JSON:
             return self.ask.request_bits
         return request_bits(self.radio.encoding, self.ask.max_helpers, self.physical is not None)
 
     @property
     def has_fusion_call(self) -> bool:
-        """Whether the ego's model is asked a second time, with what the ego has heard."""
+        """Return whether the ego's model is asked a second time, with what the ego has heard."""
         return self.radio.profile is not None and self.asks_again
 
     @property
     def asks_again(self) -> bool:
-        """Whether the ego's model is to be asked a second time, with what it has heard.
+        """Return whether the settings ask the ego's model a second time, with what it has heard.
 
         That is so with the consensus `ego-prompt` or a content that has a call, even if the point
         has no channel over which the ego could hear anything.
@@ -452,14 +459,14 @@ class OperatingPoint:
 
     @property
     def asks_twice(self) -> str:
-        """The setting that causes a second question to the ego's model, in words for a message."""
+        """Return in words which setting causes a second question to the ego's model."""
         if self.content.call:
             return f"content is {self.ask.content}"
         return f"consensus is {EGO_PROMPT}"
 
     @cached_property
     def question(self) -> Question:
-        """The question that helpers are asked: the ordinary one unless a part has another.
+        """Return the question that helpers are asked: the ordinary one unless a part has another.
 
         Raises UserError if a package's part returns a question that is not in its `questions`.
         """
@@ -476,7 +483,7 @@ class OperatingPoint:
 
     @cached_property
     def elsewhere(self) -> Part | None:
-        """The part that takes messages from other scenes, as a control does; None without one."""
+        """Return the part by which the ego hears helpers of other scenes: a control, or None."""
         for part in self.more:
             with worded_part(part):
                 elsewhere = bool(part.elsewhere)
@@ -486,7 +493,10 @@ class OperatingPoint:
 
     @property
     def rewrites(self) -> "Rewrites":
-        """How fusion calls under this point show helpers' messages to the ego's model."""
+        """Return how fusion calls under this point show helpers' messages to the ego's model.
+
+        A fusion call is a second question to that model, with what the ego has heard.
+        """
         call = self.content.call
         name = call.name if call else ""
         whole = self.fusion.consensus == EGO_PROMPT and not (call and call.in_words)
@@ -495,7 +505,10 @@ class OperatingPoint:
 
     @property
     def shows_words(self) -> bool:
-        """Whether the prompt of a fusion call has messages or their words, not only objects."""
+        """Return whether the prompt of a fusion call has messages or words, not only objects.
+
+        A fusion call is a second question to the ego's model, with what the ego has heard.
+        """
         call = self.content.call
         return self.fusion.consensus == EGO_PROMPT or (call is not None and call.in_words)
 
@@ -511,7 +524,7 @@ class OperatingPoint:
         return Changes(of_attackers, tuple(chain(*(changes.of_all for changes in each))))
 
     def speaker(self) -> Speaker:
-        """Return a new object that says what helpers send in one walk through the scenes.
+        """Return a new object that decides what helpers send in one walk through a run's episodes.
 
         It is that of a part, such as attackers, or one that sends the true intents. It may keep
         state, so each walk needs its own.
@@ -547,10 +560,10 @@ class OperatingPoint:
 
 
 def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
-    """Return what a run must store of the files and records that its conditions' parts name.
+    """Return what a run must store of what its operating points name, such as a calibration.
 
-    The keys are a folder of the run and a name in it. Raises UserError if a package's part fails,
-    or gives a name that is no plain file name.
+    The outer key is a folder of the run, the inner one a name in it. Raises UserError if a
+    package's part fails, or gives a name that is no plain file name.
     """
     kept: dict[str, dict[str, Kept]] = {}
     for point in points:
@@ -566,9 +579,11 @@ def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
 
 
 def as_here(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's recorded, flat settings without those of extensions at their defaults.
+    """Return a condition's recorded settings without extensions' parts that do nothing.
 
-    Raises UserError for a setting that does something and whose extension is not installed.
+    A condition is an operating point of a run; `settings` are values by flat name. A part, a group
+    of settings, does nothing if all of it are at their defaults. Raises UserError for a setting
+    that does something and whose extension is not installed.
     """
     here = without_gone(settings)
     for kind in more_parts().values():

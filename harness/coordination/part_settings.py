@@ -41,15 +41,19 @@ PARTS: dict[str, type[Part]] = {
 
 @cache
 def more_parts() -> Mapping[str, type[Part]]:
-    """Return the `Part` subclasses of installed extensions, by name; imports their packages."""
+    """Return the groups of settings that installed extensions add to operating points, by name.
+
+    Each is a subclass of `Part`. Imports the extensions' packages.
+    """
     return added_parts([key for kind in PARTS.values() for key in kind.__struct_fields__])
 
 
 @cache
 def part_of_settings() -> Mapping[str, str]:
-    """Return for each setting of an operating point the name of its part.
+    """Return by name of each setting of an operating point the part that it belongs to.
 
-    The order is that of the flat records in manifests and run files.
+    A part is a group of settings, such as `radio` or `fusion`. The order is that of the flat
+    records in manifests and run files.
     """
     part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
     behind: dict[str, set[str]] = {}  # parts that stand behind the same setting, in their order
@@ -64,23 +68,27 @@ def part_of_settings() -> Mapping[str, str]:
 
 @cache
 def typed_settings() -> tuple[str, ...]:
-    """Return the settings that can be typed in a condition such as `6g:tau=0.5`, by full name."""
+    """Return the names of the settings that can be typed in a condition, such as `tau_nats`.
+
+    A condition is the text of an operating point, such as `6g:tau_nats=0.5`.
+    """
     return tuple(key for key in part_of_settings() if key not in IN_NO_TEXT)
 
 
 @cache
 def settings_alone() -> Collection[str]:
-    """Return the settings that still have an effect on an ego without a channel."""
+    """Return the names of the settings that still have an effect on an ego without a radio."""
     core = ("fallback", "round_trip", "round_trip_s", "window_s")
     of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_ego]
     return {*core, *chain(*of_extensions)}
 
 
 def change_of(text: str) -> Change:
-    """Return the change of messages that `text` names in the key of a fusion call's answer.
+    """Return the change of helpers' messages, such as by an attack, that a text names.
 
-    `text` is one that some part's `changes` gave, such as `liar:share=1/3` or `quoted`. Raises
-    UserError if no installed part knows it.
+    The text stands in the key of the answer to a fusion call, a second question to the ego's model
+    that shows it these messages. It is one that some part of an operating point gave by `changes`,
+    such as `liar:share=1/3` or `quoted`. Raises UserError if no installed part knows it.
     """
     for kind in more_parts().values():
         if (change := change_by(kind, text)) is not None:
@@ -144,10 +152,10 @@ def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def gone_setting(setting: str) -> OfExtension | None:
-    """Return whose a setting is, if it is of an extension that is not installed; else None."""
+    """Return the extension that a setting belongs to if that is not installed; else None."""
     return None if setting in part_of_settings() else setting_of_extension(setting)
 
 
 def lacking_setting(setting: str, value: object, gone: OfExtension) -> str:
-    """Return what is said of a setting with a value whose extension is not installed."""
+    """Return the message on a condition's setting and value whose extension is not installed."""
     return f"setting {setting}={printable(value)} of a condition is {part_of(gone.extension)}"

@@ -50,8 +50,8 @@ Flag = Annotated[bool, Meta(description="true or false")]
 class Kept(NamedTuple):
     """Hold what a run stores of one thing that a condition names, such as a calibration."""
 
-    record: Any  # plain values: its content, or the digest of its file
-    file: Any = None  # path of its file, if it has one
+    record: Any  # its content, or the digest of its file, as values that JSON can hold
+    file: Any = None  # its file, a `pathlib.Path`; None if it has none
 
 
 @dataclass(frozen=True)
@@ -94,21 +94,27 @@ class Change(Protocol):
 class Changes(NamedTuple):
     """Hold the names of the changes that a part makes to messages before a fusion call shows them.
 
-    The names become part of the answer's key, so they hold no `+` and no `&`.
+    A fusion call is a second question to the ego's model, which shows it what it has heard. The
+    names become part of the key under which its answer is kept, so they hold no `+` and no `&`.
     """
 
-    of_attackers: str = ""  # of those of attackers, several joined by `&`
-    of_all: tuple[str, ...] = ()
+    # of the changes to messages of attackers, several joined by `&`; empty for none
+    of_attackers: str = ""
+    of_all: tuple[str, ...] = ()  # of the changes to messages of all helpers, in their order
 
 
 class ActsOn(NamedTuple):
-    """Describe a setting that needs messages of certain kinds, such as intents or words."""
+    """Describe a setting that needs messages of certain kinds, such as intents or words.
 
-    setting: str
-    value: object  # of a text that names several things, one of them
-    kinds: Collection[str]  # `contents.KINDS`; a content that holds none of them is refused
-    instead: str = "left out"  # what the setting must then be
-    # what else it may be with what a content holds
+    It is refused where the operating point's messages hold nothing of these kinds.
+    """
+
+    setting: str  # name of the setting
+    value: object  # its value; of a text that names several things, one of them
+    # the kinds of content, of `contents.KINDS`, one of which messages must hold
+    kinds: Collection[str]
+    instead: str = "left out"  # what the setting must be where they hold none
+    # returns other values that the setting may have, given the kinds that messages hold
     others: "Callable[[frozenset[str]], Collection[str]]" = lambda holds: ()
 
 
@@ -117,32 +123,36 @@ class RunFacts(Protocol):
 
     @property
     def agents(self) -> Sequence[Any]:
-        """The agents, the ego's first; each has `settings()`, `card`, `prompt` and `can`."""
+        """Return the run's agents (`harness.evaluate.agent.Agent`), the ego's first.
+
+        An agent is a model with its prompt and how it answers.
+        """
 
     @property
     def scenario(self) -> Any:
-        """The scenario, which has a `name`."""
+        """Return the run's scenario, a `harness.world.scenario.Scenario`."""
 
     @property
     def ego_alone(self) -> bool:
-        """Whether the model answers only for the ego, and helpers have other answers."""
+        """Return whether the model answers only for the ego, and helpers have other answers."""
 
     @property
     def several_decide(self) -> bool:
-        """Whether vehicles beside the ego decide for themselves, too, as agents."""
+        """Return whether vehicles beside the ego decide for themselves, too."""
 
     @property
     def frozen(self) -> bool:
-        """Whether scenes are recorded (`harness eval`), not a simulation that actions change."""
+        """Return whether scenes are recorded (`harness eval`), not simulated (`harness drive`)."""
 
 
 class Part(Struct, frozen=True, kw_only=True):
-    """Base class of a group of an operating point's settings, checked when made.
+    """Hold one group of an operating point's settings, checked when made; a base class.
 
-    An extension adds a subclass (`adds={"parts": ...}`); the hooks below do nothing unless
-    overridden, and are called in their order here, only for a part that differs from its defaults.
-    Whole numbers become floats where a float is declared. Raises ValueError for a value that is not
-    allowed.
+    An operating point is all settings that a decision depends on besides scene and model, and a
+    part those of one concern, such as the radio. An extension adds a subclass (`adds={"parts":
+    ...}`); the hooks below do nothing unless overridden, and are called in their order here, only
+    for a part that differs from its defaults. Whole numbers become floats where a float is
+    declared. Raises ValueError for a value that is not allowed.
     """
 
     behind: ClassVar[str] = ""  # the setting behind which its own stand in records
@@ -178,7 +188,7 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @property
     def acts_on(self) -> Collection[ActsOn]:
-        """The settings, as they are now, that need messages of some kind; empty by default."""
+        """Return the settings, with their values now, that need messages of some kind."""
         return ()
 
     def check_with(self, point: "OperatingPoint") -> None:
@@ -196,7 +206,7 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @property
     def needs(self) -> Collection[str]:
-        """Optional inputs that this part needs, by name; the run provides only what is needed.
+        """Return the names of optional inputs that this part needs; no others are computed.
 
         `claims`: what helpers claim of themselves; `in_time`: the probability of a reply in the
         window; `lot`: a random draw a decision; `outlook`: how much of its regions the ego sees.
@@ -205,26 +215,30 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @property
     def needs_all(self) -> bool:
-        """Whether it needs the intents of all present helpers, not only of those that are asked."""
+        """Return whether it needs the intents of all present helpers, not only of those asked."""
         return False
 
     @property
     def question(self) -> Question:
-        """The question that helpers' models are asked; one of `questions`, or the ordinary one."""
+        """Return the question that helpers' models are asked: one of `questions`, or `PLAIN`."""
         return PLAIN
 
     @property
     def elsewhere(self) -> bool:
-        """Whether the ego hears helpers of other scenes, chosen by `sources`, as a control."""
+        """Return whether the ego hears helpers of other scenes, by `sources`: a control."""
         return False
 
     def speaker(self) -> "Speaker | None":
-        """Return a new object that says what helpers send in one walk; None for the truth."""
+        """Return a new object that decides what helpers send; None if they send the truth.
+
+        Each walk through a run's episodes asks for one of its own, which may keep state.
+        """
 
     def changes(self, words: bool, objects: bool) -> Changes:
-        """Return the changes of messages before a fusion call shows them.
+        """Return the names of the changes to messages before a fusion call shows them.
 
-        `words` and `objects` say whether the call shows messages' words and their objects.
+        A fusion call is a second question to the ego's model, which shows it what it has heard;
+        `words` and `objects` say whether it shows messages' words, and their objects.
         """
         return Changes()
 
@@ -233,11 +247,14 @@ class Part(Struct, frozen=True, kw_only=True):
         """Return the change that one text of `changes` names; None if this part has none by it."""
 
     def after_call(self, fused: "Floats", intents: "Floats", heard: "Bools") -> "Floats":
-        """Return the policies, `(..., A)`, to use instead of those of a fusion call.
+        """Return the policies, `(..., A)`, to use in place of what a fusion call answered.
+
+        A fusion call is a second question to the ego's model, which shows it what it has heard. A
+        policy is the probabilities of the ego's A actions.
 
         Args:
             fused: the call's answers, `(..., A)`; NaN where one failed.
-            intents: those of the ego and its helpers, `(..., 1+H, A)`.
+            intents: those of the ego, at index 0, and its H helpers, `(..., 1+H, A)`.
             heard: which helpers were heard in time, `(..., H)`.
         """
         return fused
@@ -271,9 +288,10 @@ class Part(Struct, frozen=True, kw_only=True):
         return np.arange(len(episodes))
 
     def before(self, intents: "Intents") -> "Intents":
-        """Return the intents of n decisions, corrected before anything else uses them.
+        """Return what vehicles intend in n decisions, corrected before anything else uses it.
 
-        Only `own` and `helpers` may change; a failed or missing answer is a row of NaN.
+        A calibration does so. Only `own`, `(n, A)`, and `helpers`, `(n, H, A)`, may change; a
+        failed or missing answer is a row of NaN.
         """
         return intents
 
@@ -283,7 +301,7 @@ PACKAGES_PARTS: dict[type[Part], str] = {}
 
 
 def is_ours(part: Part) -> bool:
-    """Return whether no package has added a part."""
+    """Return whether a part of an operating point ships with the harness, not with a package."""
     return type(part) not in PACKAGES_PARTS
 
 
@@ -376,7 +394,7 @@ class Ask(Part, frozen=True, kw_only=True):
 
     @property
     def above(self) -> float:
-        """The worth above which the ego asks: nats under `entropy`, else the schedule's unit."""
+        """Return the worth above which the ego asks: nats under `entropy`, else schedule's unit."""
         if self.schedule == PAPER:
             return self.tau_nats
         default = SCHEDULES[self.schedule].threshold

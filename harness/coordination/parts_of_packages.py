@@ -44,7 +44,11 @@ if TYPE_CHECKING:
 
 
 def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
-    """Return why a part cannot be used under `point` in `run`, in one line; None if it can."""
+    """Return why a part of an operating point cannot be used in a run, or None if it can.
+
+    The text is one line. `point` is the operating point; `run` has the run's agents, scenario and
+    world. Raises UserError if a package's part fails or returns no text.
+    """
     if is_ours(part):
         return part.obstacle(point, run)
     with worded_part(part):
@@ -52,10 +56,10 @@ def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
 
 
 def prepared(part: Part, intents: Intents) -> Intents:
-    """Return `intents` as the part's `before` corrects them.
+    """Return what vehicles intend in n decisions as a part's `before` corrects it.
 
-    Raises UserError if a package's part fails, changes more than `own` and `helpers`, or returns no
-    distribution for an answer.
+    A calibration is such a part. Raises UserError if a package's part fails, changes more than
+    `own` and `helpers`, or returns no distribution for an answer.
     """
     if is_ours(part):
         return part.before(intents)
@@ -98,7 +102,10 @@ class SpeakerOfPart:
 
 
 def speaker_of(part: Part) -> Speaker | None:
-    """Return the part's speaker, which decides what helpers send; None if they send the truth."""
+    """Return what decides what helpers send under a part, its speaker; None if they send the truth.
+
+    Each walk through a run's episodes needs its own. Raises UserError if a package's part fails.
+    """
     with worded_part(part):
         speaker = part.speaker()
     if speaker is None or is_ours(part):
@@ -123,11 +130,13 @@ def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
 
 
 def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floats:
-    """Return the policies, `(..., A)`, to use instead of those that a fusion call answered.
+    """Return the policies, `(..., A)`, to use in place of what a fusion call answered.
 
-    `fused` are the call's answers, `(..., A)`, NaN where one failed; `intents` those of the ego and
-    H helpers, `(..., 1+H, A)`; `heard` says who was heard in time, `(..., H)`. Raises UserError if
-    a package's part fails or returns no distributions.
+    A fusion call is a second question to the ego's model, which shows it what it has heard; a
+    policy is the probabilities of the ego's A actions. `fused` are the call's answers, `(..., A)`,
+    NaN where one failed; `intents` those of the ego, at index 0, and H helpers, `(..., 1+H, A)`;
+    `heard` says who was heard in time, `(..., H)`. Raises UserError if a package's part fails or
+    returns no distributions.
     """
     if is_ours(part):
         return part.after_call(fused, intents, heard)
@@ -175,7 +184,10 @@ class ChangeOfPart:
 
 
 def change_by(kind: type[Part], text: str) -> Change | None:
-    """Return the change of messages that `text` names, by a kind of part; None if it has none."""
+    """Return the change of helpers' messages that `text` names, or None.
+
+    `kind` is the class of the part that may have it; None if it has no change by that name.
+    """
     what = PACKAGES_PARTS.get(kind)
     if what is None:
         return kind.change(text)

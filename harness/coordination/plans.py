@@ -14,31 +14,34 @@ STANDING_MPS = 1.0  # a slower vehicle stands, or is about to
 
 @dataclass(frozen=True)
 class Plans:
-    """Hold what an agent and the H others say of their own motion, `(..., 1+H)`, the agent first.
+    """Hold what agents, vehicles that decide for themselves, say of their own motion.
 
-    Agents are vehicles that decide for themselves. Every value is stated by its sender, so all who
+    Each decision, of shape `(...)`, is of one agent that hears H others. On an axis of length 1+H
+    index 0 is that agent and 1+h is the other h. Every value is stated by its sender, so all who
     hear it compare the same numbers.
     """
 
-    # the row of the decision that each other makes itself now, among those made together, `(...,
-    # H)`; -1 where it makes none. H is 0 until it is known whom an agent hears
+    # index of the decision that each other makes itself now, among the decisions made together,
+    # `(..., H)`; -1 where it makes none. H is 0 until it is known whom an agent hears
     row: Ints
-    vehicle: Ints  # the vehicle's number in its world; -1 for one without a plan
-    # seconds until it is at the centroid of the conflict zone at its speed; inf for one that
-    # stands, or has passed it. NaN without a plan
+    # each agent's number among the vehicles of its world, `(..., 1+H)`; -1 for one without a plan
+    vehicle: Ints
+    # seconds until each is at the centroid of the conflict zone if it keeps its speed,
+    # `(..., 1+H)`; inf for one that stands or has passed it, NaN without a plan
     reaches_s: Floats
-    # how much later it is than at the speed that it had in the beginning, at least 0; NaN without a
-    # plan
+    # seconds by which each is later than at the speed that it had in the beginning, `(..., 1+H)`,
+    # at least 0; NaN without a plan
     lost_s: Floats
 
     def take(self, at: Any) -> "Plans":
-        """Return the plans of the decisions at indices `at` of the leading dimension."""
+        """Return the plans of the decisions at `at`, indices or a mask of the leading axis."""
         return Plans(self.row[at], self.vehicle[at], self.reaches_s[at], self.lost_s[at])
 
     def of_helpers(self, places: Ints) -> "Plans":
-        """Return the plans with the others at indices `places`, `(..., H')`, from 0.
+        """Return the plans with other senders: in each decision those that `places` names.
 
-        The agent's own stays first. An index may be repeated.
+        `places`, `(..., H')`, are indices of the H others here, from 0; one may be repeated. The
+        agent's own plan stays first.
         """
         at = np.insert(places + 1, 0, 0, axis=-1)
 
@@ -49,10 +52,10 @@ class Plans:
         return Plans(row, of(self.vehicle), of(self.reaches_s), of(self.lost_s))
 
     def among(self, senders: Ints) -> "Plans":
-        """Return the plans `(n, 1+H)` that n agents hear, from their own, `(n, 1)`.
+        """Return the plans that n agents hear from each other, `(n, 1+H)`.
 
-        `senders`, `(n, H)`, has the row of each sender among these agents, -1 for one without a
-        plan.
+        These plans have each agent's own alone, `(n, 1)`. `senders`, `(n, H)`, has the row of each
+        of the H others that an agent hears, among these n agents; -1 for one without a plan.
         """
 
         def heard(values: Any, unknown: float) -> Any:

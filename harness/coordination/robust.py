@@ -23,10 +23,10 @@ SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite if a message is the median 
 
 @dataclass(frozen=True)
 class Heads(Pool):
-    """A consensus rule that pools with equal weights, and that no single helper can turn.
+    """Make a consensus rule that weighs all vehicles alike, and that no helper can turn alone.
 
-    If all vehicles but at most one, the ego among them, have the same likeliest action and the pool
-    has another, the mean intent of these vehicles replaces it.
+    If all vehicles but at most one, the ego among them, have the same likeliest action and the
+    fused policy (`pool`) has another, the mean intent of these vehicles replaces it.
     """
 
     by_distance: ClassVar[bool] = False
@@ -54,8 +54,9 @@ def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
     is in it. A vehicle votes for its likeliest action.
 
     Args:
-        policy: the policy to check, `(..., A)`.
-        p: intents, `(..., 1+H, A)`; the row of a vehicle that has no voice may hold anything.
+        policy: the fused probabilities of A actions to check, `(..., A)`.
+        p: intents of the ego (index 0) and H helpers, `(..., 1+H, A)`; the row of a vehicle that
+            has no voice may hold anything.
         voices: which vehicles count, `(..., 1+H)`.
         votes: how many make a majority, more than half, `(...)`.
     """
@@ -78,8 +79,9 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
     """Return each action's mean probability without its lowest and highest voice, `(..., A)`.
 
     It is scaled to sum to 1 (k-truncated mean with k = 1, Guo and Kong 2024). With fewer than three
-    voices, none is left out. `p` are intents, `(..., 1+H, A)`; of `weights`, `(..., 1+H)`, only
-    whether they are above 0 counts, which marks the voices heard.
+    voices, none is left out. `p` are intents of the ego (index 0) and H helpers over A actions,
+    `(..., 1+H, A)`; of `weights`, `(..., 1+H)`, only whether they are above 0 counts, which marks
+    the voices heard.
     """
     voices = weights > 0
     heads = np.sum(voices, axis=-1)[..., None, None]
@@ -96,8 +98,8 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
 def geometric_median(p: Floats, weights: Floats) -> Floats:
     """Return the distribution with the least weighted sum of L2 distances to intents, `(..., A)`.
 
-    Computed by Weiszfeld's iteration (1937). `p` are intents, `(..., 1+H, A)`; `weights`, `(...,
-    1+H)`, are 0 for a helper not heard.
+    Computed by Weiszfeld's iteration (1937). `p` are intents of the ego (index 0) and H helpers
+    over A actions, `(..., 1+H, A)`; `weights`, `(..., 1+H)`, are 0 for a helper not heard.
     """
     points = np.where((weights > 0)[..., None], p, 0.0)
     middle: Floats = linear_pool(p, weights)
@@ -112,8 +114,9 @@ def centred_clipping(p: Floats, weights: Floats) -> Floats:
     """Return the ego's intent, moved `CLIP_ROUNDS` times by the weighted mean of clipped steps.
 
     A step leads to another vehicle's intent and is at most `CLIP` long (L2); the result is `(...,
-    A)`. From Karimireddy, He and Jaggi (2021), but starting from the ego's intent. `p` are intents,
-    `(..., 1+H, A)`; `weights`, `(..., 1+H)`, are 0 for a helper not heard.
+    A)`. From Karimireddy, He and Jaggi (2021), but starting from the ego's intent. `p` are intents
+    of the ego (index 0) and H helpers over A actions, `(..., 1+H, A)`; `weights`, `(..., 1+H)`, sum
+    to 1 and are 0 for a helper not heard.
     """
     centre = p[..., 0, :]
     for _ in range(CLIP_ROUNDS):
@@ -132,7 +135,7 @@ def bayes(p: Floats, weights: Floats, reliability: float | Floats = RELIABILITY)
     that see the same are not independent, which this ignores.
 
     Args:
-        p: intents, `(..., 1+H, A)`.
+        p: intents of the ego (index 0) and H helpers over A actions, `(..., 1+H, A)`.
         weights: 0 for a helper not heard, `(..., 1+H)`; nothing else of them counts.
         reliability: reliability of the helpers, `(..., H)` or one for all.
     """

@@ -26,9 +26,9 @@ EGO_PROMPT = "ego-prompt"
 
 
 def reads(name: str) -> frozenset[str]:
-    """Return the kinds of messages (`contents.KINDS`) of which a consensus rule can use any one.
+    """Return the kinds of messages, of `contents.KINDS`, any one of which a consensus can use.
 
-    `name` is that of a rule or `ego-prompt`.
+    `name` is a value of the setting `consensus`: the name of a rule, or `ego-prompt`.
     """
     if name == EGO_PROMPT:
         return frozenset((WORDS, PLANS))

@@ -23,7 +23,10 @@ def _is_threshold(value: Any) -> bool:
 
 
 class Schedules(FilesAndPlugins[Schedule]):
-    """Hold all schedules by name: built in, of installed packages, and of files."""
+    """Hold all schedules, rules for whom the ego asks, by name.
+
+    They are built in, of installed packages, or in files.
+    """
 
     folder = "schedules"
     stated: ClassVar = {

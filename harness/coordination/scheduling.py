@@ -17,9 +17,11 @@ from harness.core.arrays import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class Outlook:
-    """Hold how much of the scenario's R regions the ego sees, and what helpers would add to it.
+    """Hold how much the ego sees of where a danger may come from, and what helpers would add.
 
-    Regions are the road's sectors: where a danger may come from.
+    A place that a danger may come from is one of the road's R sectors, or regions: stretches of
+    other roads before the ego's conflict zone. Arrays are of decisions of any shape `(...)`, with H
+    helpers.
     """
 
     unseen: Floats  # share of each region that the ego does not see, `(..., R)`
@@ -32,13 +34,13 @@ class Outlook:
     to_zone_s: Floats
 
     def take(self, at: Any) -> "Outlook":
-        """Return the outlooks of the decisions at indices `at` of the leading dimension."""
+        """Return the outlooks of the decisions at `at`, indices or a mask of the leading axis."""
         return Outlook(self.unseen[at], self.added[at], self.to_zone_s[at])
 
     def of_helpers(self, places: Ints) -> "Outlook":
-        """Return the outlook with the helpers at indices `places`, `(..., H')`, from 0.
+        """Return the outlook with other helpers: in each decision those that `places` names.
 
-        An index may be repeated.
+        `places`, `(..., H')`, are indices of the H helpers here, from 0; one may be repeated.
         """
         return replace(self, added=np.take_along_axis(self.added, places[..., None], axis=-2))
 
@@ -47,14 +49,18 @@ class Outlook:
 class ScheduleInputs:
     """Hold what the ego knows before it asks anybody, the input of a schedule.
 
-    Values for a helper that may not be asked are arbitrary.
+    A schedule is the rule for whom to ask. Arrays are of decisions of any shape `(...)`, with H
+    helpers and A actions. Values for a helper that may not be asked are arbitrary.
     """
 
-    own: Floats  # the ego's intent after the fallback, `(..., A)`
-    entropy_nats: Floats  # entropy of `own`, `(...)`
+    # the ego's intent, its probabilities of its actions, `(..., A)`; the fallback, such as all
+    # alike, where its answer failed
+    own: Floats
+    entropy_nats: Floats  # entropy of `own`, `(...)`: how unsure the ego is
     may_ask: Bools  # which helpers are in the radius and would answer, `(..., H)`
-    range_m: Floats  # distance to the ego, `(..., H)`
-    distance_m: Floats  # distance to the conflict zone, `(..., 1+H)`, the ego first
+    range_m: Floats  # each helper's distance to the ego, m, `(..., H)`
+    # each vehicle's distance to the centroid of the conflict zone, m, `(..., 1+H)`, the ego first
+    distance_m: Floats
     # probability that request and reply are received within the window, `(..., H)`, by the
     # channel's model for such links, if all who may be asked are asked
     in_time: Floats | None = None
@@ -64,7 +70,11 @@ class ScheduleInputs:
 
 @runtime_checkable
 class Schedule(Protocol):
-    """Describe a schedule: a pure function of arrays that says what asking each helper is worth."""
+    """Describe a schedule, the rule for whom the ego asks, by what asking each helper is worth.
+
+    It is a pure function of arrays. The ego asks the helpers whose worth is above the threshold,
+    those worth the most first, up to its largest number of helpers.
+    """
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -87,15 +97,13 @@ class Schedule(Protocol):
 
 @dataclass(frozen=True)
 class Formula:
-    """Make a schedule of a function of `ScheduleInputs` that returns `(..., H)` or `(..., 1)`.
+    """Make a schedule, a rule for whom the ego asks, of a function of what the ego knows."""
 
-    The function `formula` says what asking each helper is worth. The ego asks above `threshold`
-    (`Schedule.threshold`), and `needs` names the optional inputs that the function reads.
-    """
-
+    # returns what asking each helper is worth, `(..., H)`, or `(..., 1)` if it is the same for all
     formula: Callable[[ScheduleInputs], Floats]
+    # the worth above which the ego asks (`Schedule.threshold`), in the formula's own unit
     threshold: float | None = None
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()  # the optional fields of `ScheduleInputs` that the formula reads
     # whether what one helper is worth depends on which others may be asked. That of a schedule that
     # does not say may
     by_presence: bool = False
@@ -122,10 +130,11 @@ ORACLE = "oracle"  # a bound that only a study of frozen scenes can play
 
 
 def chosen(worth: Floats, threshold: float, may_ask: Bools, range_m: Floats, most: int) -> Bools:
-    """Return which helpers are asked, `(..., H)`: at most `most`, each worth more than `threshold`.
+    """Return a mask of the helpers that are asked, `(..., H)`: no more than `most` of them.
 
-    Those worth the most come first, and of equals the nearest. `worth` is `(..., H)` or `(..., 1)`;
-    `may_ask` and `range_m`, the distance to the ego in m, are `(..., H)`.
+    Asking each is worth more than `threshold`. Those worth the most come first, and of equals the
+    nearest. `worth` is `(..., H)` or `(..., 1)`; `may_ask`, which of H helpers may be asked, and
+    `range_m`, their distance to the ego in m, are `(..., H)`.
     """
     is_asked = may_ask & (worth > threshold)
     if most >= is_asked.shape[-1]:

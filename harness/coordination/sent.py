@@ -12,36 +12,38 @@ from harness.radio.channel import Draws
 
 @dataclass(frozen=True)
 class SentIntents:
-    """Hold what H voices, senders as the ego hears them, send in n decisions.
+    """Hold what the ego is sent in n decisions, by H voices: senders as the ego hears them.
 
-    An attacker may have several voices.
+    A helper has one voice; an attacker may have several.
     """
 
-    intents: Intents  # the intents and claims of each voice
-    draws: Draws  # the channel's draws for each voice
-    attackers: Bools  # which voices are an attacker's, (n, H)
+    intents: Intents  # the voices' intents and claims, in the place of the helpers'
+    draws: Draws  # the channel's random numbers for the link to each voice
+    attackers: Bools  # whether each voice is an attacker's, `(n, H)`
 
     def take(self, at: Any) -> "SentIntents":
         return SentIntents(self.intents.take(at), self.draws.take(at), self.attackers[at])
 
 
 class Speaker(Protocol):
-    """Describe who decides what helpers send during one walk under one condition.
+    """Describe who decides what helpers send during one walk: a run's episodes, step by step.
 
-    The usual one sends the truth, attackers do not. It may keep state from step to step.
+    Each condition and walk has its own. The usual one sends the truth, one of attackers does not.
+    It may keep state from step to step of an episode.
     """
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         """Return what the voices send in n decisions of one step, given the vehicles' true intents.
 
-        `episode` and `seed`, `(n,)`, are each decision's episode number and seed of channel draws.
-        The number of voices may differ from that of the helpers in `truth`.
+        `truth` has the intents and `draws` the channel's random numbers; `episode` and `seed`,
+        `(n,)`, are each decision's episode number and seed of these draws. The number of voices may
+        differ from that of the helpers in `truth`.
         """
         ...
 
 
 class Honest:
-    """A speaker that sends every helper's true intent; there are no attackers."""
+    """Send every helper's true intent, as a `Speaker` does where there are no attackers."""
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         return SentIntents(truth, draws, np.zeros(truth.valid.shape, dtype=bool))

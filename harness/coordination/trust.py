@@ -32,7 +32,10 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 
 @dataclass(frozen=True)
 class Trust:
-    """A consensus rule that learns during an episode which helpers to trust, and pools only those.
+    """Learn during an episode which helpers to trust, and fuse only the intents of those.
+
+    A helper's claimed place and speed, and its intents, count for or against it (the module's
+    description has the checks).
 
     All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`).
     """
@@ -53,9 +56,10 @@ class Trust:
     needs: ClassVar[tuple[str, ...]] = ("claims",)
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the memory before the first step, `(*batch, K)`, flattened.
+        """Return the rule's memory before the first decision of each episode, `(*batch, K)`.
 
-        For each helper: evidence for and against it, its last intent, and its last claim.
+        For each of the `helpers` it has, one helper after another: evidence for and against it, its
+        last intent over A `actions`, and its last claim, 2 + A + `CLAIM` numbers.
         """
         state = np.full((*batch, helpers, 2 + actions + CLAIM), np.nan)
         state[..., :2] = self.faith
@@ -150,9 +154,10 @@ def _claims_of(messages: Messages) -> Floats:
 
 
 def divergence(p: Floats, q: Floats) -> Floats:
-    """Return the Jensen-Shannon divergence of distributions `(..., A)`, `(...)`.
+    """Return how far two distributions over A actions are apart, from 0 to 1, `(...)`.
 
-    It is 0 if they are equal and 1 if they are disjoint (base 2).
+    `p` and `q` are `(..., A)`. It is their Jensen-Shannon divergence, base 2: 0 if they are equal
+    and 1 if they have no action in common.
     """
     gained_nats = entropy_nats((p + q) / 2) - (entropy_nats(p) + entropy_nats(q)) / 2
     return np.asarray(gained_nats / np.log(2))

@@ -30,26 +30,27 @@ class Unit(NamedTuple):
 
 @dataclass(frozen=True)
 class Site:
-    """Hold the true positions of the ego and its H helpers, m, and what blocks each link.
+    """Hold where the ego and its H helpers truly are, and what stands between their antennas.
 
-    Arrays have leading batch dimensions, `(...)`; the ego's position is the first of 1+H, and an
-    absent helper's is NaN. `sight`, `(..., H)`, is CLEAR, VEHICLE or BUILDING, `blocker_m` the
-    height of the tallest vehicle between (0 without one), and `corner_m` the distances of ego and
-    helper to the crossing of their streets, `(..., H, 2)`; NaN if they do not cross. `first_m` is
-    the height of the antenna at the first position, None if it is that of all others. `units` has
-    the sites of roadside units, each with the unit first, then the ego and the helpers.
+    A link is that of the ego and one helper. Arrays are of decisions of any shape `(...)`. On an
+    axis of length 1+H index 0 is the ego and 1+h is helper h; on one of length H, index h is the
+    link to helper h.
     """
 
-    xy_m: Floats  # positions, `(..., 1+H, 2)`, the ego's first; NaN for an absent helper
+    # positions, `(..., 1+H, 2)`, the ego's first: m to the east and to the south of the road's
+    # origin; NaN for an absent helper
+    xy_m: Floats
     # what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING
     sight: Ints
-    blocker_m: Floats  # height of the tallest vehicle between them, `(..., H)`; 0 without one
-    # distance of the ego and of the helper to the crossing of their streets, `(..., H, 2)`; NaN if
-    # the streets do not cross
+    # height of the tallest vehicle between them, m, `(..., H)`; 0 without one
+    blocker_m: Floats
+    # distance of the ego and of the helper to the crossing of their streets, m, `(..., H, 2)`; NaN
+    # if the streets do not cross
     corner_m: Floats
-    # height of the antenna at the first position; None if it is as high as all others
+    # height of the antenna at the first position, m; None if it is as high as all others
     first_m: float | None = None
-    # the sites of roadside units: each has the unit first, then the ego, then the helpers
+    # the sites of roadside units, antennas beside the road: each has the unit in the ego's place,
+    # then the ego and the helpers, `(..., 2+H, 2)`
     units: Mapping[Unit, "Site"] = field(default_factory=dict)
 
     @property
@@ -66,7 +67,7 @@ class Site:
         return self.sight, self.blocker_m, self.corner_m, self.first_m
 
     def take(self, at: Any) -> "Site":
-        """Return the part with these indices of the first batch dimension."""
+        """Return the sites of the decisions at `at`, indices or a mask of the leading axis."""
         units = {unit: site.take(at) for unit, site in self.units.items()}
         return Site(
             self.xy_m[at],
@@ -78,7 +79,7 @@ class Site:
         )
 
     def select(self, links: slice) -> "Site":
-        """Return the part with a slice of the helpers, `(..., h)`; without roadside units."""
+        """Return the site of the links in a slice of the H, `(..., h)`; without roadside units."""
         xy_m = np.concatenate(
             [self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2
         )
@@ -86,7 +87,10 @@ class Site:
         return Site(xy_m, sight, blocker_m, self.corner_m[..., links, :], self.first_m)
 
     def of_helpers(self, places: Ints) -> "Site":
-        """Return the part with the helpers of these H' indices, `(n, H')`; one may be repeated."""
+        """Return the site with other helpers: in each of n decisions those that `places` names.
+
+        `places`, `(n, H')`, are indices of helpers here, from 0; one may be repeated.
+        """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return Site(
             np.take_along_axis(self.xy_m, with_ego[..., None], axis=-2),
@@ -102,43 +106,50 @@ class Site:
 class Draws:
     """Hold the channel's uniform random numbers in [0, 1), the same for every operating point.
 
-    `link`, `(..., H, 2)`, and `jitter`, `(..., H)`, are of H helpers' requests and replies on
-    channels of constant loss. `trips` has the keys of further draws, those of physical radios; None
-    if there are none. `given` are draws of packets, `(..., 1+2H)`, in place of those of `trips`.
+    They are of the links between the ego and H helpers, in decisions of any shape `(...)`. A
+    message is lost if its draw is below the probability of a loss, so that more loss loses the same
+    messages and others.
     """
 
-    # draws of the request and the reply of each helper, `(..., H, 2)`; equal for all steps of an
-    # episode under block fading
+    # for channels of one loss: draws of the request to each helper and of its reply,
+    # `(..., H, 2)`; equal for all steps of an episode under block fading
     link: Floats
-    jitter: Floats  # draw of each reply's delay, `(..., H)`
-    # the keys of further draws, which only physical radios make; None if there are none
+    jitter: Floats  # for such channels: a draw of each reply's delay, `(..., H)`
+    # for physical channels, whose loss depends on positions: the keys from which all further draws
+    # are made; None if there are none
     trips: Trips | None = None
-    given: Floats | None = None  # draws of packets, `(..., 1+2H)`, instead of those of `trips`
+    # draws of packets in place of those made from `trips`, `(..., 1+2H)`: first one for the
+    # request's wait, then of each helper a pair (request, reply); None makes them from `trips`
+    given: Floats | None = None
 
     def take(self, at: Any) -> "Draws":
-        """Return the part with these indices of the first batch dimension."""
+        """Return the draws of the decisions at `at`, indices or a mask of the leading axis."""
         given = None if self.given is None else self.given[at]
         return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at), given)
 
     def of_helpers(self, places: Ints) -> "Draws":
-        """Return the draws of the helpers with these H' indices, `(n, H')`.
+        """Return the draws for other helpers: in each of n decisions those that `places` names.
 
-        A repeated helper has the same link.
+        `places`, `(n, H')`, are indices of helpers here, from 0. A repeated one has the same draws
+        of its link.
         """
         link = np.take_along_axis(self.link, places[..., None], axis=-2)
         return Draws(link, np.take_along_axis(self.jitter, places, axis=-1), self.trips)
 
     @cached_property
     def packet(self) -> Floats:
-        """Return draws for loss of each of H helpers' request and reply, `(..., H, 2)`.
+        """Return draws for the loss of the request to each helper and of its reply, `(..., H, 2)`.
 
-        They are new at every step.
+        They are new at every step of an episode.
         """
         return self._uniforms[..., 1:].reshape(*self.jitter.shape, 2)
 
     @cached_property
     def wait(self) -> Floats:
-        """Return draws for the request's wait for the medium, `(...)`, new at every step."""
+        """Return draws for how long the request waits for a free medium, `(...)`.
+
+        They are new at every step of an episode.
+        """
         return self._uniforms[..., 0]
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
@@ -154,25 +165,27 @@ class Draws:
 
     @cached_property
     def first_packets(self) -> Floats:
-        """Return draws for one wait and two packets of a link without any helper, `(..., 3)`.
+        """Return draws for the link between the ego and a roadside unit, `(..., 3)`.
 
-        Such a link is that of the ego and a roadside unit.
+        A unit is an antenna beside the road. The first draw is for the unit's wait for a free
+        medium, the second for the loss of the ego's message to the unit, the third for that of the
+        unit's to the ego. They exist even in a decision without helpers.
         """
         return self._trips.uniforms(1)
 
     @cached_property
     def latency(self) -> Floats:
-        """Return draws for the latency of each of H helpers' request and reply, `(..., H, 2)`.
+        """Return draws for the latency of the request to each helper and its reply, `(..., H, 2)`.
 
-        They are new at every step.
+        They are new at every step of an episode.
         """
         return self.of(f"{self._trips.links}.latency").packet
 
     @cached_property
     def first(self) -> "Draws":
-        """Return the draws of the link of ego and roadside unit, as if it were one helper's.
+        """Return the draws for the link of the ego and a roadside unit, as if it were one helper's.
 
-        The link exists even without helpers.
+        H is 1 in the result, even if there are no helpers.
         """
         none = np.zeros((*self.jitter.shape[:-1], 1))
         return Draws(np.stack([none, none], axis=-1), none, self._trips)
@@ -203,24 +216,23 @@ NO_SITE = (
 
 @dataclass(frozen=True)
 class Links:
-    """Hold what a channel must know of the links between the ego and its H helpers, (..., H).
+    """Hold what a channel must know of the links between the ego and its H helpers.
 
-    `asked` and `in_radius` say which helpers are asked, and are present and near enough to be;
-    `rounds` which of these open a round of questions of their own. `ready_s` is when a helper has
-    heard the request and has its own answer, s after the request. `payload_bits` and `request_bits`
-    are the sizes of reply and request. `site` has the positions; None if the channel or the world
-    has none.
+    Arrays are of decisions of any shape `(...)`; index h of an axis of length H is helper h. Values
+    for a helper that was not asked may be anything, even NaN.
     """
 
-    # which helpers were asked, `(..., H)`. Values for the others may be anything, even NaN
-    asked: Bools
+    asked: Bools  # which helpers were asked, `(..., H)`
     # seconds from the start of the request until the helper has heard it and has its own answer,
     # `(..., H)`
     ready_s: Floats
-    range_m: Floats  # ego-helper distance, `(..., H)`, as the ego knows it, with the beacon's error
-    payload_bits: Floats  # size of the reply, `(..., H)`
-    in_radius: Bools  # which helpers are present and in the ego's radius, asked or not, `(..., H)`
-    rounds: Bools  # which of these open a round of their own, `(..., H)`
+    # each helper's distance to the ego, m, `(..., H)`, as the ego knows it, with a beacon's error
+    range_m: Floats
+    payload_bits: Floats  # size of each helper's reply, `(..., H)`
+    # which helpers are present and near enough to be asked, asked or not, `(..., H)`
+    in_radius: Bools
+    # which of these are unsure and ask others themselves, which loads the channel, `(..., H)`
+    rounds: Bools
     request_bits: float = 0.0  # size of the request
     # positions; None if the channel is not `Physical`, or the world has no positions
     site: Site | None = None
@@ -233,7 +245,7 @@ class Links:
         return self.site
 
     def take(self, at: Any) -> "Links":
-        """Return the part with these indices of the first batch dimension."""
+        """Return the links of the decisions at `at`, indices or a mask of the leading axis."""
         return Links(
             self.asked[at],
             self.ready_s[at],
@@ -253,10 +265,7 @@ REPLY: Way = 1
 
 
 class Broadcast(NamedTuple):
-    """Hold when a broadcast request is received and how long it is on air, s.
-
-    `heard_s` is from the decision to ask, `(...)` or one number; NaN if it depends on the link.
-    """
+    """Hold when a broadcast request is received and how long it is on air."""
 
     # seconds from the decision to ask until the helpers have the request, `(...)` or one number;
     # NaN if it depends on the link (`ByLink`)
@@ -265,11 +274,9 @@ class Broadcast(NamedTuple):
 
 
 class Delivery(NamedTuple):
-    """Hold which of H helpers' replies are received on a channel, when, and their airtime.
+    """Hold which of H helpers' replies are received on a channel, and when.
 
-    `up` is whether request and reply are received, `delay_s` is from the request to the reply's
-    end, `loss` the probability that one transmission is lost, and `airtime_s` how long the reply
-    occupies the medium (NaN if not known), (..., H) each.
+    Arrays are of decisions of any shape `(...)`; index h of an axis of length H is helper h.
     """
 
     # whether request and reply are received, `(..., H)`; anything for helpers that were not asked
@@ -292,13 +299,17 @@ class Channel(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when helpers have received a broadcast of so many bits, and its airtime.
+        """Return when helpers have received a broadcast request, and how long it is on air.
 
-        `bits` is `(...)` or one number, and so are the times.
+        `bits` is the request's size in each decision, `(...)`, or in all, one number; the times
+        have the same shape. `draws` are the channel's random numbers.
         """
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Return whether, and when, each helper's request and reply are received."""
+        """Return whether, and when, the request to each helper and its reply are received.
+
+        `links` has who was asked and what is sent; `draws` are the channel's random numbers.
+        """
 
 
 @runtime_checkable
@@ -314,21 +325,27 @@ class Physical(Channel, Protocol):
         """Return the distance at which shadowing's correlation is 1/e, m; inf without shadowing."""
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the packet reception ratio at distances `(n,)`, for background packets.
+        """Return the share of background packets that are received at distances, m, `(n,)`.
 
-        `sight` is the obstacle, such as `CLEAR`. It is averaged over shadowing, and without `sight`
-        also over obstacles as in the model's source.
+        Background packets are what other vehicles send, such as beacons. `sight` is the obstacle
+        between the antennas, such as `CLEAR`, one for all or `(n,)`. The share is a mean over
+        shadowing, the slow change of received power by what stands around, and without `sight` also
+        over obstacles as in the model's source.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
         """Return the probability that a message is lost on each of H links, `(..., H)`.
 
-        `site` has the positions, `shadow` is each link's shadowing, standard normal, `(..., H)`,
-        and `bits` the message's size.
+        `site` has the positions. `shadow` is each link's shadowing, `(..., H)`, a standard normal
+        number: the slow change of received power by what stands around. `bits` is the message's
+        size, one for all or `(..., H)`.
         """
 
     def busy_ratio(self) -> float:
-        """Return the channel busy ratio under the background load; NaN if the model has none."""
+        """Return the share of time that the channel is busy with others' background packets.
+
+        NaN if the model does not know it.
+        """
 
 
 @runtime_checkable
@@ -338,17 +355,17 @@ class ByLink(Physical, Protocol):
     def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
         """Return the seconds from the wish to send until reception on each of H links, `(..., H)`.
 
-        `way` is `REQUEST` or `REPLY`, which chooses the draws of `draws.latency` they may depend
-        on.
+        `site` has the positions. `way` is `REQUEST` or `REPLY`: the index on the last axis of
+        `draws.latency` of the random numbers that the latency may depend on.
         """
 
 
 def served_s(ready_s: Floats, slot_s: Floats, range_m: Floats) -> Floats:
-    """Return when the slot of each of H replies on a serial medium ends, s, `(..., H)`.
+    """Return when each of H replies ends on a medium that carries one after another, s, `(..., H)`.
 
-    A serial medium carries one reply after another: in the order in which they are ready, of equal
-    ones the nearest first. `slot_s` is a slot's length, `ready_s` when a helper may send, `range_m`
-    its distance.
+    Replies are sent in the order in which they are ready, of equal ones the nearest first. All
+    arguments are `(..., H)`: `ready_s` is when a helper's reply can leave, `slot_s` how long the
+    medium is then taken by it, and `range_m` the helper's distance to the ego, m.
     """
     order = np.lexsort((range_m, ready_s), axis=-1)
     served_slot_s = np.take_along_axis(slot_s, order, axis=-1)

@@ -71,19 +71,21 @@ class Radio:
 
 
 def density_coupled_loss(n_active: Ints) -> Floats:
-    """Return the loss of one transmission, `(...)`, for this number of active vehicles.
+    """Return the probability that one transmission is lost, `(...)`, by the number of vehicles.
 
-    `n_active` includes the ego. It is the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4,
-    18.6 % at 8 active vehicles), clipped to [0, 1]; a single vehicle loses nothing.
+    `n_active`, `(...)`, counts the vehicles that load the channel, the ego included. The loss is
+    the line through the paper's panel 4 (0.6 % at 2, 6.6 % at 4, 18.6 % at 8 active vehicles),
+    clipped to [0, 1]; a single vehicle loses nothing.
     """
     return np.where(n_active > 1, np.clip(0.006 + 0.03 * (n_active - 2), 0.0, 1.0), 0.0)
 
 
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
-    """Return which of H helpers' request and reply are both received, `(..., H)`.
+    """Return for which of H helpers request and reply are both received, `(..., H)`.
 
-    The probability is (1 - loss)^2. `uniforms` are draws of request and reply, `(..., H, 2)`. With
-    a roadside edge, an antenna beside the road, a reply has a second path, so that it is lost with
-    probability loss^2.
+    The probability is (1 - loss)^2. `uniforms` are draws in [0, 1) of each helper's request and
+    reply, `(..., H, 2)`; `loss` is the probability that one transmission is lost, `(..., H)` or
+    `(..., 1)`. With a roadside edge, an antenna beside the road, a reply has a second path, so that
+    it is lost with probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

@@ -24,16 +24,18 @@ BLOCK = 1024  # decisions computed at once, so that their waves stay in the proc
 
 @dataclass(frozen=True)
 class Trips:
-    """Hold the keys of the channel's random numbers: seed, layout and step of each decision.
+    """Hold the keys from which the channel's random numbers are made, for decisions `(...)`.
 
-    They have the decisions' shape, `(...)`.
+    The same keys give the same numbers, whatever else is played.
     """
 
-    seed: Ints  # seed of the channel, `(...)`
-    layout_seed: Ints  # seed of the episode's layout, `(...)`
-    step: Ints  # step of the decision, `(...)`
-    steps: int  # most steps of an episode
-    links: str = ""  # name of the links; empty for those among vehicles
+    seed: Ints  # seed of the channel's draws, `(...)`
+    layout_seed: Ints  # seed of the episode's layout, its start situation, `(...)`
+    step: Ints  # number of the decision in its episode, from 0, `(...)`
+    steps: int  # most decisions of an episode
+    # name of the links that the numbers are for, such as those of a roadside unit; empty for those
+    # among vehicles
+    links: str = ""
 
     def take(self, at: Any) -> "Trips":
         return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)

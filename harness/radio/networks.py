@@ -17,17 +17,17 @@ Milliseconds = Annotated[float, between(0, 1000 * LONGEST_S)]
 
 @dataclass(frozen=True)
 class Network:
-    """Hold measured quantiles of round trips to a cloud, without the time of its answer.
+    """Hold how long round trips from a car to a cloud take, without the time of the answer there.
 
-    `quantiles_ms` has their milliseconds by percentage, from 0 to 100; `status` says whether they
-    are cited from a publication, measured by oneself, or assumed.
+    A round trip is drawn from the distribution that `quantiles_ms` states.
     """
 
     description: str  # one sentence for lists
     source: str  # who measured the round trips, where and how many
     # `cited` from a publication or its data, `measured` by oneself, or `assumed`
     status: Literal["cited", "measured", "assumed"]
-    # quantiles of the round trips by percentage, from 0 to 100
+    # milliseconds that so many percent of the round trips stay below, by percentage as a text,
+    # from 0 to 100
     quantiles_ms: dict[str, Milliseconds]
 
     def round_trip_s(self, uniforms: Floats) -> Floats:

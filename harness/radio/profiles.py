@@ -31,12 +31,7 @@ MODELS = Shipped[Any]("swarmdrive.channel_models", object, {"constant": Radio})
 
 @dataclass(frozen=True)
 class Profile:
-    """Hold the content of a channel profile, a file of `channels/`: model, parameters, source.
-
-    `status` says whether the numbers are measured on radios, cited from a publication, modelled, or
-    assumed. `limits` has the least and largest value of some parameters for which the source
-    validated the model.
-    """
+    """Hold the content of a channel profile, a file of `channels/`: model, parameters, source."""
 
     model: str  # one of `MODELS`
     description: str  # one sentence for lists
@@ -67,7 +62,10 @@ class Profiles(FilesAndPlugins[Channel]):
         return _read(file)[1]
 
     def profile(self, name: str) -> Profile:
-        """Return the profile in a channel's file; of a package's channel, one made of its class."""
+        """Return what the file of the channel `name` says: its model, parameters and source.
+
+        For a package's channel, which has no file, it is made of the channel's class.
+        """
         if file := self.file(name):
             return _read(file)[0]
         kind = type(self[name])
@@ -75,9 +73,10 @@ class Profiles(FilesAndPlugins[Channel]):
         return Profile(kind.__name__, doc, f"the package that has {kind.__module__}", "assumed")
 
     def files(self, name: str) -> dict[str, Path]:
-        """Return a profile's file, and the table it names, by their paths within `channels/`.
+        """Return the files that the channel `name` is made of, by their paths within `channels/`.
 
-        It is empty for a package's channel.
+        They are its profile, and the table that it names, if any. There are none for a package's
+        channel.
         """
         file = self.file(name)
         if file is None:
@@ -88,9 +87,10 @@ class Profiles(FilesAndPlugins[Channel]):
         return files
 
     def unchanged(self, name: str, recorded: Any) -> bool:
-        """Return whether a channel does what a run recorded of it, by model and parameters.
+        """Return whether the channel `name` still does what a run recorded of it.
 
-        A parameter that is newer than the record had its default.
+        `recorded` is what `record` returned then: model and parameters are compared. A parameter
+        that the record does not have had its default.
         """
         if name not in self:
             return False

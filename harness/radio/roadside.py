@@ -25,7 +25,7 @@ EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and thos
 
 @dataclass(frozen=True)
 class Relay(Wrapped):
-    """Wrap a channel by a roadside unit that repeats replies; requests go directly.
+    """Add to a channel a roadside unit, an antenna beside the road, that sends replies once more.
 
     A reply arrives if it reaches the ego, or the unit and from there the ego. The ego takes the one
     that comes first: the direct one, unless latencies depend on the link. The unit repeats every
@@ -33,8 +33,8 @@ class Relay(Wrapped):
     what it sends does not wait for other messages.
     """
 
-    unit: Unit  # the unit
-    delay_s: float  # time from a reply's end at the unit until its copy is to be sent
+    unit: Unit  # position and antenna height of the unit
+    delay_s: float  # seconds from a reply's end at the unit until its copy is to be sent
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Return which replies arrive, directly or by the unit, and when the first of both does.
@@ -74,13 +74,11 @@ class Relay(Wrapped):
 
 
 class Consulted(NamedTuple):
-    """Hold the result of asking H helpers, with times in s from the start of the ego's request.
+    """Hold the result of asking H helpers, directly or by a roadside unit.
 
-    `asked`, `up` and `fused` say which helpers were asked, whose replies were received, and which
-    of these were in time for fusion, (..., H); `end_s`, (..., H), is when each reply ends, inf
-    without one; `acts_s` is when the ego stops waiting, (...). `loss` is the probability that a
-    reply is lost. `requests`, `request_bits`, `policy_bits` and `airtime_s`, (...), sum what was
-    sent.
+    A unit is an antenna beside the road; it may ask for the ego, fuse the replies and send the ego
+    a policy. Times are seconds from the start of the ego's request. Arrays are of decisions of any
+    shape `(...)`; index h of an axis of length H is helper h.
     """
 
     # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
@@ -108,7 +106,7 @@ def by_unit(
     ready: Callable[[Floats], Floats],
     left_s: Floats,
 ) -> Consulted:
-    """Simulate a roadside unit that asks the helpers for the ego and sends it a policy in time.
+    """Play a roadside unit, an antenna beside the road, that asks for the ego and fuses for it.
 
     The unit sends when the last reply's slot has ended, but not so late that its own wait and time
     on air take the policy out of the window: it knows the slot that it has taken, or a table's
@@ -116,13 +114,14 @@ def by_unit(
 
     Args:
         channel: the channel between vehicles.
-        unit: the unit.
-        delay_s: time from what the unit has received to what it sends for that.
-        links: the helpers' links; their `ready_s` is not used.
-        draws: random numbers.
+        unit: position and antenna height of the unit.
+        delay_s: seconds from the end of what the unit receives until it sends what follows.
+        links: the links of the ego and its H helpers; their `ready_s` is not used.
+        draws: the channel's random numbers.
         ready: returns when replies can leave, `(..., H)`, from when helpers have the request, of
-            the same shape or `(..., 1)`.
-        left_s: when the decision window closes, `(...)`.
+            the same shape or `(..., 1)`; both in s from the start of the ego's request.
+        left_s: seconds from the start of the ego's request until the ego waits for a policy no
+            longer, `(...)`.
     """
     bits, at_unit = links.request_bits, links.where.units[unit]
     ego_link, helper_links = (replace(links, site=at_unit.select(ends)) for ends in (EGO, HELPERS))
@@ -166,8 +165,9 @@ def by_unit(
 
 
 def link_loss(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
-    """Return the probability that one transmission of so many bits is lost, on each of H links.
+    """Return the probability that one transmission is lost on each of H links, `(..., H)`.
 
-    It is `(..., H)`; `site` has the positions and `draws` the links' shadowing.
+    `site` has the positions, `draws` the random numbers of which each link's shadowing is made, and
+    `bits` is the transmission's size, one for all or `(..., H)`.
     """
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

@@ -21,7 +21,10 @@ from harness.radio.channel import (
 
 @dataclass(frozen=True)
 class Wrapped:
-    """Wrap a physical channel and forward everything to it, as a base for changes."""
+    """Wrap a physical channel, whose loss depends on positions, and forward everything to it.
+
+    It is a base class: subclasses change part of what the channel does.
+    """
 
     channel: Physical  # the wrapped channel
 
@@ -58,10 +61,11 @@ def is_ours(channel: Channel) -> bool:
 
 
 def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
-    """Return what a channel delivers, checked if its model is another package's.
+    """Return which replies are received on a channel, and when, as `Channel.deliver` does.
 
-    Such a model gets arrays that it cannot write to. Raises ValueError if a result has a wrong
-    shape or type, or an impossible value for a helper that was asked.
+    The model of another package gets arrays that it cannot write to, and its results are checked.
+    Raises ValueError if one has a wrong shape or type, or an impossible value for a helper that was
+    asked.
     """
     if is_ours(channel):
         return channel.deliver(links, draws)
@@ -89,9 +93,10 @@ def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
 
 
 def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast:
-    """Return when a channel's request is received, checked if its model is another package's.
+    """Return when a request of so many bits is received on a channel, as `Channel.request` does.
 
-    Raises ValueError for a time that is negative or infinite; NaN is one that is unknown.
+    Times of another package's model are checked. Raises ValueError for one that is negative or
+    infinite; NaN is one that is unknown.
     """
     if is_ours(channel):
         return channel.request(bits, draws)
@@ -106,7 +111,8 @@ def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast
 def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) -> Floats:
     """Return when each of H receivers has a broadcast, in s from the wish to send, `(..., H)`.
 
-    `request` is what the channel said of it. It is `(..., 1)` if all have it at once.
+    It is `(..., 1)` if all have it at once. `request` is what `broadcast` returned for it; `links`
+    has the receivers' positions, and `draws` are the channel's random numbers.
     """
     model = innermost(channel)
     if isinstance(model, ByLink):
@@ -119,7 +125,7 @@ def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) ->
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """Wrap a physical channel so that every transmission has the same loss everywhere."""
+    """Wrap a physical channel so that its loss is the same everywhere, whatever the positions."""
 
     probability: float  # probability that one transmission is lost
 

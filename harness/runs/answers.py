@@ -17,14 +17,16 @@ MARKS = f"{ASKED}{REWRITTEN}/+"  # in keys, beside who answered
 
 @dataclass(frozen=True)
 class Answered:
-    """Hold a run's number of answers by role, parse failures by role and status, and ego's intents.
+    """Hold how many answers a run has, how many could not be read, and what the ego answered.
 
-    `ego` has the n distributions over A actions, (n, A), that could be read from the ego's answers.
+    A role is who answers, and to what: `ego`, `helper` or `merge` (a fusion call).
     """
 
-    count: Counter[str]  # how many answers there are, by role
-    failed: Mapping[str, Counter[str]]  # how many could not be read, by role and status
-    ego: Floats  # distributions over the actions that the ego answered and could be read, (n, A)
+    count: Counter[str]  # number of answers by role
+    # number of answers that could not be read, by role, and by status, such as `bad_sum`
+    failed: Mapping[str, Counter[str]]
+    # the intents in the n answers of the ego that could be read, probabilities of A actions, (n, A)
+    ego: Floats
 
 
 class Answers:

@@ -40,7 +40,11 @@ CLOSE = 1e-6  # how near numbers stay that were only written and read again
 
 
 def refuse(run: Run | SuiteRun) -> None:
-    """Raise UserError if a table of a run or suite contradicts the tables it is computed from."""
+    """Raise UserError if a table of a run or suite contradicts the tables it is computed from.
+
+    Such as a mean in `summary.csv` that is not that of `episodes.csv`. A suite is checked with all
+    of its runs.
+    """
     if isinstance(run, SuiteRun):
         for member in run.runs.values():
             refuse(member)
@@ -67,8 +71,8 @@ def sound(folder: Path) -> Run:
 def contradictions(run: Run) -> Iterator[str]:
     """Yield a sentence for each statement of a run's tables that its other tables contradict.
 
-    Scores are computed again by the version of the rules that the run states; a run of an older
-    version may lack figures that came later.
+    Scores are computed again by the rules of the version that the run states (`versions.FIGURES`);
+    a run of an earlier version may lack figures that only later ones have.
     """
     version = run.manifest.versions.get("figures", "1")
     if version not in map(str, range(1, FIGURES + 1)):
@@ -96,7 +100,8 @@ def contradictions(run: Run) -> Iterator[str]:
 def of_suite(suite: SuiteRun) -> Iterator[str]:
     """Yield a sentence for each mean of a suite's table that its runs' scores contradict.
 
-    Intervals are compared only if all runs have figures of this version.
+    A suite is a run for each of several scenarios. Intervals are compared only if all of its runs
+    state this harness's version of the rules for figures (`versions.FIGURES`).
     """
     scenes = [run.manifest.world.pinned for run in suite.runs.values()]
     if any(scenes.count(each) > 1 for each in scenes):
@@ -135,7 +140,7 @@ def _scores(run: Run) -> Iterator[Score]:
 
 
 def current(run: Run) -> bool:
-    """Return whether a run's figures were computed by this harness's version of the rules.
+    """Return whether a run's figures are by this harness's version of the rules for them.
 
     The run's manifest states the version; one that states none is of version 1.
     """

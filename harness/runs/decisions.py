@@ -150,33 +150,33 @@ def by_message(name: str, values: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Labels:
-    """Hold names (n,) in a compact form, `names[code]`; a negative code stands for no name."""
+    """Hold a name for each of n rows in a compact form."""
 
-    codes: Ints
-    names: Sequence[str]
+    codes: Ints  # index in `names` of each row's name, (n,); negative for a row without one
+    names: Sequence[str]  # the names, each once
 
 
 @dataclass(frozen=True)
 class Decisions:
-    """Hold n decisions as the columns (n,) of an Arrow table: one row for each decision point,
-    condition and seed.
+    """Hold n decisions of a run as a table, one row for each decision point, condition and seed.
 
-    `actions` are the names of the meta-actions, `helpers` the greatest number of messages in a
-    decision.
+    A decision point is one situation in which a decision is due; a condition is the operating point
+    under which it is decided, and the seed is that of the channel's draws.
     """
 
-    table: pa.Table  # the columns of `schema`
-    actions: tuple[str, ...]  # the meta-actions, in the order of every distribution
-    helpers: int  # the most helpers of any decision point
+    table: pa.Table  # its columns, (n,) each, are those of `schema`
+    # names of the meta-actions, in the order of every distribution over them
+    actions: tuple[str, ...]
+    helpers: int  # the greatest number of messages in a decision: of columns such as `helper_1`
     _arrays: dict[str, Floats] = field(default_factory=dict, repr=False, compare=False)
     _rows: dict[int, list[dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
-        """Build decisions from arrays and `Labels` (n,) by column; missing columns are unknown.
+        """Build n decisions from the values (n,) of each column: an array, or `Labels` of names.
 
-        `actions` are the names of the meta-actions, `helpers` the greatest number of messages in a
-        decision.
+        Missing columns are unknown. `actions` are the names of the meta-actions, `helpers` the
+        greatest number of messages in a decision.
         """
         n = len(columns["seed"])
         fields = schema(actions, helpers)
@@ -188,7 +188,7 @@ class Decisions:
 
     @classmethod
     def concat(cls, parts: Sequence["Decisions"]) -> "Decisions":
-        """Concatenate tables of decisions that have the same actions."""
+        """Return the decisions of several tables, one after another; all have the same actions."""
         actions, helpers = parts[0].actions, max(part.helpers for part in parts)
         tables = pa.concat_tables([part.table for part in parts], promote_options="default")
         return cls(
@@ -213,8 +213,9 @@ class Decisions:
         return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
-        """Return the columns of a value that each of A actions has, such as `fused` or `safe`, (n,
-        A).
+        """Return a value that each of A actions has in n decisions, such as `fused`, (n, A).
+
+        `name` is the start of its columns' names, such as that of `fused_IDLE`; NaN where unknown.
         """
         key = f"{name} of actions"
         if key not in self._arrays:
@@ -223,17 +224,19 @@ class Decisions:
         return self._arrays[key]
 
     def of_messages(self, name: str) -> Floats:
-        """Return the columns of a value that each of H messages has, such as `on_time`, (n, H).
+        """Return a value that each of H messages has in n decisions, such as `on_time`, (n, H).
 
-        NaN where no helper was asked.
+        `name` is the start of its columns' names, such as that of `on_time_1`; NaN where no helper
+        was asked.
         """
         columns = [self[f"{name}_{place}"] for place in range(1, self.helpers + 1)]
         return np.stack(columns, axis=-1) if columns else np.empty((len(self), 0))
 
     def codes(self, name: str, names: Sequence[str]) -> Ints:
-        """Return the index in `names` of each row's label, (n,); -1 where it has none.
+        """Return of each row of a column of labels the index of its label in `names`, (n,).
 
-        Raises ValueError for a label that is not in `names`.
+        It is -1 in a row without one. `name` is the column's. Raises ValueError for a label that is
+        not in `names`.
         """
         column = self.table[name].combine_chunks()
         position = {label: place for place, label in enumerate(names)}

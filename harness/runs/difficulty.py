@@ -23,7 +23,10 @@ REFERENCES = ("local-view", "cruise", "uniform")  # that ask no model
 
 
 class Layout(Struct, frozen=True):
-    """Hold the success of three reference policies in one layout: a line of `difficulty.csv`."""
+    """Hold the success of three reference policies in one layout: a line of `difficulty.csv`.
+
+    A layout is one start situation of a scenario; the references need no model.
+    """
 
     episode: int  # the episode's number
     danger: str  # where the hidden danger comes from; `none` without one
@@ -40,17 +43,17 @@ class Layout(Struct, frozen=True):
 class Pool:
     """Hold all N layouts that a run's E layouts are a random sample of, with their difficulty.
 
-    `known` is the success of K reference policies (N, K), the covariates of the adjustment;
-    `dangerous` is a mask (N,), and `answered` the indices of the sample (E,).
+    A layout is one start situation of a scenario, and has one episode. How hard it is, is known
+    from K reference policies that need no model.
     """
 
-    known: Floats  # how well the references do in each, (N, K)
-    dangerous: Bools  # whether each has a danger, (N,)
-    answered: Ints  # the places of the run's own, (E,)
+    known: Floats  # success of each reference in each layout, 0 to 1, (N, K)
+    dangerous: Bools  # whether each layout has a danger, (N,)
+    answered: Ints  # index among the N of each of the run's layouts, (E,)
 
     @classmethod
     def of(cls, layouts: Sequence[Layout], episodes: Iterable[int]) -> "Pool":
-        """Return the pool of all these layouts; `episodes` are the numbers of the sampled ones."""
+        """Return the pool of all layouts of a dataset; `episodes` are the numbers of the run's."""
         places = {layout.episode: place for place, layout in enumerate(layouts)}
         return cls(
             np.array([(each.local_view, each.cruise, each.uniform) for each in layouts]),
@@ -61,11 +64,11 @@ class Pool:
     def difference(
         self, success: Success, a: Floats, b: Floats, level: float = LEVEL
     ) -> Estimate | None:
-        """Return the difference in success a - b, both (S, E), adjusted; None if impossible.
+        """Return the difference in success a - b, corrected for how hard the run's layouts are.
 
-        It is paired by episode and adjusted for layout difficulty. `success` says how episodes are
-        averaged, `level` is the confidence of the interval. The axes are S channel seeds and E
-        episodes.
+        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes,
+        and are paired by episode. `success` says how episodes are averaged, `level` is the
+        confidence of the interval. None if it cannot be corrected, as with too few episodes.
         """
 
         def plain(part: Bools) -> Estimate:
@@ -74,9 +77,11 @@ class Pool:
         return self._corrected(success, plain, known_mean(a - b, 0), -1.0, level)
 
     def estimate(self, success: Success, values: Floats) -> Estimate | None:
-        """Return the mean success of values (S, E), adjusted for difficulty; None if impossible.
+        """Return the mean success, corrected for how hard the run's layouts are.
 
-        `success` says how episodes are averaged. The axes are S channel seeds and E episodes.
+        `values` are the success of its episodes, (S, E), by S channel seeds and E episodes;
+        `success` says how episodes are averaged. None if it cannot be corrected, as with too few
+        episodes.
         """
 
         def plain(part: Bools) -> Estimate:

@@ -22,9 +22,15 @@ def doubted(
 ) -> set[str]:
     """Return the names of the conditions with a warning: controls, another lag, unvalidated radios.
 
-    A control replaces what helpers say. The lag is the time from a decision to its action.
-    `channels` holds parameters and validated limits by channel profile, `off_lag` by condition the
-    share of decisions that take longer or shorter than the dataset's lag.
+    A condition is an operating point of a run; `conditions` has their settings by name. A control
+    replaces what helpers say. The lag is the time from a decision to its action, for which the
+    dataset knows what follows.
+
+    Args:
+        conditions: the settings of each condition.
+        channels: by name of a channel profile its parameters, and for some the least and greatest
+            value for which its model was validated.
+        off_lag: by condition the share of decisions that act in another frame than after the lag.
     """
     names = {name for control in control_settings().values() for name in under(conditions, control)}
     return names | {*lagging(off_lag)} | {name for name, _ in beyond(conditions, channels)}
@@ -40,7 +46,7 @@ def under(conditions: Conditions, control: str) -> list[str]:
 
 
 def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
-    """Return the conditions half or more of whose decisions miss the dataset's lag.
+    """Return the names of the conditions half or more of whose decisions miss the dataset's lag.
 
     The lag is the time from a decision to its action, for which the dataset knows what follows.
     `off_lag` is by condition the share of decisions that would act in another frame.
@@ -49,7 +55,11 @@ def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
 
 
 def beyond(conditions: Conditions, channels: Mapping[str, Channel]) -> Iterator[tuple[str, str]]:
-    """Yield each condition with a radio outside its channel model's validated range, and why."""
+    """Yield the name of each condition whose radio its channel model is not validated for, and why.
+
+    `conditions` has the settings of each; `channels` by name of a channel profile its parameters,
+    and for some the least and greatest value for which the model was validated.
+    """
     for condition in conditions:
         if channel := channels.get(condition.get("profile") or ""):
             parameters, limits = channel

@@ -59,10 +59,10 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
 
 
 def junit(run: Run, path: Path) -> Path:
-    """Write a run as JUnit's XML: a test case for each episode and condition.
+    """Write a run as JUnit's XML, which servers of tests read: a case for an episode and condition.
 
-    A case fails if the episode fails in any seed. It is an error if a request got no answer, unless
-    that counts as a lost message.
+    A case fails if the episode fails with any seed of the channel's draws. It is an error if a
+    request got no answer, unless that counts as a lost message.
     """
     errors = _unanswered(run)
     episodes: dict[tuple[str, int], list[Episode]] = {}

@@ -18,27 +18,24 @@ from harness.runs.folder import Run
 class Option:
     """Describe a further command-line option of an export format.
 
-    `refusal` is called with the typed value and the option that names the file; it returns why the
-    value is refused there, or None. Formats that share an option hold the same object.
+    Formats that share an option hold the same object.
     """
 
     kind: type  # what is typed: `bool` for a switch, or `float`
-    help: str
-    # why a value is refused beside the option that names a file
+    help: str  # its help
+    # returns why a value is refused, or None, given the value and the command-line option of the
+    # format that is exported
     refusal: Callable[[Any, str], str | None]
 
 
 @runtime_checkable
 class Export(Protocol):
-    """Describe an export format that an extension adds: a run as a file of another program.
+    """Describe an export format that an extension adds: a run as a file of another program."""
 
-    `help` is the help of its command-line option, `doing` what is said while it writes, and `needs`
-    the optional modules without which it cannot write.
-    """
-
-    help: str  # of the option
-    doing: str  # what is said while it writes
-    # modules of extras without which it cannot write: `harness.core.extras.OPTIONAL`
+    help: str  # the help of its command-line option
+    doing: str  # what is said while it writes, such as `writing chats`
+    # names of the optional modules without which it cannot write, of
+    # `harness.core.extras.OPTIONAL`
     needs: tuple[str, ...]
 
     def write(self, run: Run, file: Path, dataset: Path | None, **options: Any) -> Path:

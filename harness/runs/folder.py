@@ -112,7 +112,7 @@ class Run:
 
     @cached_property
     def answered(self) -> Answered:
-        """Return counts of the answers and the ego's distributions, from one pass through them."""
+        """Return how many answers there are and failed, and what the ego answered, read once."""
         return self.answers.counted()
 
     @cached_property
@@ -128,9 +128,9 @@ class Run:
         return {layout: place for place, layout in enumerate(self.grid.episodes)}
 
     def of_scenes(self, ids: Collection[str]) -> "Run":
-        """Return a copy with the decisions and answers in these scenes, and their episodes.
+        """Return a copy with the decisions and answers of some scenes alone, and their episodes.
 
-        `ids` are the scenes' ids.
+        A scene is the state at one decision point; `ids` are the scenes' ids.
         """
         rows = [row for scene in ids for row in self.decisions.scenes.get(scene, ())]
         decisions = self.decisions.take(rows)
@@ -161,9 +161,10 @@ class Run:
         return {}
 
     def undeclared_delay(self, answer: Answer) -> str | None:
-        """Return a phrase on an answer's extra seconds if its model card declares no such delay.
+        """Return a phrase on seconds that an answer took beyond what its model's card declares.
 
-        None if there are none, or the card declares them.
+        A model card, a file that describes a model, may declare that some answers take longer. None
+        if this one took no longer, or so much as declared.
         """
         failures = self.agent(answer)["model"].get("failures")
         tail_s = failures.get("slow_s", 0.0) if isinstance(failures, Mapping) else 0.0
@@ -196,7 +197,8 @@ class Run:
     def layouts(self) -> tuple[Layout, ...]:
         """Return the rows of `difficulty.csv`: all layouts that the run's are sampled from.
 
-        It is empty for a run with all layouts of its dataset, or in closed loop.
+        A layout is one start situation of a scenario; a row has how reference policies do in it.
+        There are none for a run with all layouts of its dataset, or in closed loop.
         """
         exists = self.world == "frozen" and (self.path / DIFFICULTY).is_file()
         return self.read_file(DIFFICULTY, self._layouts) if exists else ()
@@ -213,7 +215,8 @@ class Run:
     def score(self, condition: str, metric: str) -> Score | None:
         """Return a metric's score in one condition; None if it has no value there.
 
-        Of several intervals, it is the anytime-valid one, else the one over episodes.
+        Of scores with several kinds of interval it is the one that holds however often the run was
+        looked at while it went on, else the one over episodes.
         """
         of_metric = [s for s in self.scores if (s.condition, s.metric) == (condition, metric)]
         candidates = [score for score in of_metric if score.value is not None]

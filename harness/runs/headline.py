@@ -25,15 +25,20 @@ class Scored(Protocol):
 
 
 def headline_metric(*names: Container[str]) -> str:
-    """Return the headline metric: balanced success if every container of metric names has it.
+    """Return the name of the metric by which runs are read, the headline metric.
 
-    Otherwise it is the plain success rate.
+    `names` has for each run the names of its metrics. It is balanced success, the mean of success
+    with a danger and without, if every run has that; otherwise plain success.
     """
     return BALANCED if all(BALANCED in each for each in names) else SUCCESS
 
 
 def headline_of(*runs: Scored) -> str:
-    """Return the headline metric of runs: balanced success if all of them have it, else success."""
+    """Return the name of the metric by which runs are read, the headline metric.
+
+    It is balanced success, the mean of success with a danger and without, if all of them have a
+    value of it; otherwise plain success.
+    """
     names_by_run = []
     for run in runs:
         names_by_run.append({score.metric for score in run.scores if score.value is not None})
@@ -41,14 +46,15 @@ def headline_of(*runs: Scored) -> str:
 
 
 def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:
-    """Return the condition with the highest success, the first of equals; empty if there is none.
+    """Return the name of the condition with the highest success; empty if there is none.
 
-    Conditions in `doubted` (those with a warning) do not count if another with a radio is left.
+    A condition is an operating point of a run. Of equals it is the first. Conditions with a warning
+    do not count if another one with a radio is left.
 
     Args:
-        success: success by condition.
-        radios: conditions with V2V.
-        doubted: conditions with a warning.
+        success: success from 0 to 1 by condition.
+        radios: names of the conditions with a radio.
+        doubted: names of the conditions with a warning.
     """
     trusted = [name for name in success if name not in doubted]
     counted = trusted if any(name in radios for name in trusted) else success

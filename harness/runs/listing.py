@@ -31,12 +31,7 @@ _BROKEN = (*BROKEN, AttributeError, csv.Error)  # in what no type was given to
 
 @dataclass(frozen=True)
 class Listed:
-    """Describe one run or study in a list.
-
-    `state` says whether it is finished, and `why` what to do if it is not. `success`, from 0 to 1,
-    is that of `condition`, the best one, with the 95 % interval from `low` to `high`. None where it
-    is unknown, or a study has no such thing.
-    """
+    """Describe one run or study in a list; None where a value is unknown or a study has none."""
 
     name: str  # its folder, relative to the folder that is listed
     # `eval`, `drive`, `suite`, a word of `STUDIES`, or `run` if it is broken and does not say
@@ -52,12 +47,14 @@ class Listed:
     prompt: str | None = None  # the prompt version; those of all families for a suite
     answer: str | None = None  # the answer mode
     tags: tuple[str, ...] = ()  # words by which to find it
-    condition: str | None = None  # the best condition that no warning of its page is about
-    success: float | None = None  # that, 0 to 1, over episodes; for a suite, the mean over families
+    # name of the condition with the highest success that no warning of its page is about
+    condition: str | None = None
+    # success in that condition, 0 to 1, over episodes; for a suite, the mean over families
+    success: float | None = None
     low: float | None = None  # lower end of its 95 % interval; None if the data cannot bound it
     high: float | None = None  # its upper end
     unread: float | None = None  # share of the ego's answers that could not be parsed
-    metric: str | None = None  # what success is: the metric that leads
+    metric: str | None = None  # name of the metric that `success` is, balanced or plain success
 
 
 def runs(folder: Path) -> list[Listed]:
@@ -191,7 +188,7 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
 
 
 def own_name(name: str) -> bool:
-    """Return whether a name is that of a visible folder, and not a path."""
+    """Return whether a name can be that of a run's folder in a list: one visible name, no path."""
     return os.path.basename(name) == name and not name.startswith(".") and name != ""
 
 

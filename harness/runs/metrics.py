@@ -67,7 +67,7 @@ COUNT, MEAN_COUNT, SCORE = Unit(decimals=1), Unit(decimals=2), Unit(decimals=3)
 
 
 class Columns(Protocol):
-    """Describe a table of decisions: numeric columns (n,) by name, NaN where unknown."""
+    """Describe a table of n decisions: `table[name]` is a column (n,), NaN where unknown."""
 
     def __getitem__(self, name: str, /) -> Floats: ...
 
@@ -77,15 +77,13 @@ class Metric:
     """Define one metric, with values of 0 or more, by its name, meaning, unit and function.
 
     The function is one of `decisions`, `episodes`, `answers` and `pooled`, by what it takes; a
-    metric without any is computed where `summary.csv` is made. `better` says which change is
-    better, and `most` is the greatest value. `halves` names the two metrics that it is the mean of,
-    with and without a danger.
+    metric without any is computed where `summary.csv` is made.
     """
 
     name: str  # its name in tables, with the unit at the end
     meaning: str  # its meaning, in words for people
     unit: Unit  # how it is written
-    better: Better  # which change is better
+    better: Better  # which change of it is better
     # `rate` for a share of events, whose interval is Wilson's; `mean` for Student's t
     interval: Literal["rate", "mean"] = "mean"
     most: float = math.inf  # the greatest value that it can have
@@ -106,7 +104,7 @@ class Metric:
     world: World | None = None  # the world in which it is known; None for every world
     optional: bool = False  # whether a run in which it is nowhere known has no row of it
     half: bool = False  # whether it is of the episodes with a danger alone, or of those without
-    # two metrics of a half of the episodes each, whose mean it is
+    # names of two metrics whose mean it is: of the episodes with a danger, and of those without
     halves: tuple[str, ...] = ()
     # the metric that it corrects by the layouts' difficulty, where two runs are compared
     corrects: str = ""
@@ -927,9 +925,10 @@ METRICS = Metrics("swarmdrive.metrics", Metric, {metric.name: metric for metric 
 
 
 def metrics_of(world: World) -> tuple[Metric, ...]:
-    """Return the metrics of decisions and of episodes that are known in this world.
+    """Return the metrics of decisions and of episodes that are known in a kind of world.
 
-    Raises UserError if a package's metric does not load.
+    `world` is `frozen` (recorded scenes) or `closed-loop`. Raises UserError if a package's metric
+    does not load.
     """
     by_row = (metric for metric in METRICS.values() if metric.decisions or metric.episodes)
     return tuple(metric for metric in by_row if metric.world in (None, world))
@@ -937,9 +936,9 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
 
 @lru_cache(1024)
 def entry(name: str) -> Metric:
-    """Return the metric of this name; a plain one without a meaning if it is not registered.
+    """Return the metric of a name; a plain one without a meaning if it is not registered.
 
-    An older run may have such a name.
+    Such a name may stand in a run that another version of the harness made.
     """
     try:
         return METRICS[name]
@@ -949,18 +948,21 @@ def entry(name: str) -> Metric:
 
 @dataclass(frozen=True)
 class Grid:
-    """Hold the conditions, seeds and episodes of a run; each combination is a cell, one episode."""
+    """Hold the conditions, seeds and episodes of a run: the axes (C, S, E) of its figures.
 
-    conditions: tuple[str, ...]  # the conditions' names
-    seeds: tuple[int, ...]  # seeds of the channel's draws
-    episodes: tuple[int, ...]  # the episodes' numbers
+    Each combination is a cell: one episode under one condition with one seed.
+    """
+
+    conditions: tuple[str, ...]  # names of the C conditions, operating points of the run
+    seeds: tuple[int, ...]  # the S seeds of the channel's draws
+    episodes: tuple[int, ...]  # numbers of the E episodes, one for each layout
 
     @property
     def shape(self) -> tuple[int, int, int]:
         return len(self.conditions), len(self.seeds), len(self.episodes)
 
     def places(self, decisions: Decisions) -> Ints:
-        """Return the flat index (C × S × E) of each decision's cell, (n,).
+        """Return the index of each of n decisions' cells in a flattened array (C, S, E), (n,).
 
         Raises ValueError for a decision outside the grid.
         """
@@ -986,10 +988,10 @@ class Grid:
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Return each metric's values for every episode, (C, S, E), by name; NaN where unknown.
+    """Return each metric's values by its name, (C, S, E); NaN where unknown.
 
-    `episodes` are in the order of the grid. The axes are C conditions, S channel seeds and E
-    episodes.
+    The axes are those of the grid: C conditions, S channel seeds and E episodes, and `episodes`, of
+    one record for each, are in that order.
     """
     places = grid.places(decisions)
 
@@ -1002,10 +1004,10 @@ def by_episode(
 
 
 def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
-    """Return a metric's values from the episodes' outcomes, (C, S, E); NaN where unknown.
+    """Return a metric's values from how episodes ended, (C, S, E); NaN where unknown.
 
-    `episodes` are in the order of the grid. The axes are C conditions, S channel seeds and E
-    episodes.
+    The axes are those of the grid: C conditions, S channel seeds and E episodes, and `episodes`, of
+    one record for each, are in that order.
     """
     function = metric.episodes
     assert function
@@ -1018,9 +1020,9 @@ def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
 
 
 def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
-    """Return a metric's value for each of n episodes, (n,), from decisions; NaN where unknown.
+    """Return a metric's value for each of n episodes, (n,), from m decisions; NaN where unknown.
 
-    `places` is the index of each decision's episode.
+    `places`, (m,), is the index from 0 to n - 1 of each decision's episode.
     """
     function = metric.decisions
     assert function
@@ -1054,17 +1056,18 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Return the sum of the known values at each index from 0 to n - 1, (n,).
+    """Return the sum of the known values of each of n groups, such as episodes, (n,).
 
-    `places` has the index of each value.
+    `places`, (m,), is the group of each of m `values`, (m,): an index from 0 to n - 1.
     """
     return np.bincount(places, weights=np.nan_to_num(values), minlength=n).astype(float)
 
 
 def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Return the mean of the known values at each index, (n,); NaN where there is none.
+    """Return the mean of the known values of each of n groups, such as episodes, (n,).
 
-    `places` has the index of each value, from 0 to n - 1.
+    `places`, (m,), is the group of each of m `values`, (m,): an index from 0 to n - 1. NaN for a
+    group without a known value.
     """
     is_known = ~np.isnan(values)
     count = np.bincount(places[is_known], minlength=n)
@@ -1073,9 +1076,10 @@ def mean_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
 
 def least_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Return the least of the known values at each index, (n,); NaN where there is none.
+    """Return the least of the known values of each of n groups, such as episodes, (n,).
 
-    `places` has the index of each value, from 0 to n - 1.
+    `places`, (m,), is the group of each of m `values`, (m,): an index from 0 to n - 1. NaN for a
+    group without a known value.
     """
     least = np.full(n, np.nan)
     np.fmin.at(least, places, values)
@@ -1083,9 +1087,10 @@ def least_by_place(values: Floats, places: Ints, n: int) -> Floats:
 
 
 def over_seeds(name: str, values: Floats) -> Estimate:
-    """Return the mean of a metric's values (S, E) with a 95 % interval over channel seeds.
+    """Return the mean of a metric's values with a 95 % interval over channel seeds.
 
-    The axes are S channel seeds and E episodes.
+    `values` are (S, E), by S channel seeds and E episodes, NaN where unknown; `name` is the
+    metric's.
     """
     if entry(name).interval == "rate":
         return in_range(name, seed_rate_interval(values))
@@ -1093,9 +1098,10 @@ def over_seeds(name: str, values: Floats) -> Estimate:
 
 
 def over_episodes(name: str, values: Floats) -> Estimate:
-    """Return the mean of a metric's values (S, E) with a 95 % interval over episodes.
+    """Return the mean of a metric's values with a 95 % interval over episodes.
 
-    The axes are S channel seeds and E episodes.
+    `values` are (S, E), by S channel seeds and E episodes, NaN where unknown; `name` is the
+    metric's.
     """
     means = known_mean(values, axis=0)
     rate = entry(name).interval == "rate"
@@ -1105,8 +1111,9 @@ def over_episodes(name: str, values: Floats) -> Estimate:
 def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float = LEVEL) -> Estimate:
     """Return the difference a - b of a metric with its interval over episodes.
 
-    `pairs` has a and b, (E, S) each: one pair, or of balanced success one for each half, in which
-    the episodes of the other half are NaN. The axes are S channel seeds and E episodes.
+    `pairs` has the metric's values a and b of the same episodes, (E, S) each, by E episodes and S
+    channel seeds: one pair, or of balanced success one for each half, with a danger and without, in
+    which the episodes of the other half are NaN. `level` is the confidence of the interval.
     """
     if entry(name).interval != "rate":
         ((a, b),) = pairs
@@ -1136,9 +1143,10 @@ def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False)
 
 
 def by_danger(success: Floats, dangerous: Bools) -> dict[str, Floats]:
-    """Return success (..., E) with a danger and without, by metric name; NaN in other episodes.
+    """Return success with a danger, and success without, by the metrics' names, (..., E) each.
 
-    `dangerous` is a mask (E,) of the E episodes with a danger.
+    `success` is (..., E), 1 or 0, of E episodes; `dangerous` is a mask (E,) of those with a danger.
+    NaN in the episodes of the other kind.
     """
     parts = (np.where(part, success, np.nan) for part in (dangerous, ~dangerous))
     return dict(zip(entry(BALANCED).halves, parts, strict=True))
@@ -1185,7 +1193,7 @@ def percentiles(latency_ms: Floats) -> Floats:
 
 
 def written(score: Score) -> str:
-    """Return a score with its interval as text, in the metric's unit but without its name."""
+    """Return a score and its interval as text, with the metric's unit but without its name."""
     return interval_of(score, entry(score.metric).unit)
 
 

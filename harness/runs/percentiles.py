@@ -26,8 +26,9 @@ def differences(
 ) -> Iterator[tuple[int, float, float, Estimate]]:
     """Yield for each of `PERCENTILES`: percent, value in A, value in B, and B - A with interval.
 
-    `a` and `b` have one entry for each seed, and a percentile is the mean over seeds. In a seed, an
-    episode without values in either run is left out. `episodes` is their number.
+    `a` and `b` have of each run, for each seed of the channel's draws, the index of each decision's
+    episode and its value; a percentile is the mean over seeds. In a seed, an episode without values
+    in either run is left out. `episodes` is the number of all episodes.
     """
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
     common = [_common(of_a, of_b) for of_a, of_b in zip(a, b, strict=True)]
@@ -43,9 +44,10 @@ def differences(
 
 
 def intervals(values: Floats, episodes: Sequence[str]) -> dict[int, tuple[float, float]]:
-    """Return the 95 % bootstrap interval of each of `PERCENTILES` of values (n,), by the percent.
+    """Return the 95 % bootstrap interval of each of `PERCENTILES` of n values, by the percent.
 
-    Episodes are resampled; `episodes` names that of each value. NaN if an interval is unbounded.
+    Whole episodes are resampled: `values` are (n,), and `episodes` names the episode of each. An
+    end is NaN if the data cannot bound it.
     """
     names, index = np.unique(episodes, return_inverse=True)
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), len(names), RESAMPLES)

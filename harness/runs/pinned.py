@@ -15,11 +15,12 @@ KIND = "episodes"  # of its intervals
 
 
 def mean_difference(pairs: Pairs) -> Estimate:
-    """Return the difference in success a - b, as figures of version 1 computed it.
+    """Return the mean over families of success a - b, by the rules of figures' version 1.
 
-    `pairs` holds for each family of scenes its success rule and a and b, (S, E) each. The interval
-    of each half of each family is computed apart, and these are combined. The axes are S channel
-    seeds and E episodes.
+    A family is the scenes of one scenario. `pairs` has for each its rule of how success is averaged
+    and the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes. The
+    interval of each half of a family, with a danger or without, is computed apart, and these are
+    combined. `harness.core.versions.FIGURES` has today's version.
     """
     families = []
     for success, a, b in pairs:
@@ -29,9 +30,10 @@ def mean_difference(pairs: Pairs) -> Estimate:
 
 
 def gain(run: Run, score: Score) -> Score:
-    """Return a run's gain over the condition without V2V, computed as figures of version 1 were.
+    """Return a run's gain over the condition without a radio, by the rules of figures' version 1.
 
-    `score` says which condition and metric.
+    `score` says of which condition, and of which metric. `harness.core.versions.FIGURES` has
+    today's version.
     """
     success, values = by_condition(run.grid, run.episodes)
     counted = success if score.metric == GAINS[BALANCED] else success.plain

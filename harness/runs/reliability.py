@@ -39,10 +39,10 @@ AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay
 
 
 def mass(p: Floats, optimal: Bools) -> Floats:
-    """Return the probability that policies p (..., A) over A actions give to optimal actions,
-    (...).
+    """Return the probability that policies give to all optimal actions together, (...).
 
-    `optimal` is a mask (..., A); NaN where no action is optimal.
+    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). NaN where no
+    action is optimal.
     """
     # rounding may lift it above 1
     total = np.minimum(np.sum(np.where(optimal, p, 0.0), axis=-1), 1.0)
@@ -50,9 +50,10 @@ def mass(p: Floats, optimal: Bools) -> Floats:
 
 
 def brier(p: Floats, optimal: Bools) -> Floats:
-    """Return the Brier score (Brier 1950) of taking any optimal action, (...), from p (..., A).
+    """Return the Brier score (Brier 1950) of policies: how far they are from optimal, (...).
 
-    `optimal` is a mask (..., A) over the A actions. With the probability m of the optimal actions
+    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). NaN where no
+    action is optimal. With the probability m of the optimal actions together
     it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst. It does not matter how m is spread over
     several optimal actions.
     """
@@ -60,19 +61,19 @@ def brier(p: Floats, optimal: Bools) -> Floats:
 
 
 def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
-    """Return -ln of the optimal actions' probability (Good 1952), (...), from p (..., A).
+    """Return -ln of the probability of the optimal actions together (Good 1952), (...).
 
-    `optimal` is a mask (..., A) over the A actions. A probability below `LEAST_P` counts as that,
-    so that it is 5.3 nats at most.
+    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). NaN where no
+    action is optimal. A probability below `LEAST_P` counts as that, so that it is 5.3 nats at most.
     """
     return np.asarray(-np.log(np.maximum(mass(p, optimal), LEAST_P)))
 
 
 def right(p: Floats, optimal: Bools) -> Floats:
-    """Return 1 where the likeliest action of p (..., A) is optimal, else 0, (...).
+    """Return 1 where the likeliest action of a policy is optimal, else 0, (...).
 
-    `optimal` is a mask (..., A) over the A actions. For equally likely actions it is the share that
-    is optimal; NaN where no action is.
+    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). For equally
+    likely actions it is the share that is optimal; NaN where no action is.
     """
     likeliest = p == p.max(axis=-1, keepdims=True)
     share = np.sum(likeliest & optimal, axis=-1) / np.maximum(likeliest.sum(axis=-1), 1)
@@ -81,22 +82,23 @@ def right(p: Floats, optimal: Bools) -> Floats:
 
 @dataclass(frozen=True)
 class Judged:
-    """Hold confidence and correctness of the n decisions with exactly one optimal action.
+    """Hold how sure and how right the n decisions with exactly one optimal action are.
 
-    `sure` is the probability of the likeliest action, `right` 1 if it is the optimal one (a share
-    if several are equally likely) and `episode` the index of its episode, (n,) each.
+    An action is optimal if success is still possible after it, where it is possible at all.
     """
 
-    sure: Floats  # the probability of the likeliest action, (n,)
-    right: Floats  # the share of the likeliest actions that is optimal, (n,)
-    episode: Ints  # the place of each decision's episode, from 0, (n,)
+    sure: Floats  # probability of each decision's likeliest action, (n,)
+    # 1 if that is the optimal one, else 0, (n,); if several are equally likely, the share of these
+    # that is optimal
+    right: Floats
+    episode: Ints  # index from 0 of each decision's episode among the run's, (n,)
 
     @classmethod
     def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
-        """Return the decisions of policies p (n, A) that have exactly one optimal action.
+        """Return those of n decisions that have exactly one optimal action.
 
-        `optimal` is a mask (n, A) over A actions, `episode` (n,) the index of each decision's
-        episode.
+        `p` are the decisions' policies, probabilities of A actions, (n, A), `optimal` is a mask,
+        (n, A), and `episode`, (n,), the index of each decision's episode.
         """
         hits = right(p, optimal)
         is_judged = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
@@ -112,7 +114,10 @@ class Judged:
         return cls(sure, hits, np.concatenate(episode))
 
     def bins(self) -> Ints:
-        """Return the confidence bin of each decision, (n,), as `calibration_error` has them."""
+        """Return the number from 0 of each decision's bin of alike sure ones, (n,).
+
+        The bins are those of `calibration_error`.
+        """
         levels, level = np.unique(-self.sure, return_inverse=True)
         return np.asarray(_bins(np.bincount(level, minlength=len(levels))[None])[0][level])
 
@@ -161,8 +166,9 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
     """Return a figure of judged decisions, such as `coverage`, with its bootstrap interval.
 
-    `episodes` is the number of all episodes. The figure is unknown, unless it is the number of
-    decisions, with fewer than `LEAST` of these or from fewer than `LEAST_EPISODES` episodes.
+    `figure` is one of the functions above; `episodes` is the number of all episodes. The figure is
+    unknown, unless it is the number of decisions, with fewer than `LEAST` of these or from fewer
+    than `LEAST_EPISODES` episodes.
     """
     return estimates(judged, [figure], episodes)[0]
 
@@ -172,7 +178,8 @@ def estimates(
 ) -> list[Estimate]:
     """Return several figures of the same decisions, as `estimate` does; they share resamples.
 
-    `older` selects the rules of version 1: any number of episodes is enough, and a figure whose
+    `older` selects the rules by which runs of figures' version 1 state them
+    (`harness.core.versions.FIGURES`): any number of episodes is enough, and a figure whose
     resamples are all alike has an interval of no width.
     """
     known_figures = [figure for figure in figures if _is_known(figure, judged, older)]

@@ -16,37 +16,50 @@ HELPER = "helper"
 
 
 class RoleAgents(ABC):
-    """Says by which settings of its extension a role has agents of its own, and which; frozen."""
+    """Say which agents answer for the vehicles of a role in place of the ego's; a base class.
 
-    chosen_by: ClassVar[tuple[str, ...]]  # these settings
+    An agent is a model, its prompt and how it answers (`harness.evaluate.agent.Agent`); a role is
+    what a vehicle is asked as, such as `helper`. Objects do not change.
+    """
+
+    chosen_by: ClassVar[tuple[str, ...]]  # names of the settings of its extension that choose them
 
     @abstractmethod
     def opened(self, settings: Any, ego: Any) -> tuple[Any, ...]:
-        """Return the role's agents by a run's `Settings`; none if the ego's `Agent` answers.
+        """Return the role's agents, each an `Agent`, which vehicles of the role take in turn.
 
-        Vehicles of the role take them in turn. Raises UserError for those that cannot be.
+        There are none if the ego's answers for all. `settings` are the run's, a
+        `harness.runs.settings.Settings`, and `ego` is the ego's agent. Raises UserError for agents
+        that cannot be.
         """
 
     @abstractmethod
     def settings(self, ego: Any, agents: Sequence[Any]) -> dict[str, Any]:
-        """Return the settings of `chosen_by` that open these agents beside the ego's, by name."""
+        """Return the values, by name, of the settings in `chosen_by` that open these agents.
+
+        `ego` is the ego's `Agent`, and `agents` are the role's.
+        """
 
     @abstractmethod
     def recorded(self, agents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """Return the settings that a run's records of agents state, values by name.
+        """Return the settings, values by name, that open the agents which a run states.
 
-        It may raise KeyError, TypeError, AttributeError or IndexError for what is no record.
+        `agents` are the run's records of them, as in `Manifest.helpers`. It may raise KeyError,
+        TypeError, AttributeError or IndexError for what is no record.
         """
 
     @abstractmethod
     def check(self, run: Any) -> None:
-        """Raise UserError if a run, a `Spec`, has agents that cannot answer for the role."""
+        """Raise UserError if a run has agents that cannot answer for the role.
+
+        `run` is a `harness.evaluate.spec.Spec`.
+        """
 
     @abstractmethod
     def unlike(self, run: Any) -> str | None:
-        """Return why the messages of a run's agents are none that its ego's prompt can show.
+        """Return why the ego's prompt cannot show the messages of a run's agents, or None.
 
-        None if it can show them.
+        `run` is a `harness.evaluate.spec.Spec`.
         """
 
 
@@ -54,7 +67,10 @@ AGENTS = Shipped[RoleAgents]("swarmdrive.agents", RoleAgents, {})
 
 
 def of_helpers() -> RoleAgents:
-    """Return who says which agents answer for the helpers. Raises UserError if it is gone."""
+    """Return the object that says which agents answer for helpers in place of the ego's.
+
+    Raises UserError if no installed extension adds one.
+    """
     if HELPER in AGENTS:
         return AGENTS[HELPER]
     owner = owner_of_plugin("agents", HELPER) or HELPER
@@ -62,22 +78,24 @@ def of_helpers() -> RoleAgents:
 
 
 def opened(settings: Any, ego: Any) -> tuple[Any, ...]:
-    """Return the helpers' agents by a run's `Settings`; none if the ego's `Agent` answers.
+    """Return the helpers' agents, which helpers take in turn; none if the ego's answers for all.
 
-    Raises UserError for those that cannot be.
+    An agent is a `harness.evaluate.agent.Agent`: a model, its prompt and how it answers. `settings`
+    are the run's, a `harness.runs.settings.Settings`, and `ego` is the ego's agent. Raises
+    UserError for agents that cannot be.
     """
     return AGENTS[HELPER].opened(settings, ego) if HELPER in AGENTS else ()
 
 
 def settings() -> tuple[str, ...]:
-    """Return the settings of extensions by which helpers have agents of their own, by name."""
+    """Return the names of the settings of extensions that give helpers agents of their own."""
     return AGENTS[HELPER].chosen_by if HELPER in AGENTS else ()
 
 
 def recorded(helpers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the settings of extensions that a run's records of helpers' agents state, by name.
+    """Return the settings of extensions, values by name, that open a run's agents of helpers.
 
-    There are none without records. Raises UserError if the extension is gone, and what
-    `RoleAgents.recorded` does.
+    `helpers` are the run's records of these agents (`Manifest.helpers`); there are no settings
+    without any. Raises UserError if the extension is gone, and what `RoleAgents.recorded` does.
     """
     return of_helpers().recorded(helpers) if helpers else {}

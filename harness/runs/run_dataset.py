@@ -77,7 +77,8 @@ def _holds(path: Path) -> bool:
 def check_scenes(run: Run, dataset: Dataset, some: Iterable[str] | None = None) -> None:
     """Raise UserError if a decision or answer of a run is of a scene that is not in its dataset.
 
-    With `some`, of the decisions only those in these scenes are checked.
+    `some` are ids of scenes (decision points), of which alone the decisions are checked; None
+    checks all.
     """
     decided = run.decisions.scenes
     scenes_by_file: dict[str, Iterable[str]] = {

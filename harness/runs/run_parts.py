@@ -44,7 +44,8 @@ def part_files(
 def write_part(out: Path, files: Mapping[str, bytes]) -> None:
     """Write the files of a part of a run to the folder `out`, which appears only when complete.
 
-    Its seal lies beside it, if this user can make one.
+    `files` has their content by name. A seal, by which a later run of this user knows its own
+    files, is written beside the folder if this user can make one.
     """
     write_seal(out, files)
     part = out.with_name(f".{out.name}.{os.getpid()}.part")
@@ -57,9 +58,10 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
 def read_part(
     part: Path, actions: Sequence[str]
 ) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:
-    """Return the decisions, episodes and answers (without texts) of a folder from `write_part`.
+    """Return the decisions, episodes and answers (without texts) of a part of a run.
 
-    Raises UserError if it is broken.
+    `part` is its folder, as `write_part` wrote it, and `actions` are the names of the meta-actions.
+    Raises UserError if a file is broken.
     """
     return whole(
         part,
@@ -92,16 +94,19 @@ def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[E
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
-    """Return the decisions of all parts of a run, as files that are read one at a time."""
+    """Return the decisions of all parts of a run, as files that are read one at a time.
+
+    `parts` are the parts' folders, and `actions` the names of the meta-actions.
+    """
     return DecisionFiles([part / "decisions.parquet" for part in parts], tuple(actions))
 
 
 def answers_in(part: Path) -> int:
-    """Return the number of answers in a part's folder."""
+    """Return the number of answers in the folder of a part of a run."""
     return bytes_of(part / "answers.jsonl", "rows").count(b"\n")
 
 
 def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
-    """Yield the content of each part's `answers.jsonl`, in order."""
+    """Yield the content of `answers.jsonl` of each part of a run, in the order of their folders."""
     for part in parts:
         yield bytes_of(part / "answers.jsonl", "rows")

@@ -24,7 +24,8 @@ PROMPTS = "prompts"
 def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
     """Write the files that a run was made of to the folder `sources` in the run's folder `out`.
 
-    `files` is by path within it. They replace what is there at once, by way of the folder `work`.
+    `files` has their content by path within that folder. They replace what is there at once:
+    written first to the folder `work`, which is then renamed.
     """
     if read(out) == files:
         return

@@ -31,9 +31,11 @@ class InterimLooks:
 
 
 class StoppingRule(ABC):
-    """Says when a run has enough layouts, which come in a fixed order; frozen.
+    """Say when a run has enough layouts, so that it may stop; a base class.
 
-    The object that is registered has opened no files: it makes those that have (`opened`), and
+    A layout is one start situation of a scenario, with one episode; layouts come in a fixed order.
+    At an interim look, after some of them, the rule says whether these are enough. Objects do not
+    change. The one that is registered has opened no files: it makes those that have (`opened`), and
     reads what runs state.
     """
 
@@ -54,27 +56,31 @@ class StoppingRule(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """Return the settings of `chosen_by` that choose this rule, values by name."""
+        """Return the values, by name, of the settings in `chosen_by` that choose this rule."""
 
     @abstractmethod
     def check(self, run: Any) -> None:
-        """Raise UserError if a run, a `Spec`, cannot be stopped by this rule."""
+        """Raise UserError if this rule cannot stop a run, a `harness.evaluate.spec.Spec`."""
 
     @abstractmethod
     def planned_looks(self, layouts: int) -> Sequence[int]:
-        """Return after how many of a run's layouts it looks, ascending; the last is all."""
+        """Return after how many of a run's `layouts` the rule looks, ascending; the last is all."""
 
     @abstractmethod
     def enough(self, grid: "Grid", episodes: "Sequence[Episode]") -> bool:
-        """Return whether a run may stop, by the episodes so far, in the order of the grid."""
+        """Return whether a run may stop, by its episodes so far.
+
+        `grid` has the conditions, seeds and layouts so far; `episodes` are in its order: by
+        condition, seed and layout.
+        """
 
     @abstractmethod
     def record(self, looks: InterimLooks) -> dict[str, Any]:
-        """Return what a run states of this rule and of its looks, as plain values."""
+        """Return what a run's manifest states of this rule and of the looks, as plain values."""
 
     @abstractmethod
     def looks(self, record: Mapping[str, Any]) -> InterimLooks:
-        """Return the looks of a run that has ended, as it states them.
+        """Return the looks of a run that has ended, given what its manifest states (`record`).
 
         Raises ValueError if it states none that can be.
         """
@@ -83,9 +89,10 @@ class StoppingRule(ABC):
     def contradictions(
         self, record: Mapping[str, Any], grid: "Grid", episodes: "Sequence[Episode]"
     ) -> Iterator[str]:
-        """Yield what a run states of its last look, and its episodes contradict.
+        """Yield a sentence on each statement of a run's last look that its episodes contradict.
 
-        `episodes` are all of the run, in the order of the grid.
+        `record` is what its manifest states; `episodes` are all of the run, in the order of the
+        grid: by condition, seed and layout.
         """
 
     def unchecked(self, record: Mapping[str, Any]) -> str | None:
@@ -94,20 +101,24 @@ class StoppingRule(ABC):
 
     @abstractmethod
     def sentence(self, record: Mapping[str, Any]) -> str:
-        """Return when a run that states this was looked at, and which of its intervals hold."""
+        """Return a sentence on when a run was looked at, and which of its intervals hold.
+
+        `record` is what its manifest states.
+        """
 
     @abstractmethod
     def scores(self, grid: "Grid", episodes: "Sequence[Episode]") -> "Iterator[Score]":
         """Yield the further scores of a run that may stop, by intervals that hold at every look.
 
-        `episodes` are in the order of the grid.
+        `episodes` are in the order of the grid: by condition, seed and layout.
         """
 
     @abstractmethod
     def difference(self, success: "Success", a: "Floats", b: "Floats") -> "Estimate":
-        """Return success a - b, both (S, E), by an interval that holds at every look.
+        """Return the difference in success a - b, with an interval that holds at every look.
 
-        The axes are S channel seeds and E episodes, by which it is paired.
+        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes,
+        and are paired by episode. `success` says how episodes are averaged.
         """
 
 
@@ -138,7 +149,7 @@ STOPPING_RULES = Shipped[StoppingRule]("swarmdrive.stopping_rules", StoppingRule
 
 
 def chosen(settings: Mapping[str, Any]) -> StoppingRule | None:
-    """Return the rule that a run's settings of extensions choose; None for a run of all layouts."""
+    """Return the stopping rule that a run's settings of extensions choose; None if it has none."""
     for each in STOPPING_RULES.values():
         if opened := each.opened(settings):
             return opened
@@ -146,15 +157,16 @@ def chosen(settings: Mapping[str, Any]) -> StoppingRule | None:
 
 
 def without(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings of extensions without those that choose a rule."""
+    """Return settings of extensions, values by name, without those that choose a stopping rule."""
     choosing = {name for each in STOPPING_RULES.values() for name in each.chosen_by}
     return {name: value for name, value in settings.items() if name not in choosing}
 
 
 def rule_of(record: Any) -> StoppingRule | None:
-    """Return what reads the looks that a run states of its scenes; None for a run without looks.
+    """Return the stopping rule by which a run was looked at; None for a run without looks.
 
-    Raises UserError if its extension is gone.
+    `record` is what the run's manifest states of them. Raises UserError if the rule's extension is
+    not installed.
     """
     if record is None:
         return None

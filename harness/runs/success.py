@@ -32,14 +32,18 @@ Setting = TypeVar("Setting")
 class Success:
     """Define how success of E episodes is averaged: plainly, or balanced over danger and none.
 
-    Balanced success is the mean of the rates with and without a danger.
+    A danger is a vehicle that would meet an ego which keeps its speed. Balanced success is the mean
+    of two shares: of the successes among episodes with one, and among those without.
     """
 
-    dangerous: Bools  # which of them have a danger, (E,)
+    dangerous: Bools  # whether each episode has a danger, (E,); all false for a plain mean
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], headline_metric: str) -> "Success":
-        """Return the rule for these episodes, one record of each, with this headline metric."""
+        """Return the rule for E episodes, given one record of each and the metric's name.
+
+        `headline_metric` is plain or balanced success.
+        """
         return cls(
             np.array(
                 [headline_metric == BALANCED and episode.danger != "none" for episode in episodes]
@@ -67,41 +71,42 @@ class Success:
         return (self.plain, self) if self.metric == BALANCED else (self,)
 
     def mean(self, success: Floats) -> float:
-        """Return mean success of values (S, E), plain or balanced as this rule says.
+        """Return the mean of success, plain or balanced as this rule says.
 
-        The axes are S channel seeds and E episodes.
+        `success` is 1 or 0 (NaN where unknown), (S, E), by S channel seeds and E episodes.
         """
         return float(
             np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self.parts])
         )
 
     def estimate(self, success: Floats) -> Estimate:
-        """Return mean success of values (S, E) with its 95 % interval over episodes.
+        """Return the mean of success with its 95 % interval over episodes.
 
-        The axes are S channel seeds and E episodes.
+        `success` is 1 or 0 (NaN where unknown), (S, E), by S channel seeds and E episodes.
         """
         return self._mean(lambda part: over_episodes(SUCCESS, success[:, part]))
 
     def difference(self, a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
-        """Return the difference in success a - b, both (S, E), paired by episode, with interval.
+        """Return the difference in mean success a - b, with an interval of confidence `level`.
 
-        `level` is the confidence of the interval. The axes are S channel seeds and E episodes.
+        `a` and `b` are the success of the same episodes, such as under two conditions, (S, E), by S
+        channel seeds and E episodes. They are paired by episode.
         """
         return mean_difference([(self, a, b)], level)
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
-        """Return the p-value of no difference between a and b, (S, E); None without an interval.
+        """Return the p-value of no difference in success; None if that has no interval.
 
-        The axes are S channel seeds and E episodes.
+        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes.
         """
         return p_of_mean([(self, a, b)])
 
     def most(self, successes: Mapping[str, Floats]) -> list[str]:
         """Return the name with the highest success, then those not significantly below it.
 
-        `successes` has values (S, E) by name. These are names whose paired difference from the best
-        has a p above `LEVEL`, by Holm's method for all pairs since the best was picked, or that
-        have no p. The axes are S channel seeds and E episodes.
+        `successes` has by name the success of the same episodes, (S, E), by S channel seeds and E
+        episodes. Not below it are names whose paired difference from the best has a p above
+        `LEVEL`, by Holm's method for all pairs since the best was picked, or that have no p.
         """
         best = max(successes, key=lambda name: self.mean(successes[name]))
         rest = [name for name in successes if name != best]
@@ -112,10 +117,10 @@ class Success:
         return [best, *close]
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
-        """Return the variance of success b - a, both (S, E), over episodes.
+        """Return how much the difference in success b - a varies between episodes.
 
-        `counts` (..., E) says how often each episode counts in a bootstrap resample. The axes are S
-        channel seeds and E episodes.
+        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes.
+        `counts` (..., E) says how often each episode counts in a bootstrap resample.
         """
         differences, parts = known_mean(b - a, 0), self.parts
         variances = [variance(differences[part], counts[..., part]) for part in parts]
@@ -158,10 +163,10 @@ class Success:
 def by_condition(
     grid: Grid, episodes: Sequence[Episode], headline_metric: str = BALANCED
 ) -> tuple[Success, dict[str, Floats]]:
-    """Return the success rule of a run's episodes, and their success (S, E) by condition.
+    """Return how success of a run's episodes is averaged, and their success by condition, (S, E).
 
-    The rule says how episodes are averaged. `episodes` are in the order of the grid;
-    `headline_metric` is plain or balanced success. The axes are S channel seeds and E episodes.
+    Success is 1 or 0, by S channel seeds and E episodes. `episodes` are in the order of the grid:
+    by condition, seed and number; `headline_metric` is plain or balanced success.
     """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
     return Success.of(episodes[: len(grid.episodes)], headline_metric), values
@@ -181,10 +186,12 @@ Pairs = Sequence[tuple[Success, Floats, Floats]]
 class Plays(Generic[Setting]):
     """Hold the success of the same episodes under several settings, by family of scenes.
 
-    A setting is what is compared, such as a condition's name.
+    A setting is what is compared, such as a condition's name; a family is the scenes of one
+    scenario.
     """
 
-    # of each family: how success counts, and success by setting, (S, E)
+    # for each family how its success is averaged, and by setting the success of its episodes, 1 or
+    # 0, (S, E), by S channel seeds and E episodes
     families: Sequence[tuple[Success, Mapping[Setting, Floats]]]
 
     @property
@@ -193,9 +200,10 @@ class Plays(Generic[Setting]):
         return Plays([(rule.plain, success) for rule, success in self.families])
 
     def pairs(self, setting: Setting, base: Setting) -> Pairs:
-        """Return for each family its success rule and success (S, E) of `setting` and of `base`.
+        """Return for each family how its success is averaged, and that of two settings, (S, E).
 
-        The axes are S channel seeds and E episodes.
+        The success of `setting` comes first, then that of `base`, by S channel seeds and E
+        episodes.
         """
         return [(rule, success[setting], success[base]) for rule, success in self.families]
 
@@ -205,10 +213,11 @@ class Plays(Generic[Setting]):
 
 
 def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
-    """Return the mean over families of success a - b, both (S, E), paired by episode.
+    """Return the mean over families of the difference in success a - b, paired by episode.
 
-    `pairs` has for each family of scenes its success rule, a and b; the axes are S channel seeds
-    and E episodes. The interval, of confidence `level`, treats all families' episodes together.
+    A family is the scenes of one scenario. `pairs` has for each how its success is averaged, and
+    the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes. The
+    interval, of confidence `level`, treats all families' episodes together.
     """
     parts = []
     for success, a, b in pairs:
@@ -235,6 +244,9 @@ def p_of_mean(pairs: Pairs) -> float | None:
 
 
 def alike(successes: Sequence[Success]) -> list[Success]:
-    """Return rules that all average in one way: balanced only if every given rule is."""
+    """Return the rules of several families, so that all average success in one way.
+
+    They are balanced if every given rule is, and else plain.
+    """
     balanced = all(success.metric == BALANCED for success in successes)
     return [success if balanced else success.plain for success in successes]

@@ -43,9 +43,10 @@ class Contents(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class SuiteRun:
-    """Hold the finished runs of one model on all families of a suite (one scenario each).
+    """Hold the finished runs of one model on all families of a suite.
 
-    They have the same conditions and seeds.
+    A family is the scenes of one scenario, as one dataset. The runs have the same conditions and
+    seeds.
     """
 
     path: Path  # the folder that holds the runs' folders
@@ -87,7 +88,10 @@ class SuiteRun:
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        """Return the means over families of all scores with intervals over episodes or answers."""
+        """Return the means over families of scores with intervals over episodes or answers.
+
+        A family is the scenes of one scenario.
+        """
         return tuple(self._means())
 
     @cached_property
@@ -127,15 +131,18 @@ class SuiteRun:
 
 
 def plays(runs: Iterable[Run], headline_metric: str) -> Plays[str]:
-    """Return success by condition of runs, each on another family of scenes, to be compared.
+    """Return the success of episodes by condition in runs that are each on another family.
 
-    `headline_metric` is plain or balanced success.
+    A family is the scenes of one scenario. `headline_metric` is plain or balanced success.
     """
     return Plays([by_condition(run.grid, run.episodes, headline_metric) for run in runs])
 
 
 def mean(scores: Sequence[Score]) -> Score:
-    """Return the mean of one metric's scores of several families, with its interval."""
+    """Return the mean of one metric's scores, one of each of several families, with its interval.
+
+    A family is the scenes of one scenario.
+    """
     first = scores[0]
     return Score.of(
         first.condition, first.metric, mean_of([s.estimate for s in scores]), first.interval

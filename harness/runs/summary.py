@@ -52,18 +52,21 @@ from harness.runs.reliability import Judged, estimates
 class Figures:
     """Hold all that a run's scores are computed from, for some of its episodes.
 
-    `values` has each metric's values by episode, (C, S, E), for C conditions, S channel seeds and E
-    episodes; `latency_ms` the decisions' latencies for each condition and seed; `judged` the
-    decisions with exactly one optimal action for each condition; and `answers` each answer with its
-    episode.
+    An episode is played under C conditions, operating points of the run, and with S seeds of the
+    channel's draws.
     """
 
-    grid: Grid  # the episodes
-    values: Mapping[str, Floats]  # each metric's values by episode, (C, S, E)
-    # the decisions' latencies for each condition and seed, in the order of the grid
+    grid: Grid  # the conditions, seeds and episodes
+    # values of each metric by its name, (C, S, E) for E episodes; NaN where unknown
+    values: Mapping[str, Floats]
+    # latencies of all decisions, ms, an array (n,) for each condition and seed in the order of the
+    # grid: all seeds of the first condition, then of the second
     latency_ms: Sequence[Floats]
-    judged: Sequence[Judged]  # the decisions with exactly one optimal action, for each condition
-    answers: Sequence[tuple[Answer | AnswerFacts, int]]  # the answers, each with its episode
+    # for each condition its decisions with exactly one optimal action: their probability of the
+    # likeliest action, and whether that was right
+    judged: Sequence[Judged]
+    # the answers, each with the number of its episode
+    answers: Sequence[tuple[Answer | AnswerFacts, int]]
 
     @classmethod
     def of(
@@ -74,7 +77,10 @@ class Figures:
         episodes: Sequence[Episode],
         answers: Iterable[Answer | AnswerFacts],
     ) -> "Figures":
-        """Compute the figures of a run; `episodes` are in the order of the grid."""
+        """Compute the figures of a run in a world, `frozen` or `closed-loop`.
+
+        `episodes` are in the order of the grid: by condition, seed and number.
+        """
         cells, latency_ms = grid.places(decisions), decisions["latency_ms"]
         places = cells // len(grid.episodes)
         order = np.argsort(places, kind="stable")
@@ -110,7 +116,12 @@ class Figures:
         )
 
     def scores(self, older: bool = False) -> list[Score]:
-        """Return the scores of all metrics; with `older`, calibration by the rules of version 1."""
+        """Return the scores of all metrics, each with its intervals, as lines of `summary.csv`.
+
+        `older` computes figures of calibration (how sure policies are, and how often right) as a
+        run of figures' version 1 states them (`harness.core.versions.FIGURES`): from any number of
+        episodes, and of an interval without width where all resamples are alike.
+        """
         names = known_in(self.values)
         return [
             *of_conditions(self.grid.conditions, self.values, names),
@@ -126,10 +137,10 @@ class Figures:
 def of_conditions(
     conditions: Sequence[str], values: Mapping[str, Floats], names: Sequence[str]
 ) -> Iterator[Score]:
-    """Yield the scores of the metrics `names` in each condition, from their values (C, S, E).
+    """Yield the scores of the metrics `names` in each of C conditions.
 
-    Each has a score with an interval over seeds, and one with an interval over episodes. The axes
-    are C conditions, S channel seeds and E episodes.
+    `values` has each metric's values by its name, (C, S, E), over S channel seeds and E episodes. A
+    metric has one score with an interval over seeds, and one with an interval over episodes.
     """
     for index, condition in enumerate(conditions):
 
@@ -162,7 +173,9 @@ def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
 def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
     """Return for each condition its decisions with exactly one optimal action.
 
-    `cells` (n,) is the index of each decision's episode in the grid (`Grid.places`).
+    An action is optimal if success is still possible after it, where it is possible at all. `cells`
+    (n,) is the flat index of each decision's condition, seed and episode in the grid
+    (`Grid.places`).
     """
     fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
     condition, _, episode = np.unravel_index(cells, grid.shape)

@@ -63,9 +63,10 @@ class Tables:
 
     @cached_property
     def agents(self) -> "pd.DataFrame":
-        """Return one row for each deciding vehicle of an episode: `journeys` of `episodes.csv`.
+        """Return one row for each agent of an episode: the column `journeys` of `episodes.csv`.
 
-        It is empty where only the ego decides. `gave_way` says whether it lost the most time.
+        An agent is a vehicle that decides for itself; there is no row where only the ego does. The
+        column `gave_way` says whether it lost the most time.
         """
         import pandas as pd
 
@@ -135,9 +136,10 @@ class Tables:
 
 
 def tables_of(run: Path, kind: type[T]) -> T:
-    """Load a run from its folder as tables of the class `kind`.
+    """Load a run from its folder as pandas tables, an object of the class `kind`.
 
-    Raises UserError if it holds no finished run, or one of another format version.
+    `kind` is `Tables` or a subclass. Raises UserError if the folder holds no finished run, or one
+    of another format version.
     """
     source = read(run)
     return kind(run, msgspec.json.decode(msgspec.json.encode(source.manifest.as_file())), source)

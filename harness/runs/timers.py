@@ -21,14 +21,16 @@ if TYPE_CHECKING:
 
 
 class Timer(ABC):
-    """Times each answer of a run, and says what its decisions cost; frozen.
+    """Time each answer of a run by itself, as from a device's tokens a second; a base class.
 
-    The object that is registered has opened no files: it makes those that have (`opened`,
-    `recorded`), and reads speeds.
+    Without a timer all answers of a role take one time, which `--latency` states. A timer also says
+    how many joules decisions take. Objects do not change. The one that is registered has opened no
+    files: it makes those that have (`opened`, `recorded`), and reads speeds. A speed is how fast an
+    agent, a model with its prompt, answers: an object of the timer's own.
     """
 
-    option: ClassVar[str]  # what is typed to choose it
-    chosen_by: ClassVar[tuple[str, ...]]  # the settings of its extension that choose it
+    option: ClassVar[str]  # what is typed to choose it, such as the name of an option
+    chosen_by: ClassVar[tuple[str, ...]]  # names of the settings of its extension that choose it
     how: ClassVar[str]  # where its times come from, for people
     # the columns that it adds to a decision, each with the one behind which it stands: numbers,
     # null where unknown, in a file only where some are known
@@ -47,29 +49,39 @@ class Timer(ABC):
 
     @abstractmethod
     def speed(self, stated_speed: Any) -> Any:
-        """Return how fast an agent answers, as a run states it. Raises ValueError for no speed."""
+        """Return the speed that a run's record states, in plain values, as an object.
+
+        Raises ValueError if it is none.
+        """
 
     @abstractmethod
     def speeds(self, models: Sequence[str]) -> tuple[Any, ...]:
-        """Return how fast the models of a run's agents answer, by name, the ego's first.
+        """Return the speed of each of a run's agents, given the names of their models' cards.
 
-        Raises UserError for a model that it cannot time.
+        Both have the ego's first. Raises UserError for a model that it cannot time.
         """
 
     @abstractmethod
     def changed(self) -> str | None:
-        """Return what of it, as a run states it, is otherwise here; None if nothing is."""
+        """Return what differs here from what the run stated of this timer; None if nothing does.
+
+        Such is a file of rates that has changed since.
+        """
 
     @abstractmethod
     def answer_s(self, speed: Any, answer: "Answer") -> float:
-        """Return the seconds of one answer, a repair turn included; NaN if the engine failed.
+        """Return the seconds that an answer takes at a speed; NaN if the engine failed.
 
-        Raises UserError if the answer does not say enough.
+        A repair turn, a second question after a failed answer, is included. Raises UserError if the
+        answer does not say enough, such as its number of tokens.
         """
 
     @abstractmethod
     def check(self, run: Any) -> None:
-        """Raise UserError if a run, a `Spec`, has other settings that do not go with this timer."""
+        """Raise UserError if a run has settings that do not go with this timer.
+
+        `run` is a `harness.evaluate.spec.Spec`.
+        """
 
     @abstractmethod
     def obstacle(self, point: "OperatingPoint") -> str | None:
@@ -77,7 +89,11 @@ class Timer(ABC):
 
     @abstractmethod
     def latency(self, agents: Sequence[Any]) -> "Latency":
-        """Return the latency of a run with these agents, the ego's first."""
+        """Return the record of a run's latency: that this timer times it, and each agent's speed.
+
+        `agents` are those of the run, each a `harness.evaluate.agent.Agent`: a model, its prompt
+        and how it answers. The ego's is first.
+        """
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
@@ -85,9 +101,9 @@ class Timer(ABC):
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return what a run states of this timer beside its settings, as plain values.
+        """Return what a run's record states of this timer, as plain values by name of a setting.
 
-        It has by setting the content of what the setting opened, or else its value.
+        A value is the content of the file that the setting names, or else the setting's own value.
         """
 
     @abstractmethod
@@ -98,10 +114,11 @@ class Timer(ABC):
     def columns(
         self, latency: "Latency", decided: Sequence[Any], answers: Mapping[str, "Answer"]
     ) -> dict[str, Floats]:
-        """Return the columns that this timer `adds` to n decisions, in their order, (n,) each.
+        """Return the columns that this timer adds to n decisions, by name, (n,) each.
 
-        `decided` has the decisions in parts, `answers` the answers by request id, and `latency` is
-        the run's.
+        `decided` has the decisions, in order, in parts of one condition each (`Decided` of
+        `harness.evaluate.walk`). `answers` has the run's answers by id of their request, and
+        `latency` is the run's.
         """
 
     @abstractmethod
@@ -114,15 +131,18 @@ class Timer(ABC):
     ) -> Floats:
         """Return the joules of each vehicle's answer in n scenes, (n, 1+H), NaN if unknown.
 
-        The ego comes first, then the H helpers. `answers` has the run's by request id.
+        The ego comes first, then the H helpers. `latency` is the run's and `point` the condition;
+        `scenes` are `harness.dataset.load.Scene`, and `answers` has the run's answers by id of
+        their request.
         """
 
     @abstractmethod
     def energy_j(self, point: "OperatingPoint", heard: "Exchange", joules: Floats) -> Floats:
-        """Return the joules of n decisions, (n,), without those of a fusion call.
+        """Return the joules of n decisions, (n,): of the answers that were made, and of the radio.
 
-        `joules` are those of the answers, (n, 1+H), the ego's and H helpers'; `heard` is what was
-        sent.
+        Those of a fusion call, a second question to the ego's model, are left out. `joules` are of
+        each vehicle's answer, (n, 1+H), the ego's first; `heard` says which helpers answered, and
+        what was sent.
         """
 
 
@@ -130,7 +150,7 @@ TIMERS = Shipped[Timer]("swarmdrive.timers", Timer, {})
 
 
 def timer(source: str) -> Timer:
-    """Return what times answers, by the source of a latency.
+    """Return the timer of a name, the `source` that a run's latency states.
 
     Raises ValueError if there is none of this name, and UserError if its extension is gone.
     """
@@ -142,7 +162,10 @@ def timer(source: str) -> Timer:
 
 
 def chosen(settings: Mapping[str, Any]) -> Timer | None:
-    """Return what a run's settings of extensions choose to time answers; None for `--latency`."""
+    """Return the timer that a run's settings of extensions choose; None for `--latency`.
+
+    `settings` are values by name.
+    """
     for each in TIMERS.values():
         if opened := each.opened(settings):
             return opened
@@ -150,7 +173,7 @@ def chosen(settings: Mapping[str, Any]) -> Timer | None:
 
 
 def options() -> list[str]:
-    """Return what is typed to choose each timer."""
+    """Return what is typed on the command line to choose each timer."""
     return [each.option for each in TIMERS.values()]
 
 

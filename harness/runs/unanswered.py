@@ -23,10 +23,12 @@ _WHO: dict[Role, str] = {
 class Tally:
     """Count a run's requests by role, and those that got an error instead of an answer.
 
+    A role is who is asked, and what: `ego`, `helper` or `merge`, a fusion call.
+
     Attributes:
         asked: number of requests by role.
         unanswered: number of requests without an answer by role.
-        words: number of times that each error message came.
+        words: number of times that each error message came, by its text.
     """
 
     def __init__(self, answers: Iterable[Answer | AnswerFacts] = ()) -> None:
@@ -78,9 +80,9 @@ class Tally:
 
 
 def tally(run: Run) -> Tally:
-    """Return the counts of a finished run's requests and errors.
+    """Return how many requests of a finished run got an answer, and how many an error.
 
-    They are empty, and the answers unread, if the manifest states no errors.
+    Nothing is counted, and no answer read, if the run's manifest states no errors.
     """
     return Tally(run.answers if run.manifest.engine_errors else ())
 

@@ -19,18 +19,15 @@ from harness.runs.formats import LOOKS
 
 @dataclass(frozen=True)
 class Extent:
-    """Hold how far an unfinished run is, as `extent` reads it.
-
-    `going` is whether a process works on it, `done` the finished episodes of `due`, which is None
-    for a shard. `early` says that the run may stop before; `answers` counts those of unfinished
-    episodes.
-    """
+    """Hold how far an unfinished run is, as `extent` reads it from its folder."""
 
     going: bool  # whether a process works on it now
-    done: int  # episodes that are at their end in all conditions and seeds
-    due: int | None  # how many the run has; None for a shard, which has some of them
+    done: int  # number of episodes that are at their end in all conditions and seeds
+    # number of episodes that the run has; None for a shard, one of several parts of a run that are
+    # made apart
+    due: int | None
     early: bool  # whether the run may stop before, once it has seen enough
-    answers: int  # answers that are kept for the episodes which are not at their end
+    answers: int  # number of answers that are kept for the episodes which are not at their end
 
 
 def extent(run: Path) -> Extent:

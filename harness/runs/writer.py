@@ -43,12 +43,12 @@ def write(
 
     Args:
         out: the run's folder.
-        manifest: for `run.json`.
-        decisions: for `decisions.parquet`, already rounded.
-        episodes: for `episodes.csv`.
-        answers: pieces of the content of `answers.jsonl`.
-        scores: for `summary.csv`.
-        layouts: for `difficulty.csv`, which is not written without any.
+        manifest: the run's settings and origin, for `run.json`.
+        decisions: the rows of `decisions.parquet`, already rounded.
+        episodes: the rows of `episodes.csv`.
+        answers: pieces of the content of `answers.jsonl`, in order.
+        scores: the rows of `summary.csv`.
+        layouts: the rows of `difficulty.csv`, which is not written without any.
     """
     with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
         file.writelines(answers)
