@@ -39,22 +39,19 @@ KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool
 
 @dataclass(frozen=True)
 class Table:
-    """Describe a Parquet table of a published dataset: its source, size and reference results.
+    """Describe a Parquet table of a published dataset: its source, size and reference results."""
 
-    `lag_s` is from the moment of a decision to its action, and `rows` counts decision points;
-    `references` has the success of each policy that needs no model, over layouts.
-    """
-
-    manifest: Manifest  # of the frozen dataset
-    dataset_sha256: str  # digest of the frozen dataset's manifest
+    manifest: Manifest  # manifest of the dataset that it was made of
+    dataset_sha256: str  # digest of that manifest
     title: str  # its scenario, for people
-    lag_s: float  # from the moment of a decision to its action
+    lag_s: float  # seconds from the moment of a decision to its action
     released: bool  # whether it is one of the harness's own
     prompt: str  # the prompt version that its chats are of
-    rows: int  # its decision points
+    rows: int  # number of its decision points, one a row
     sha256: str  # digest of its Parquet file
     bytes: int  # size of that file
-    references: Mapping[str, Estimate]  # success of the policies that need no model, over layouts
+    # success of each policy that needs no model, by name: the mean over layouts, start situations
+    references: Mapping[str, Estimate]
 
     @property
     def name(self) -> str:

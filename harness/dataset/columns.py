@@ -12,13 +12,13 @@ TEXTS, NUMBERS, FLAGS = pa.list_(TEXT), pa.list_(pa.float64()), pa.list_(pa.bool
 class Column(NamedTuple):
     """Describe one column of a published table; a row is a decision point.
 
-    `kind` is its type in Arrow, and `meaning` one line with units. A list has an entry for each of
-    `viewers` or for each of `actions`, in their order.
+    A value that is a list has an entry for each of the row's `viewers` (the vehicles that are
+    asked) or for each of its `actions`, in their order.
     """
 
     name: str  # its name in the table
     kind: pa.DataType  # its type in Arrow
-    meaning: str  # one line, with units
+    meaning: str  # its meaning in one line, with units
 
 
 COLUMNS = (

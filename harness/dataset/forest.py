@@ -32,31 +32,32 @@ from harness.world.parameters import Parameters
 
 @dataclass(frozen=True)
 class Forest:
-    """Hold E decision trees with N decision points and A actions as arrays, and derive values.
+    """Hold the decision trees of a dataset as arrays, and derive what actions are worth.
 
-    Decision points are numbered tree by tree, and within a tree by step. An edge is what one or
+    A decision tree has every decision point that decisions can lead to from a layout, the start
+    situation of an episode. There are E trees with N decision points in all and A actions. Decision
+    points are numbered from 0 tree by tree, and within a tree by step. An edge is what one or
     several equivalent actions do at a decision point: it leads to another one or ends the episode.
-    `child`, (N, A), is the decision point after each action, -1 if the episode ends; `edge`, (N,
-    A), the index in `edges`; `root`, (E,), each tree's first point; `drivers` the action that each
-    reference driver takes, (N,); and `allowance_s`, (E,), the needless delay that still is a
-    success.
     """
 
-    actions: tuple[str, ...]  # the meta-actions
-    allowance_s: Floats  # needless delay that an episode of each tree may have, (E,)
-    time_limit_s: float  # when every episode ends
-    episodes: Ints  # the episode's number of each tree, (E,)
-    seeds: Ints  # the layout seed of each tree, (E,)
-    # the sector from which each tree's danger comes; None without one
+    actions: tuple[str, ...]  # names of the A meta-actions
+    # seconds of needless delay with which an episode of each tree is a success, (E,)
+    allowance_s: Floats
+    time_limit_s: float  # seconds after which every episode ends
+    episodes: Ints  # number of each tree's episode, (E,)
+    seeds: Ints  # layout seed of each tree, (E,)
+    # the sector from which each tree's danger comes, E of them; None without one
     dangers: tuple[str | None, ...]
-    root: Ints  # the first decision point of each tree, (E,)
-    ids: tuple[str, ...]  # the ids of the decision points
-    tree: Ints  # the tree of each decision point, (N,)
-    step: Ints  # the step of each decision point, (N,)
-    child: Ints  # the decision point to which an action leads, (N, A); -1 if the episode ends
-    edge: Ints  # the edge that an action takes, (N, A)
+    root: Ints  # number of each tree's first decision point, (E,)
+    ids: tuple[str, ...]  # scene ids of the N decision points
+    tree: Ints  # index from 0 of each decision point's tree, (N,)
+    step: Ints  # number from 0 of the decision in its episode at each decision point, (N,)
+    # number of the decision point to which each action leads, (N, A); -1 if the episode ends
+    child: Ints
+    edge: Ints  # index in `edges` of the edge that each action takes, (N, A)
     edges: tuple[Edge, ...]  # the edges of all trees
-    drivers: Mapping[str, Ints]  # the index of each reference driver's action, (N,)
+    # by name of a reference driver the index of the action that it takes at each point, (N,)
+    drivers: Mapping[str, Ints]
 
     @classmethod
     def of(
@@ -107,12 +108,12 @@ class Forest:
 
     @cached_property
     def place(self) -> Mapping[str, int]:
-        """Index of each decision point by its scene id."""
+        """Return the number of each decision point by its scene id."""
         return {name: n for n, name in enumerate(self.ids)}
 
     @cached_property
     def cleared_s(self) -> Floats:
-        """Time (s) at which each edge reaches the goal, (edges,).
+        """Return the time (s) at which each edge reaches the goal, (edges,).
 
         inf if it ends otherwise or leads to another decision point.
         """
@@ -124,13 +125,13 @@ class Forest:
 
     @cached_property
     def harms(self) -> Bools:
-        """Whether each edge ends the episode in a collision or off the road, (edges,)."""
+        """Return whether each edge ends in a collision or off the road, (edges,)."""
         ends = [edge.end for edge in self.edges]
         return np.array([end is not None and RATINGS[end.result] == "unsafe" for end in ends])
 
     @cached_property
     def conflicts(self) -> Mapping[str, Floats]:
-        """Least time to collision and post-encroachment time on each edge, each (edges,).
+        """Return the least time to collision and post-encroachment time (s) of edges, (edges,).
 
         The names are those of `conflict_measures.columns`.
         """
@@ -146,7 +147,7 @@ class Forest:
 
     @cached_property
     def earliest_s(self) -> Floats:
-        """Earliest time (s) at which the goal can be reached after each action, (N, A), or inf."""
+        """Return the earliest time (s) at the goal after each action, (N, A); inf if never."""
         earliest_s = self.cleared_s[self.edge]
         for rows in self._levels_backwards():
             has_child = self.child[rows] >= 0
@@ -156,7 +157,10 @@ class Forest:
 
     @cached_property
     def avoids_harm(self) -> Bools:
-        """Whether collision and leaving the road can still be avoided after each action, (N, A)."""
+        """Return whether harm can still be avoided after each action, (N, A).
+
+        Harm is a collision, or leaving the road.
+        """
         avoids = ~self.harms[self.edge]
         for rows in self._levels_backwards():
             child = self.child[rows]
@@ -165,12 +169,15 @@ class Forest:
 
     @cached_property
     def miss(self) -> Bools:
-        """Whether each action makes harm inevitable that could be avoided before it, (N, A)."""
+        """Return whether each action makes harm inevitable, (N, A), that could be avoided before.
+
+        Harm is a collision, or leaving the road.
+        """
         return np.asarray(self.avoids_harm.any(axis=-1, keepdims=True) & ~self.avoids_harm)
 
     @cached_property
     def false_alarm(self) -> Bools:
-        """Whether each action makes success impossible by time alone, (N, A).
+        """Return whether each action makes success impossible by time alone, (N, A).
 
         Success was possible before it, and a collision can still be avoided after it.
         """
@@ -178,9 +185,9 @@ class Forest:
 
     @cached_property
     def then_full_view(self) -> Ints:
-        """Last edge of the episode after each action if then the full-view driver goes on, (N, A).
+        """Return the last edge if the full-view driver goes on after each action, (N, A).
 
-        That is the reference driver that sees everything.
+        It is an index in `edges`. That driver is the reference that sees everything.
         """
         last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
         for rows in self._levels_backwards():
@@ -195,7 +202,7 @@ class Forest:
 
     @cached_property
     def reference_s(self) -> Floats:
-        """Time (s) at which the full-view driver reaches the goal in each tree, (E,), or inf.
+        """Return when the full-view driver reaches the goal in each tree, s, (E,); inf if never.
 
         That is the reference driver that sees everything.
         """
@@ -203,7 +210,7 @@ class Forest:
 
     @cached_property
     def limit_s(self) -> Floats:
-        """Latest time (s) of an arrival that is a success, (E,).
+        """Return the latest time (s) of an arrival that is a success, (E,).
 
         It is the full-view driver's time plus the allowance, but at most the time limit.
         """
@@ -211,12 +218,12 @@ class Forest:
 
     @cached_property
     def safe(self) -> Bools:
-        """Whether the episode can still succeed after each action, (N, A)."""
+        """Return whether the episode can still succeed after each action, (N, A)."""
         return self._in_time(self.earliest_s, self.limit_s[self.tree][:, None])
 
     @cached_property
     def value(self) -> Bools:
-        """Whether the episode can still succeed at each decision point, (N,).
+        """Return whether the episode can still succeed at each decision point, (N,).
 
         So it is the success of the best policy from there on.
         """
@@ -224,7 +231,10 @@ class Forest:
 
     @cached_property
     def delay_s(self) -> Floats:
-        """How much (s) each action puts off the earliest arrival, (N, A); NaN if it is not safe."""
+        """Return by how much (s) each action puts off the earliest arrival, (N, A).
+
+        NaN if the action is not safe.
+        """
         soonest_s = self.earliest_s.min(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             return np.where(self.safe, self.earliest_s - soonest_s, np.nan)
@@ -254,7 +264,10 @@ class Forest:
         return np.sort(np.concatenate(visited))
 
     def succeeds(self, edge: Ints, tree: Ints) -> Bools:
-        """Return whether an episode of a tree that ends at an edge succeeds; all are (...)."""
+        """Return whether episodes that end at some edges succeed, (...).
+
+        `edge`, (...), are indices in `edges`, and `tree`, (...), those of the episodes' trees.
+        """
         return self._in_time(self.cleared_s[edge], self.limit_s[tree])
 
     @staticmethod
@@ -262,7 +275,7 @@ class Forest:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
-        """Return how the episode ends at an edge; the edge must be a last one."""
+        """Return how the episode ends at an edge, an index in `edges` of one that ends it."""
         end = self.edges[edge].end
         assert end is not None
         return end
@@ -299,7 +312,10 @@ class Forest:
 
     @cached_property
     def worth(self) -> Floats:
-        """Probability of success after each action if later ones are drawn uniformly, (N, A)."""
+        """Return the probability of success after each action, (N, A), if later ones are drawn.
+
+        They are drawn uniformly.
+        """
         return self.chance(np.ones(self.child.shape))
 
     def chance(self, policy: Floats) -> Floats:

@@ -26,16 +26,22 @@ from harness.world.world import Target, World
 
 
 class Frozen(NamedTuple):
-    """Hold a layout's decision tree and the record of each decision point, both by step."""
+    """Hold a layout's decision tree and the record of each decision point.
 
-    branchings: list[list[Branching]]  # by step: what each action does at each decision point
-    scenes: list[list[Record]]  # by step: state and scene graphs of each decision point
+    A layout is the start situation of an episode, and its tree has every decision point that
+    decisions can lead to. Both lists have a list for each step, one decision after another.
+    """
+
+    branchings: list[list[Branching]]  # what each action does at each decision point of a step
+    # the state at each decision point of a step, and what each vehicle knows: its scene graph
+    scenes: list[list[Record]]
 
 
 def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
     """Simulate and return the decision tree of each layout, in the order of `seeds`.
 
-    `seeds` has the layout seed of each episode number.
+    A layout is the start situation of an episode, and its tree has every decision point that
+    decisions can lead to. `seeds` has by number of an episode the seed that draws its layout.
     """
     level = [(episode, World.start(scenario, seed)) for episode, seed in seeds.items()]
     trees = {episode: Frozen([], []) for episode in seeds}
@@ -64,9 +70,9 @@ def edges(
 ) -> tuple[list[list[Edge]], list[tuple[int, World]]]:
     """Simulate every action at the decision points of one step.
 
-    `worlds` are the decision points, of the `episodes` given beside them. Returned are the edges of
-    each, and the distinct decision points of the next step, each as (episode, world). `Edge.to`
-    counts the next points of the same episode.
+    `worlds` are the decision points, and `episodes` the number of each one's episode. Returned are
+    for each point its edges, what its actions lead to, and then the distinct decision points of the
+    next step, each as (episode, world). `Edge.to` counts the next points of the same episode.
     """
     waiting = [world.branch() for world in worlds]
     p = worlds[0].scenario.parameters

@@ -49,15 +49,15 @@ TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over al
 class Scene:
     """Hold one decision point of a dataset or of a drive: its state and its scene graphs.
 
-    `seat` is the scenario as an agent other than the ego plays it, if such a one decides, else
-    None; `agent` is the index of who decides, 0 for the ego. `notes` keeps what was computed from
-    the scene.
+    A scene graph is what one vehicle knows of the state. Who decides is an agent; where that is not
+    the ego of the scenario, the scene is as this agent sees it, with itself as the ego.
     """
 
-    record: Record  # its record in the dataset
+    record: Record  # state and scene graphs, as a dataset has them
     # results computed from it, by name, kept so that they are computed once
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
-    seat: Scenario | None = None  # the scenario of who decides, if that is an agent on a seat
+    # the scenario with the agent that decides as its ego; None where that is the scenario's own ego
+    seat: Scenario | None = None
     agent: int = 0  # index of who decides among the vehicles that can be asked; the ego has 0
     several: bool = False  # whether vehicles beside the ego can decide in this scenario
 
@@ -71,7 +71,7 @@ class Scene:
 
     @cached_property
     def graphs(self) -> Mapping[str, SceneGraph]:
-        """The scene graph of the ego and of each helper, by id, the ego first."""
+        """Return what the ego and each helper know, their scene graphs, by id, the ego first."""
         graphs = self.record.graphs
         return {v.id: graphs[v.id] for v in self.state.vehicles if v.id in graphs}
 
@@ -89,9 +89,10 @@ class Scene:
         return self.viewers[0] if name is None else name
 
     def place(self, viewer: int) -> int:
-        """Return the index of the nth viewer among the vehicles that can be asked.
+        """Return the index among all vehicles that can be asked of one of this scene's `viewers`.
 
-        Viewers begin with the agent that decides, and vehicles with the ego; `viewer` is n.
+        `viewer` is the index in `viewers`, which begin with the agent that decides here; the
+        vehicles that can be asked begin with the scenario's own ego.
         """
         if not viewer:
             return self.agent
@@ -103,17 +104,18 @@ class Scene:
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
-    """Return the indices of scenes by the scenario of the agent that decides in them.
+    """Return the indices in `scenes` by the scenario with the agent that decides as its ego.
 
-    That is the scenario with that agent as its ego; `scenario` itself where the ego decides.
+    That is `scenario` itself where its own ego decides.
     """
     return places_by(scene.seat or scenario for scene in scenes)
 
 
 class Trees(Sequence[Tree]):
-    """Sequence of the decision trees of the episodes `numbers`, each read when it is used.
+    """Hold the decision trees of some episodes, each read when it is used.
 
-    `read` returns the tree of an episode number.
+    A decision tree has every course that decisions can take from one start situation. `numbers` are
+    the episodes', and `read` returns the tree of a number.
     """
 
     def __init__(self, numbers: Iterable[int], read: Callable[[int], Tree]) -> None:
@@ -149,7 +151,7 @@ class Dataset:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """The scenario, with the parameters with which the dataset was built."""
+        """Return the scenario, with the parameters with which the dataset was built."""
         return scenario_of(self.manifest)
 
     @property
@@ -176,12 +178,12 @@ class Dataset:
 
     @property
     def dangerous(self) -> Bools:
-        """Whether each of the E episodes has a danger, (E,)."""
+        """Return whether each of the E episodes has a danger, (E,)."""
         return np.array([tree.danger.sector is not None for tree in self.trees])
 
     @property
     def lost(self) -> int:
-        """Number of episodes in which the ego collides before its first action can act."""
+        """Return in how many episodes the ego collides before its first action takes effect."""
         lag_s, forest = self.scenario.parameters.decision_lag_s, self.forest
         before_any = np.zeros(len(forest.edges), dtype=bool)  # whether each edge ends so
         for n, edge in enumerate(forest.edges):
@@ -200,7 +202,7 @@ class Dataset:
 
     @property
     def whole(self) -> "Dataset":
-        """This dataset with all episodes of its folder."""
+        """Return this dataset with all episodes of its folder."""
         return replace(self, trees=Trees(range(self.manifest.episodes), self.trees.read))
 
     def reference_success(self) -> dict[str, Floats]:

@@ -30,7 +30,8 @@ BEGUN, REBUILT = 1000, 3  # layouts of which the first scene is built, and the w
 def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
     """Raise UserError unless a dataset is what its seeds give, and shares no layout with test data.
 
-    Layouts are rebuilt in the simulator, some of them; without the simulator this is skipped.
+    A layout is the start situation of an episode, drawn by its seed. Some are rebuilt in the
+    simulator; without the simulator this is skipped.
 
     Args:
         dataset: one that something is trained on or chosen by; a released one always passes.

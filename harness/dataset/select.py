@@ -24,15 +24,18 @@ NONE = "none"  # the `danger` of layouts without one
 class Choice:
     """State which episodes a run uses, where something chooses them."""
 
-    numbers: tuple[int, ...]  # the episodes, ascending
-    pool: tuple[int, ...]  # those that they were drawn from, ascending
+    numbers: tuple[int, ...]  # numbers of the episodes that are used, ascending
+    pool: tuple[int, ...]  # numbers of those that they were chosen from, ascending
     given: Mapping[str, Any]  # the settings that chose them, by name, as a run states them
 
 
 class Selection(ABC):
-    """Chooses which episodes a run uses, by settings of its extension; frozen."""
+    """Choose which episodes a run uses, such as a random sample, by an extension's settings.
 
-    chosen_by: ClassVar[tuple[str, ...]]  # these settings
+    It is a base class; objects do not change.
+    """
+
+    chosen_by: ClassVar[tuple[str, ...]]  # names of the settings of its extension that choose it
 
     @abstractmethod
     def opened(self, settings: Mapping[str, Any]) -> "Selection | None":
@@ -43,10 +46,10 @@ class Selection(ABC):
 
     @abstractmethod
     def choice(self, numbers: Sequence[int], dataset: Dataset | None) -> Choice:
-        """Return which of these episodes are used, ascending as they are.
+        """Return which of the episodes with these numbers are used, ascending as they are.
 
-        They are those of a dataset, or layouts to drive where that is None. Raises UserError if
-        there are none, or too few.
+        They are those of `dataset`, or layouts (start situations) to drive where that is None.
+        Raises UserError if there are none, or too few.
         """
 
 
@@ -62,7 +65,7 @@ def opened(settings: Mapping[str, Any]) -> Selection | None:
 
 
 def without(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings of extensions without those that choose episodes."""
+    """Return settings of extensions, values by name, without those that choose episodes."""
     choosing = {name for each in SELECTIONS.values() for name in each.chosen_by}
     return {name: value for name, value in settings.items() if name not in choosing}
 
@@ -82,7 +85,10 @@ def recorded(record: Mapping[str, Any]) -> Selection | None:
 
 
 def lacking(record: Mapping[str, Any]) -> str | None:
-    """Return the extension that chose a run's episodes, by what it states, if it is gone."""
+    """Return the name of the extension that chose a run's episodes if it is not installed.
+
+    `record` is the `selection` that the run states; None if there is none, or it is installed.
+    """
     owners = [owner_of_plugin("settings", name) for name in record]
     return next((owner for owner in owners if owner and owner not in extensions()), None)
 

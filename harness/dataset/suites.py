@@ -28,7 +28,7 @@ class Suite(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def named(text: str) -> Suite | None:
-    """Return the suite that a text `suite:NAME` names, shipped or the project's; else None.
+    """Return the suite that a text `suite:NAME` names, one that ships or the project's; else None.
 
     Raises UserError if there is no such suite, or two, or its table is wrong.
     """

@@ -206,9 +206,10 @@ def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
 
 
 def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = False) -> Tree:
-    """Read an episode's decision tree. Raises Damaged if its digest or content is wrong.
+    """Read an episode's decision tree: every course that decisions can take from its start.
 
-    The content of a `trusted` dataset is not checked beyond its digest and types.
+    `file` is the archive `layouts.zip`. The content of a `trusted` dataset is not checked beyond
+    its digest and types. Raises Damaged if its digest or content is wrong.
     """
     name = tree_name(episode)
     data = _entry(file, name, manifest.trees_sha256[episode])
@@ -224,9 +225,10 @@ def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = F
 
 
 def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
-    """Read the scenes of one step of a tree as JSON lines, in the order of its decision points.
+    """Read the scenes of one step of a decision tree as JSON lines, one for each decision point.
 
-    Raises Damaged if the digest or the number of lines is wrong.
+    They are in the order of the tree. `file` is the archive `layouts.zip`, and `step` the number of
+    the decision, from 0. Raises Damaged if the digest or the number of lines is wrong.
     """
     name = level_name(tree.episode, step)
     lines = _entry(file, name, tree.scenes_sha256[step]).splitlines()
@@ -297,7 +299,7 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
 
 
 def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, list[str]]:
-    """Decode a scene's JSON line; return the record, and a line for each problem.
+    """Decode a scene's JSON line; return the scene's record, and a line for each problem.
 
     The record is None if it cannot be decoded, and may be used only if there is no problem. `name`
     is the scene id that it should have.
@@ -339,7 +341,7 @@ def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -
 
 
 def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name: str) -> list[str]:
-    """Return how a record contradicts itself, its scenario or the manifest, one phrase each.
+    """Return how a scene's record contradicts itself, its scenario or the manifest, in phrases.
 
     `name` is the scene id that it should have.
     """

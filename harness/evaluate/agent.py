@@ -124,12 +124,15 @@ class Agent:
 
     @property
     def samples(self) -> bool:
-        """Whether its answers are drawn at a temperature; a read-out or decision is not."""
+        """Return whether its answers are drawn at a temperature.
+
+        A read-out and a decision are not: they are probabilities already.
+        """
         return self.can.samples and self.answer not in BARE
 
     @property
     def name(self) -> str:
-        """Model, prompt version and answer mode, as text for people and tables."""
+        """Return model, prompt version and answer mode, as text for people and tables."""
         return f"{self.card.name} · {self.prompt.version} · {self.answer}"
 
     def most_tokens(self, role: Role) -> int:
@@ -138,9 +141,10 @@ class Agent:
         return answer + (self.card.thinking_tokens if self.thinking else 0)
 
     def blank(self, role: Role, actions: tuple[str, ...]) -> Request:
-        """Return a request in a role that lacks all that differs from scene to scene.
+        """Return a request without all that differs from scene to scene.
 
-        The caller fills in `id`, `messages` and the like (`Request.alike`). `actions` are in order.
+        The caller fills in `id`, `messages` and the like (`Request.alike`). `role` is whom the
+        prompt addresses, `ego` or `helper`; `actions` are the names of the meta-actions, in order.
         """
         return Request(
             id="",
@@ -192,10 +196,11 @@ class Agent:
         actions: tuple[str, ...],
         chat: Callable[[Sequence[str]], tuple[Mapping[str, str], ...]],
     ) -> dict[str, Any]:
-        """Return a chat for each order of the action list to be asked, as fields of a request.
+        """Return a chat for each order of the list of actions to be asked, as fields of a request.
 
-        `chat` makes the messages for one order. The fields are `messages`, and where there are
-        further orders `orders`, and with `flip` the same of the reversed list, `flips`.
+        A read-out of letters is asked with the actions in several orders, since a model may prefer
+        a letter. `chat` makes the messages for one order. The fields are `messages`, and where
+        there are further orders `orders`, and with `flip` the same of the reversed list, `flips`.
         """
 
         def each(listed: tuple[str, ...]) -> list[tuple[Mapping[str, str], ...]]:
@@ -274,9 +279,10 @@ def in_mode(
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:
-    """Return the likeliest action in the answer of each of a role's examples.
+    """Return the likeliest action in each example answer that a prompt shows in a role.
 
-    Raises UserError if such an answer cannot be parsed without repairs.
+    `role` is whom the prompt addresses, `ego` or `helper`; `actions` are the names of the
+    meta-actions, in order. Raises UserError if such an answer cannot be parsed without repairs.
     """
     likeliest = []
     for number, example in enumerate(prompt.examples.of(role) if prompt.examples else (), 1):

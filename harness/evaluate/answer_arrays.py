@@ -20,11 +20,12 @@ def intents_of(
     answers: Sequence[list[Answer | None]],
     width: int = 1,
 ) -> Intents:
-    """Return the answers of n scenes as arrays `(n, ...)` of at least `width` vehicles.
+    """Return what vehicles answered in n scenes as arrays, `(n, ...)`, of intents and their cost.
 
-    `answers` has for each scene the ego's first, then the helpers' in order of `Scene.viewers`;
-    None for one that was not asked yet. An answer that is missing or did not parse is a row of NaN.
-    `latency` says how long each answer took.
+    An intent is the probabilities that a vehicle gives to the ego's actions. `answers` has for each
+    scene the ego's answer first, then the helpers' in order of `Scene.viewers`; None for one that
+    was not asked yet. An answer that is missing or did not parse is a row of NaN. `latency` says
+    how long each answer took. Arrays have room for `width` vehicles at least, the ego included.
     """
     width = max([width, *[len(row) for row in answers]])
     unknown = (math.nan,) * len(spec.actions)
@@ -64,10 +65,11 @@ def intents_of(
 
 
 def models_of(spec: Spec, scene: Scene, width: int) -> list[int]:
-    """Return for each vehicle in a scene the number that says whose model answers for it.
+    """Return for each vehicle in a scene the number of the model that answers for it.
 
-    0 is the ego's model; from 1 on, the helpers' models take turns (`Latency.speed`). The order is
-    that of `Scene.viewers`. If these are fewer than `width` vehicles, the rest have their index.
+    Number 0 is the ego's model; from 1 on, the helpers' models take turns (`Latency.speed`). The
+    order is that of `Scene.viewers`. If these are fewer than `width` vehicles, the rest have their
+    own index.
     """
     there = range(len(scene.viewers))
     places = [scene.place(n) for n in there] if spec.helpers else [*there]
@@ -89,9 +91,10 @@ def _bits(scene: Scene, answer: Answer | None) -> int:
 
 
 def payload_bits(xy_m: tuple[float, float], answer: Answer) -> int:
-    """Return the size in bits of a helper's message as compact JSON, sent from `xy_m`.
+    """Return the size in bits of a helper's message as compact JSON.
 
-    It holds id, position (one decimal), intent (two decimals), evidence and risk.
+    It holds the sender's id and position `xy_m` (m to the east and to the south, one decimal), and
+    of its answer the intent (two decimals), evidence and risk.
     """
     intent = "null"
     if answer.intent:

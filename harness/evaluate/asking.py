@@ -102,10 +102,10 @@ class Asker:
     question that got no answer is never kept, so that it is asked again when the work goes on.
 
     Attributes:
-        spec: the evaluation.
+        spec: the evaluation: agents, scenes, conditions and settings.
         answers: answers by request id, in the order of the requests.
-        latency: how long inference takes.
-        tally: how the questions that were asked here ended.
+        latency: how long the models take to answer.
+        tally: how many questions that were asked here got an answer, and how many an error.
         served: which server gave each answer that is not kept in a file.
     """
 
@@ -239,7 +239,7 @@ class Asker:
         return name in self.answers and name not in self._unasked
 
     def asked_answers(self) -> dict[str, Answer]:
-        """Return all answers by request id, except kept ones whose question was not asked here."""
+        """Return all answers by request id, without kept ones that nothing asked for here."""
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
     def settle(self) -> None:
@@ -329,9 +329,9 @@ class Asker:
         return self.laid_out(scenes)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
-        """Return the intents of n scenes where helpers are asked `question` instead.
+        """Return the intents of n scenes where helpers are asked another question, `(n, ...)`.
 
-        Only scenes at the indices `at` are asked, and only if a run asks all helpers; NaN
+        Only the scenes at the indices `at` are asked, and only if a run asks all helpers; NaN
         elsewhere.
         """
         if self.spec.asks_all:
@@ -341,9 +341,9 @@ class Asker:
     def helpers(
         self, scenes: Sequence[Scene], wanted: Bools, question: Question = PLAIN
     ) -> Intents:
-        """Ask the helpers marked in `wanted`, `(n, H)`: n scenes, H helpers.
+        """Ask some helpers, those marked in `wanted`, `(n, H)`, of n scenes with H helpers.
 
-        Returns the intents of the scenes in which a helper is marked.
+        Returns the intents of the scenes in which a helper is marked, in their order.
         """
         scenes, places = wanted_in(scenes, wanted)
         self._ask_at(scenes, places, question)
@@ -357,8 +357,8 @@ class Asker:
     ) -> list[bool]:
         """Return for each scene whether an answer is missing.
 
-        `places` restricts this to some vehicles of each scene, the ego at 0; None for all. With
-        another than the ordinary `question`, only helpers count.
+        `places` restricts this to some vehicles of each scene, by their index in `Scene.viewers`,
+        the ego at 0; None for all. With another than the ordinary `question`, only helpers count.
         """
         return list(self._lacking(scenes, self._has, question, places))
 
@@ -457,10 +457,10 @@ class Asker:
     def fusion_requests(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> list[Request]:
-        """Return a fusion request for each set of messages heard, one code a set.
+        """Return the requests that ask egos once more, with each set of messages that one heard.
 
-        `codes`, `(K,)`, are those of `fusion.codes_of`, for these scenes in their order; `rewrites`
-        says how the messages are shown.
+        `codes`, `(K,)`, has for each set an integer that says in which scene who was heard
+        (`fusion.codes_of`), with the scenes in this order; `rewrites` says how messages are shown.
         """
         sets = list(heard_sets(scenes, codes, rewrites))
         lacks = [not self._has(fusion_id(*each)) for each in sets]

@@ -19,28 +19,36 @@ from harness.world.world import Target, World
 
 @dataclass
 class Decision:
-    """Hold one agent's chosen action and the simulation frame in which it takes effect."""
+    """Hold one agent's chosen action and the simulation frame in which it takes effect.
 
-    action: str  # the meta-action
-    frame: int  # the frame in which it acts
-    acted: bool = False  # whether it has acted
-    # least time to collision and post-encroachment time until the next decision begins; inf for
-    # none
+    An agent is a vehicle that decides for itself.
+    """
+
+    action: str  # name of the meta-action
+    frame: int  # number of the simulation frame in which it takes effect
+    acted: bool = False  # whether it has taken effect
+    # least time to collision, s, until the agent's next decision begins; inf if nothing is near
     ttc_s: float = math.inf
+    # least post-encroachment time, s, until then: from when one vehicle leaves a place to when
+    # another arrives; inf if nothing is near
     pet_s: float = math.inf
 
 
 @dataclass
 class Course:
-    """Hold one episode under one condition and channel seed, while it is driven."""
+    """Hold one episode under one condition and channel seed, while it is driven.
+
+    Agents, vehicles that decide for themselves, are numbered by their place among the vehicles of
+    the world; 0 is the ego.
+    """
 
     point: OperatingPoint  # the condition
     seed: int  # seed of the channel's draws
-    # the decision of each agent that has not acted yet; until it does, the agent keeps to its last
+    # by agent its decision that has not taken effect yet; until then the agent keeps to its last
     # action
     open: dict[int, Decision] = field(default_factory=dict)
-    last: dict[int, Decision] = field(default_factory=dict)  # the decision of each that began last
-    # how many decisions did not begin, since one was still open when they were due
+    last: dict[int, Decision] = field(default_factory=dict)  # by agent its latest decision
+    # number of decisions that did not begin, since one was still open when they were due
     skipped: int = 0
 
 
@@ -48,21 +56,26 @@ class Course:
 class Trajectory:
     """Hold a simulated world and the episodes that still share it, having acted alike so far."""
 
-    number: int  # the episode's number
-    world: World  # the world
-    courses: list[Course]  # the episode under each condition and seed
+    number: int  # number of the layout's episode in the run
+    world: World  # the simulated world
+    courses: list[Course]  # the episode under each condition and seed that shares the world
 
     @property
     def under_way(self) -> list[int]:
-        """Places of the agents whose episode has not ended."""
+        """Return the numbers of the agents whose episode has not ended.
+
+        An agent is a vehicle that decides for itself; its number is the index of the vehicle in the
+        world, 0 the ego.
+        """
         return [
             agent for agent, journey in self.world.journeys.items() if not journey.outcome.ended
         ]
 
     def measure(self) -> None:
-        """Add the conflicts since the last call to each agent's last decision, and count anew.
+        """Add how near others came to each agent to its latest decision, and count anew.
 
-        Conflicts are the least time to collision and the least post-encroachment time, in s.
+        That is the least time to collision and the least post-encroachment time, in s, since the
+        last call.
         """
         for agent, journey in self.world.journeys.items():
             for decision in (course.last[agent] for course in self.courses if agent in course.last):
@@ -115,7 +128,8 @@ class Trajectory:
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
     """Simulate each trajectory to a frame, or to its end, and apply decisions in their frames.
 
-    Returns one trajectory for each way in which the episodes went on, in the order given.
+    A trajectory whose episodes take different actions parts into several. Returns all that there
+    are then, in the order of those given.
     """
     running: list[tuple[tuple[int, ...], Trajectory]] = [
         ((n,), t) for n, t in enumerate(trajectories)

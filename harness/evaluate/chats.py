@@ -19,8 +19,8 @@ class Asking:
     Raises UserError if the prompt shows pictures or does not fit the scenario.
     """
 
-    scenario: Scenario
-    prompt: Prompt
+    scenario: Scenario  # the scenario of the scenes, whose actions and words the chats have
+    prompt: Prompt  # the prompt version
     answer: Form = "json"  # `json`, or `readout`: one letter
 
     def __post_init__(self) -> None:

@@ -20,7 +20,7 @@ NEGLIGIBLE_M = 0.01  # how far a simplified line of the map may be off
 
 
 def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
-    """Return what helpers claim in n scenes, and what the ego's sensors say of it.
+    """Return the positions and speeds that helpers claim in n scenes, and what the ego sees of it.
 
     Arrays are `(n, ...)`, with NaN where a scene has fewer helpers than another.
     """

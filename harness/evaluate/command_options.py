@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Follower(Protocol):
-    """Describe what is told of one run while it goes."""
+    """Describe what an extension is told of one run while it goes, such as to a tracker."""
 
     def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
         """Return a function of a number of new answers that calls `progress`, too."""
@@ -44,7 +44,10 @@ Guard = Callable[["Card", "Backend"], "Backend"]
 
 
 class CommandOption(ABC):
-    """An option of `harness eval` and `harness drive` that changes nothing of a run."""
+    """Describe an option of `harness eval` and `harness drive` that changes nothing of a run.
+
+    It may tell others of the runs while they go (`follow`), or stop them (`guard`); a base class.
+    """
 
     kind: ClassVar[Any]  # of its value: str, int, float, bool or list[str]
     help: ClassVar[str]  # a sentence for people

@@ -27,7 +27,7 @@ FILE = "costs.jsonl"
 class Asked(msgspec.Struct, frozen=True):
     """Hold the token counts of completions that one model was asked for in one call."""
 
-    model: str
+    model: str  # name of the model's card
     asked: Whole  # number of completions
     uncounted: Whole  # how many of them have no token counts: failed ones, as a rule
     read: Whole  # tokens of the others' prompts
@@ -48,10 +48,11 @@ class Asked(msgspec.Struct, frozen=True):
 def metered(
     cards: Sequence[Card], backends: Sequence[Backend], work: Path | None, guards: Sequence[Guard]
 ) -> list[Backend]:
-    """Return the backends, each whose card has a price wrapped so that its cost is counted.
+    """Return agents' backends, wrapped so that the cost of those with a price is counted.
 
-    Counts go to a file in the working folder `work`; nothing is counted with None. `guards` wrap
-    each backend, too.
+    A price stands in a model's card; `cards` and `backends` are in the order of the agents. Counts
+    go to a file in the working folder `work`; nothing is counted with None. `guards`, which may
+    refuse to ask, wrap each backend, too.
     """
     models = []
     for card, backend in zip(cards, backends, strict=True):

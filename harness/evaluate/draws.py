@@ -21,11 +21,12 @@ def _channel_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> 
 
 
 def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
-    """Return the channel's random draws for n decisions of episodes with `steps` decisions.
+    """Return the channel's random draws for n decisions, by their keys.
 
-    `seed`, `layout_seed` and `step` are `(n,)`; they are the key, so every condition, prompt and
-    model has the same draws. Each decision has those of `helpers` links. Whether a link is up is
-    drawn once an episode, jitter at each step.
+    The keys are the seed of the channel's draws, the seed of the episode's layout and the number of
+    the decision in its episode, `(n,)` each; so every condition, prompt and model has the same
+    draws. Episodes have at most `steps` decisions, and each decision has draws for the links to
+    `helpers` helpers. Whether a link is up is drawn once an episode, jitter at each step.
     """
     seeds, seed_index = np.unique(seed, return_inverse=True)
     layouts, layout_index = np.unique(layout_seed, return_inverse=True)
@@ -53,9 +54,9 @@ def _tie_uniforms(seed: int, layout_seed: int, steps: int) -> Floats:
 def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
     """Return the function that draws among equally likely actions, for n decisions.
 
-    It takes which decisions have such a tie, `(n,)`, and returns a number in [0, 1) for each of
-    these. None if `ties` is `first`, or the draws are of no layouts: the first such action is then
-    taken. The key is seed, layout and step, as in `channel_draws`.
+    It takes a mask, `(n,)`, of the decisions that have such a tie and returns a number in [0, 1)
+    for each of these. None if `ties` is `first`, or the draws are of no layouts: the first such
+    action is then taken. Keys are those of `draws`: seed, layout and step, as in `channel_draws`.
     """
     trips = draws.trips
     if ties == "first" or trips is None:

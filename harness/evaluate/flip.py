@@ -22,7 +22,7 @@ def wanted(request: Request, answer: Answer) -> bool:
 
 
 def mirror_request(request: Request) -> Request:
-    """Return the request with its list of actions reversed."""
+    """Return the request that asks the same with the list of actions reversed."""
     messages, *orders = request.flips
     return request.alike(
         messages=messages, orders=tuple(orders), flips=(), actions=request.actions[::-1]

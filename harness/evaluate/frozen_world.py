@@ -33,7 +33,7 @@ MOST_KNOWN = 20
 
 @dataclass(frozen=True)
 class FrozenSource:
-    """Describe recorded scenes of a dataset to evaluate on, as `harness eval` does."""
+    """Describe the recorded scenes to evaluate on: some or all episodes of a dataset."""
 
     dataset: Dataset  # the dataset, cut to the episodes that are used
     limit: int | None = None  # how many were asked for, from the first; None for all
@@ -76,7 +76,7 @@ class FrozenSource:
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes to evaluate; a run that stops early uses the first of them."""
+        """Return the numbers of the episodes to evaluate; a run that stops early has the first."""
         return self.dataset.episodes
 
     def first(self, count: int) -> "FrozenSource":
@@ -89,10 +89,10 @@ class FrozenSource:
     def layouts(self, n_asked: int) -> list[Layout]:
         """Return how hard each layout is, of those asked and of others that might have been asked.
 
-        That is the success of reference policies in it, by which a run's success is corrected where
-        the layouts asked are harder than the others. The first `n_asked` are the source's own
-        episodes. The list is empty if there are no others, or too few were asked to correct
-        anything.
+        A layout is one start situation of the scenario, with one episode. How hard it is, is the
+        success of reference policies in it, by which a run's success is corrected where the layouts
+        asked are harder than the others. Those asked are the first `n_asked` of the source. The
+        list is empty if there are no others, or too few were asked to correct anything.
         """
         if n_asked < LEAST:
             return []
@@ -110,9 +110,9 @@ class FrozenSource:
         ]
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
-        """Yield the first decision point of each of up to `most` episodes.
+        """Yield the first scene of each of up to `most` episodes.
 
-        It has the scene graphs of all vehicles, also with `ego_alone`.
+        It has what every vehicle knows, its scene graph, also with `ego_alone`.
         """
         forest = self.dataset.forest
         for root in forest.root[:most].tolist():
@@ -151,10 +151,12 @@ class _Layout(NamedTuple):
 
 
 class FrozenWorld(SceneWorld):
-    """A world of recorded scenes: it walks each layout's decision tree under all conditions.
+    """Play recorded scenes: walk the decision tree of each layout under all conditions.
 
-    There is one walk for each episode, condition and channel seed. An action takes effect one
-    decision lag of the dataset after its decision point, however long the decision took.
+    A decision tree has every scene that decisions can lead to from one start situation, the layout,
+    and how each course ends. There is one walk for each episode, condition and channel seed. An
+    action takes effect one decision lag of the dataset after its scene, however long the decision
+    took.
     """
 
     def __init__(
@@ -225,10 +227,11 @@ class FrozenWorld(SceneWorld):
             self._decided.append((at, action, part.result.latency_s))
 
     def columns(self) -> dict[str, Any]:
-        """Return columns, in decision order, of what each decision and its alternatives were worth.
+        """Return what each decision and its alternatives were worth, as columns by name, `(n,)`.
 
-        By name: whether success was possible (`value`), whether the action was safe, its regret,
-        delay in s, misses and false alarms, conflicts, and safety and delay of every action.
+        The n decisions are in the order of the calls of `step`. Columns are whether success was
+        possible (`value`), whether the action was safe, its regret, delay in s, misses and false
+        alarms, how near others came in time, and safety and delay of every action.
         """
         at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
         forest, p = self._forest, self.scenario.parameters
@@ -248,14 +251,14 @@ class FrozenWorld(SceneWorld):
 
     @property
     def numbers(self) -> Ints:
-        """Episode numbers, `(E,)`."""
+        """Return the number of each of the E episodes, `(E,)`."""
         return self._forest.episodes
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
-        """Return how each walk of a condition ended, arrays `(S, E)` of 0 and 1 by metric name.
+        """Return how each episode of a condition ended, by name of a metric, `(S, E)`.
 
-        S are channel seeds, E episodes; NaN where a walk was left out. Success with a danger and
-        without is NaN in the other episodes as well.
+        Values are 0 or 1, by S channel seeds and E episodes; NaN where one was left out. Success
+        with a danger and without is NaN in the other episodes as well.
         """
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])

@@ -30,7 +30,7 @@ FROM = "from:"  # in a key, before the id of the other scene that a message come
 
 @dataclass(frozen=True)
 class FusionAnswers:
-    """Hold the ego's answers to K sets of heard messages; H helpers, A actions."""
+    """Hold what the ego answered to K sets of messages that it may hear, with A actions."""
 
     # the decision point of each set and who was heard in it (`codes_of`), ascending, (K,)
     codes: Ints
@@ -66,19 +66,21 @@ class FusionAnswers:
 
 
 def codes_of(on_time: Bools, points: Ints, attackers: Bools | None = None) -> Ints:
-    """Return for n decisions one integer, `(n,)`, of a point and the set of helpers heard there.
+    """Return an integer for each of n decisions, `(n,)`, that says where it is and who was heard.
 
-    `on_time`, `(n, H)`, says who was heard and `points`, `(n,)`, where. With `attackers`, `(n, H)`,
-    the integer also says which of those heard attack. `heard_in` decodes it.
+    `on_time`, `(n, H)`, says which of H helpers were heard, and `points`, `(n,)`, is the index of
+    the decision point. With `attackers`, `(n, H)`, the integer also says which of those heard
+    attack. `heard_in` decodes it.
     """
     flags = on_time if attackers is None else np.concatenate([on_time, on_time & attackers], axis=1)
     return np.asarray(points << flags.shape[1] | flags @ (1 << np.arange(flags.shape[1])))
 
 
 def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list[int], list[int]]:
-    """Decode an integer of `codes_of` into the point, and lists of who was heard and who attacks.
+    """Decode an integer of `codes_of`: return the decision point, who was heard and who attacks.
 
-    Helpers are numbered from 0. `attacked` says whether the code was made with `attackers`.
+    The point is an index, as are the helpers in the two lists, from 0 to `helpers` - 1. `attacked`
+    says whether the code was made with `attackers`.
     """
     bits = helpers * (1 + attacked)
     heard = [h for h in range(helpers) if code >> h & 1]
@@ -146,15 +148,17 @@ def _plan_of(key: str) -> dict[str, Any] | None:
 
 
 class Marks(NamedTuple):
-    """Hold what a message's key (`key_of`) says after its sender's name."""
+    """Hold what the key of a message that the ego heard (`key_of`) says after the sender's name."""
 
-    changes: list[str]  # how it was changed
-    call: Call | None  # what the ego was asked with it; None if with all of it and nothing else
-    whole: bool  # whether the prompt showed all of it
+    changes: list[str]  # names of what attacks and defences changed of it, in order
+    # the second question to the ego's model that shows objects or words of it; None if the prompt
+    # just has the message
+    call: Call | None
+    whole: bool  # whether the prompt showed the whole message
 
 
 def marks_of(key: str) -> Marks:
-    """Return what a message's key says of it, except for the scene that it comes from."""
+    """Return what the key of a message that the ego heard says of how it was shown."""
     changes, call, whole, named = [], None, False, calls()
     for mark in filter(None, key.partition(REWRITTEN)[2].split("&")):
         if mark == WHOLE:
@@ -178,11 +182,12 @@ def source_of(scene: str, senders: Sequence[str]) -> str:
 def messages_of(
     answers: Mapping[str, Answer], senders: Sequence[str], actions: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the messages of these keys as a prompt template takes them.
+    """Return the messages that the ego heard as a prompt template takes them, one dict each.
 
-    `answers` has the senders' answers by key. A message has `sender`, `intent` and the fields of
-    its answer; one of words alone `sender` and `evidence`, in one line. An agent's plan has
-    `sender`, `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`. A
+    `senders` are the messages' keys (`key_of`), and `answers` has the senders' answers by key;
+    `actions` are the names of the meta-actions, in order. A message has `sender`, `intent` and the
+    fields of its answer; one of words alone `sender` and `evidence`, in one line. An agent's plan
+    has `sender`, `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`. A
     message whose objects are in the ego's graph, or whose answer failed, is left out.
     """
     messages = []

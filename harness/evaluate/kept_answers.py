@@ -20,7 +20,7 @@ _DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
 
 
 class KeptAnswers:
-    """A file of a stopped run's answers, one JSON line each, written in chunks that may be torn.
+    """Read and append a stopped run's answers in a file, a JSON line each, in chunks.
 
     Only one process at a time may append.
     """

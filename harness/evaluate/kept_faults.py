@@ -20,9 +20,10 @@ SUMMED = ("prompt_tokens", "completion_tokens", "seconds", "slow_s")  # over the
 
 
 def fault(spec: Spec, request: Request, answer: Answer) -> str | None:
-    """Return what a kept answer to a request states that cannot be, as a phrase; None if nothing.
+    """Return what an answer that a stopped run kept states and cannot be, as a phrase, or None.
 
-    The phrase follows "the answer".
+    `spec` is the evaluation and `request` the question. The phrase follows "the answer", as in
+    "the answer has ...".
     """
     if digests(request) != (answer.prompt_sha256, answer.image_sha256):
         return "is to another prompt or picture than is asked"

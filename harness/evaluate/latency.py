@@ -31,10 +31,11 @@ EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 def chosen_latency(
     choice: str | None, agents: Sequence[Agent], backends: Sequence[Backend]
 ) -> Latency | None:
-    """Return the latency that `--latency` chooses for agents, the ego's first; None to measure it.
+    """Return the inference times that `--latency` chooses for agents; None if they are measured.
 
-    Without a choice it is each agent's own: the replayed run's, else the card's, else the paper's.
-    `backends` are those of the agents, in their order.
+    `choice` is what was typed. Without it each agent has its own: those of the run that it replays,
+    else what its model's card declares, else the paper's. `backends` are those of `agents`, in
+    their order, the ego's first.
     """
     if choice not in (None, *NAMES):
         return declared(choice)
@@ -56,9 +57,10 @@ def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
 
 
 def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
-    """Return the ego's latency with the helpers' times replaced by those of their own models.
+    """Return the ego's inference times with the helpers' replaced by those of their own models.
 
-    Without helpers' latencies it is the ego's. Raises UserError if one times each answer.
+    `helpers` has the times of each agent that answers for helpers; without any the ego's stay.
+    Raises UserError if one of them times each answer by itself.
     """
     if not helpers:
         return ego
@@ -113,7 +115,7 @@ def same_times(one: Latency, other: Latency) -> bool:
 
 
 def as_declared(latency: Latency) -> str:
-    """Return the text by which `declared` gives these times."""
+    """Return the text of inference times that `declared` reads as these."""
     helpers = ":".join(map(str, latency.helpers_s or (latency.helper_s,)))
     return f"ego={latency.ego_s},helper={helpers},fusion={latency.fusion_s}"
 
@@ -123,10 +125,11 @@ def inference_s(
 ) -> Floats:
     """Return the seconds in which each vehicle's answer is ready, `(n, 1+H)`, NaN without one.
 
-    `answers` has for each of n scenes those of the ego and of H helpers. `places`, alike, say whose
-    model answers: 0 is the ego's, and helpers' models take turns (`Latency.speed`). If one model
-    answers for all, only the role counts. A repair turn takes the time of one more answer. An
-    answer's own declared delay (`slow_s`) is added.
+    `answers` has for each of n scenes those of the ego and of H helpers, the ego's first. `places`,
+    alike, has the number of the model that answers: 0 is the ego's, and helpers' models take turns
+    (`Latency.speed`). If one model answers for all, only the role counts. A repair turn, a second
+    question after a failed answer, takes the time of one more answer. An answer's own declared
+    delay (`slow_s`) is added.
     """
     shape = len(answers), len(answers[0]) if answers else 0
     seconds, turns, slow = np.full((3, *shape), np.nan)
@@ -145,8 +148,9 @@ def inference_s(
 def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int]) -> Floats:
     """Return the seconds of K fusion calls, `(K,)`, counted as in `inference_s`.
 
-    `places` say whose model answers, 0 the ego's. A vehicle with a helper's model takes as long as
-    for any other answer.
+    A fusion call is a second question to a deciding vehicle's model. `places` has the number of the
+    model that answers each, 0 the ego's. A vehicle with a helper's model takes as long as for any
+    other answer.
     """
     if latency.speeds:
         return np.array([latency.answer_s(n, a) for n, a in zip(places, answers, strict=True)])

@@ -29,7 +29,7 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
 
     created: str  # when the run began, UTC, ISO 8601
     command: tuple[str, ...] = ()  # words of the command that repeats the run
-    identity: dict[str, Any]  # identity of the models
+    identity: dict[str, Any]  # all that decides the models' answers (`Backend.identity`)
     tags: tuple[str, ...]  # the user's tags
     latency: Latency  # how long the run's answers take
     # versions of the packages and of the code that the run may depend on
@@ -58,9 +58,9 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
 class Evaluated:
     """Hold a finished run: its folder, its manifest and its scores."""
 
-    out: Path
-    manifest: Manifest
-    scores: Sequence[Score]
+    out: Path  # the run's folder
+    manifest: Manifest  # its settings and origin, the content of `run.json`
+    scores: Sequence[Score]  # the lines of its `summary.csv`
 
 
 def begin(
@@ -71,11 +71,12 @@ def begin(
     latency: Latency,
     shard: str = "",
 ) -> RunStart:
-    """Return the record of a run that begins, or `run_start` if it resumes.
+    """Return the record of what a run begins with, or `run_start` if it resumes.
 
-    `identity` and `latency` are those of the models opened now; `shard` is the part of a run, such
-    as `1/3`, empty for all of it. Raises UserError if the run was begun with a model of another
-    identity.
+    `run_start` is the record that a stopped run kept in the folder `out`, None without one.
+    `identity`, all that decides the models' answers, and `latency` are those of the models opened
+    now; `shard` is the part of a run, such as `1/3`, empty for all of it. Raises UserError if the
+    run was begun with a model of another identity.
     """
     if run_start is None:
         return RunStart(
@@ -97,7 +98,7 @@ def begin(
 
 
 def another_model(spec: Spec) -> str:
-    """Return words for an error: that a model is not the one that a run began with."""
+    """Return the words of an error that a model is not the one that a run began with."""
     names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
     return f"another model behind {names} (its files, package versions or device differ)"
 

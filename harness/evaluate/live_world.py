@@ -46,12 +46,13 @@ from harness.world.world import World
 class LiveSource:
     """Describe the layouts of a scenario to drive in closed loop, as `harness drive` does.
 
-    Episode e has layout seed `first_seed` + e. With a `choice`, only those of the episodes are
-    driven.
+    A layout is one start situation, drawn by its seed; episode e has layout seed `first_seed` + e.
+    With a `choice`, only those of the episodes are driven.
     """
 
-    first_seed: int
-    episodes: int
+    first_seed: int  # layout seed of episode 0
+    episodes: int  # number of episodes
+    # name of the scenario, with settings as they are typed, such as `NAME:beacon_loss=0.3`
     scenario_name: str = scenarios.DEFAULT
     choice: Choice | None = None  # what chose some of the episodes; None for all
     name: ClassVar[str] = "drive"
@@ -63,7 +64,7 @@ class LiveSource:
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes to drive; a run that stops early drives the first of them."""
+        """Return the numbers of the episodes to drive; a run that stops early has the first."""
         return self.choice.numbers if self.choice else range(self.episodes)
 
     @property
@@ -112,10 +113,10 @@ class LiveSource:
 
 
 class LiveWorld(SceneWorld):
-    """A world that simulates episodes under all conditions and channel seeds.
+    """Simulate the episodes of layouts under all conditions and channel seeds.
 
-    Episodes of one layout that have acted alike so far share a simulation. A decision takes effect
-    in the first frame after its latency.
+    Episodes of one layout, a start situation, that have acted alike so far share a simulation. A
+    decision takes effect in the first frame after its latency.
     """
 
     def __init__(
@@ -259,10 +260,11 @@ class LiveWorld(SceneWorld):
         self._going = [part for part in parts if not part.world.ended]
 
     def columns(self) -> dict[str, Any]:
-        """Return columns, in decision order, of when each decision took effect, and of conflicts.
+        """Return when each decision took effect, and how near others came, by column, `(n,)`.
 
-        By name: `acts_at_s`, the time in s at which it takes effect, `acted`, and the least time to
-        collision and post-encroachment time in s until the agent's next decision.
+        The n decisions are in the order of the calls of `step`. Columns are `acts_at_s`, the time
+        in s at which it takes effect, `acted`, whether it did, and the least time to collision and
+        post-encroachment time in s until the agent's next decision.
         """
         ttc_s = np.array([decision.ttc_s for decision in self._decisions])
         pet_s = np.array([decision.pet_s for decision in self._decisions])
@@ -299,19 +301,22 @@ def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episod
 
 
 def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> Scene:
-    """Return the decision point of one agent in a simulated world, now.
+    """Return the scene in which one agent of a simulated world decides now.
 
-    `agent` is its place in the world, 0 the ego; `number` is the episode's. With `ego_alone` it has
-    no scene graph of a helper.
+    An agent is a vehicle that decides for itself; `agent` is its index among the world's vehicles,
+    0 the ego. `number` is the episode's, and `step` that of the decision. With `ego_alone` the
+    scene lacks what helpers know, their scene graphs.
     """
     [scene] = looks([(world, agent, number)], step, ego_alone)
     return scene
 
 
 def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) -> list[Scene]:
-    """Return the decision point of each (world, agent, episode number), now, as step `step`.
+    """Return the scene in which each agent decides now, given its world, index and episode.
 
-    With `ego_alone` they have no scene graphs of helpers.
+    `points` has for each the simulated world, the index of the agent among its vehicles (0 the ego)
+    and the number of the episode; `step` is the number of the decision. With `ego_alone` scenes
+    lack what helpers know, their scene graphs.
     """
     states = [structs.replace(world.state(agent), step=step) for world, agent, _ in points]
     scenes = dict[int, Scene]()

@@ -31,9 +31,10 @@ DRIVER = "driver"  # the engine of what has no model and no prompt
 
 
 def spec_of(run: Run, source: FrozenSource) -> Spec:
-    """Return the evaluation by which a run's frozen scenes were answered, without conditions.
+    """Return the evaluation by which a finished run's recorded scenes were answered.
 
-    Raises UserError if a prompt of it is not installed here.
+    It has no conditions; `source` has the scenes. Raises UserError if a prompt of it is not
+    installed here.
     """
     manifest = run.manifest
     ego, *helpers = (_agent(run, record) for record in (manifest.agent(0), *manifest.helpers))
@@ -43,7 +44,10 @@ def spec_of(run: Run, source: FrozenSource) -> Spec:
 
 
 def card_here(card: Card) -> Card:
-    """Return the card of a model; of a rule-based driver the installed one instead of the run's."""
+    """Return the card of a run's model: the run's own, or of a rule-based driver the one here.
+
+    A card is what a file says of a model, such as its engine and weights.
+    """
     return cards.load(card.name) if card.engine == DRIVER else card
 
 

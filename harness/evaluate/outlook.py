@@ -21,11 +21,10 @@ MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
 def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
-    """Return what share of R regions the egos of n scenes do not see; arrays are `(n, ...)`.
+    """Return how much the egos of n scenes see of where a danger may come from, `(n, ...)`.
 
-    Regions are the road's sectors: where a danger may come from. It also says what helpers would
-    add. On a road with fewer regions than others, the rest counts
-    as seen.
+    It also says what helpers would add. The road's R sectors, or regions, are where a danger may
+    come from; on a road with fewer of them than others, the rest counts as seen.
     """
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario).items()]

@@ -20,10 +20,11 @@ GREY = 127
 def picture(
     spec: Spec, index: int, scene: Scene, viewer: str, pictured: bool = True
 ) -> Image | None:
-    """Return the picture that a vehicle's agent is shown; None if its prompt shows none.
+    """Return the picture that a vehicle's model is shown of a scene; None if its prompt shows none.
 
-    `index` says which agent answers. The picture is grey if `pictured` is false. Raises UserError
-    if it must come from another scene and there is none.
+    `index` is the number of the agent (a model with its prompt) that answers, in `spec.agents`, and
+    `viewer` the vehicle's id. The picture is grey if `pictured` is false. Raises UserError if it
+    must come from another scene and there is none.
     """
     agent = spec.agents[index]
     vision = agent.card.vision
@@ -46,7 +47,7 @@ def blank(size_px: tuple[int, int]) -> Image:
 
 
 def another(spec: Spec, scene: Scene) -> Scene:
-    """Return a random scene of the same step in another episode, keyed by this scene's id.
+    """Return a random scene of the same step in another episode, always the same for a scene's id.
 
     Raises UserError if there is none.
     """

@@ -65,7 +65,7 @@ REPLAY = "replay"  # the engine of stored answers
 
 
 class Held:
-    """A backend that asks a rule-based model, and counts its answers that a run states otherwise.
+    """Ask a rule-based model, and count its answers that a run states otherwise: a backend.
 
     `wrong` is that count. Identity and latency are the run's.
     """

@@ -36,9 +36,10 @@ def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
 def repair_request(
     request: Request, answer: Answer, prompt: Prompt, words: Mapping[str, str]
 ) -> Request:
-    """Return the request of the repair turn: the chat so far, the answer, and what was wrong.
+    """Return the request of a repair turn: the chat so far, the failed answer and what was wrong.
 
-    The prompt's template words the last; `words` are the scenario's, which templates take by name.
+    A repair turn is a second question after an answer that cannot be parsed. A template of the
+    prompt words it; `words` are the scenario's texts, which templates take by name.
     """
     correction = prompt.repair(
         request.role, as_text(answer.detail)[:ERROR_CHARS], request.actions, words
@@ -51,7 +52,7 @@ def repair_request(
 
 
 def quoted(raw: str) -> str:
-    """Return an answer as text to put in a chat: no thought, cut to `QUOTED` characters."""
+    """Return an answer as text to quote in a chat: no thought, at most `QUOTED` characters."""
     text = as_text(raw.rpartition("</think>")[2].strip())
     return text if len(text) <= QUOTED else text[: QUOTED - 1] + "…"
 

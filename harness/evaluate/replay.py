@@ -118,7 +118,7 @@ def acting_frame(decision: Decision, p: Parameters) -> int:
 
 
 def act(world: World, decisions: Sequence[Decision]) -> None:
-    """Let agents in a world take the actions of these decisions."""
+    """Let agents, the vehicles that decide in a world, take the actions of some decisions."""
     for decision in decisions:
         world.take(decision.action, _place(world, decision.agent))
 

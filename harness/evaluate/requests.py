@@ -31,10 +31,11 @@ def requests(
     question: Question = PLAIN,
     places: Places | None = None,
 ) -> Iterator[Request]:
-    """Yield what vehicles in scenes are asked, the ego's request first in each scene.
+    """Yield the requests to the models of vehicles in scenes, the ego's first in each scene.
 
-    With another `question` than the ordinary one, what to do as they see it, only helpers are
-    asked. With `places`, only vehicles at these places in each scene, the ego at 0.
+    With another `question` than the ordinary one, what the ego should do as they see it, only
+    helpers are asked. `places` has for each scene the indices in `Scene.viewers` of the vehicles to
+    ask, the ego at 0; None asks all.
     """
     agents, actions = spec.agents, spec.actions
     privileged, sees = (
@@ -69,9 +70,10 @@ def requests(
 
 
 def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Places]:
-    """Return the scenes where some helper is wanted, and the places of these helpers in each.
+    """Return the scenes where some helper is wanted, and the indices of these helpers in each.
 
-    `wanted` is `(n, H)`; the first helper is at place 1.
+    `wanted` is a mask `(n, H)` of n scenes with H helpers. An index is that in `Scene.viewers`: the
+    ego has 0 and the first helper 1.
     """
     rows = np.flatnonzero(wanted.any(axis=1)).tolist()
     return [scenes[n] for n in rows], [(1 + np.flatnonzero(wanted[n])).tolist() for n in rows]
@@ -98,13 +100,13 @@ def fusion_request(
     senders: Sequence[str],
     graph: SceneGraph | None = None,
 ) -> Request:
-    """Return the request that asks the ego once more, with messages of these keys.
+    """Return the request of a fusion call: it asks the ego once more, with what it has heard.
 
     Args:
         spec: the evaluation.
-        scene: the ego's.
+        scene: the ego's scene.
         answers: helpers' answers by key, without what says how a message is shown.
-        senders: keys of the messages, as of `fusion.key_of`.
+        senders: keys of the messages that the ego has heard (`fusion.key_of`).
         graph: scene graph to show instead of the ego's own; None for its own.
     """
     heard = messages_of(answers, senders, spec.actions)
@@ -124,17 +126,21 @@ def fusion_request(
 
 
 def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
-    """Return the id of the request with messages of these keys (`fusion.key_of`) in a scene."""
+    """Return the id of the request that asks the ego of a scene once more, by what it has heard.
+
+    `senders` are the keys of the messages (`fusion.key_of`).
+    """
     return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
 
 def heard_sets(
     scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites
 ) -> Iterator[tuple[Scene, list[str]]]:
-    """Yield for each code the ego's scene and the keys of the messages that it heard.
+    """Yield for each set of heard messages the ego's scene and the keys of the messages.
 
-    `codes`, `(K,)`, are those of `fusion.codes_of`, for these scenes in their order; `rewrites`
-    says how the messages are shown, which their keys (`fusion.key_of`) state.
+    `codes`, `(K,)`, has for each set an integer that says in which scene who was heard
+    (`fusion.codes_of`), with `scenes` in this order; `rewrites` says how the messages are shown,
+    which their keys (`fusion.key_of`) state.
     """
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():

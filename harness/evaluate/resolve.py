@@ -31,7 +31,9 @@ if TYPE_CHECKING:
 
 
 def spec(settings: Settings, source: Source) -> Spec:
-    """Return the evaluation of a source of scenes under a run's settings, with all files opened.
+    """Return the evaluation that a run's settings describe, with all files that they name opened.
+
+    `source` has the scenes: recorded ones of a dataset, or layouts to drive.
 
     Raises UserError for a name that there is not, or settings that are not allowed together.
     """
@@ -109,10 +111,11 @@ def _shipped(scenario: str) -> dict[str, Any]:
 
 
 def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, ...]]:
-    """Return the ego's agent, and those of the helpers, by a run's settings.
+    """Return the agent that answers for the ego, and those that answer for helpers.
 
-    There are none of helpers for whom the ego's agent answers. Raises UserError for models, prompts
-    or answer modes that do not exist or do not fit.
+    An agent is a model, its prompt and how it answers, by a run's settings. The second are empty if
+    the ego's answers for helpers, too. Raises UserError for models, prompts or answer modes that do
+    not exist or do not fit.
     """
     card = cards.resolve(settings.model, settings.engine)
     prompt = versions.load(settings.prompt or scenario.prompt)
@@ -138,9 +141,11 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
 def points(
     conditions: Sequence[str], settings: Mapping[str, Any] | None = None
 ) -> tuple[OperatingPoint, ...]:
-    """Return the operating points of conditions, each once, and the counterparts of each.
+    """Return the operating points that conditions name, each once, and the counterparts of these.
 
-    `settings` are a run's settings of extensions, by name. Raises UserError for an unknown name.
+    An operating point is the settings of radio, asking and fusion, such as `6g:window_s=0.4`; a
+    counterpart differs from it in one setting, such as a control. `settings` are a run's settings
+    of extensions, values by name. Raises UserError for an unknown name.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
     return tuple(dict.fromkeys((*named, *counterparts(named, settings or {}))))

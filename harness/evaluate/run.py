@@ -159,9 +159,9 @@ def evaluate_shard(
 ) -> int:
     """Drive one shard of a closed-loop run, or resume it; return its number of episodes.
 
-    `harness run merge` combines shards. `progress` counts episodes, those that a stopped shard kept
-    included. Raises UserError as `evaluate`, or if the latency is to be measured or the run may
-    stop early.
+    A shard is one of several parts of a run that are made apart; `harness run merge` combines them.
+    `progress` counts episodes, those that a stopped shard kept included. Raises UserError as
+    `evaluate`, or if the latency is to be measured or the run may stop early.
     """
     metrics_of(spec.source.kind)
     refuse_finished(out)
@@ -366,7 +366,7 @@ def _open_again(part: Path) -> None:
 
 
 def spreadable(spec: Spec, workers: Workers) -> Workers:
-    """Return the workers by which frozen scenes can be walked, 1 for this process alone.
+    """Return the workers by which recorded scenes can be evaluated, 1 for this process alone.
 
     More than one serve where rules answer (all of `workers`), or models on servers, of which there
     are no more than a server may have requests at once (`batch_size`).

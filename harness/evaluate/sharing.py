@@ -22,14 +22,14 @@ from harness.world.scene_graph import SceneGraph
 def shared_graphs(
     scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
-    """Return the ego's scene graph with the objects that it heard, for each set of messages.
+    """Return the ego's scene graph with the objects that it heard of, for each set of messages.
 
-    It is None where the messages add nothing to the graph.
+    A scene graph is what one vehicle knows of a scene. It is None where the messages add nothing.
 
     Args:
-        scenario: the ego's.
-        sets: the ego's scene and the keys of the messages heard (`fusion.key_of`), all of one
-            content.
+        scenario: the scenario as the ego plays it.
+        sets: for each set the ego's scene and the keys of the messages heard (`fusion.key_of`), all
+            of which hold the same kind of content.
         scenes: the scenes that the messages come from, by id.
     """
     graphs: list[SceneGraph | None] = [None] * len(sets)
@@ -78,10 +78,11 @@ def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
 def as_asked(
     scenario: Scenario, scene: Scene, answer: Answer, source: Scene | None = None
 ) -> Scene:
-    """Return a scene as it was shown to the vehicle that gave `answer`.
+    """Return a scene as it was shown to the vehicle that gave an answer.
 
-    A helper may have been asked another question; an ego that was asked again may have had the
-    objects of others, of the scene `source` (`fusion.source_of`) if messages came from elsewhere.
+    A helper may have been asked another question, with another scene graph; an ego that was asked
+    again may have had the objects of others, of the scene `source` (`fusion.source_of`) if messages
+    came from elsewhere.
 
     Raises:
         UserError: the answer names a sender or an attack that there is not,

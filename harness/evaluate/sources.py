@@ -15,7 +15,7 @@ from harness.radio.profiles import CHANNELS
 
 
 def sources(spec: Spec) -> dict[str, bytes]:
-    """Return the files that an evaluation was made from, by path in a project: name to bytes.
+    """Return the content of the files that an evaluation is made of, by their path in a project.
 
     They are prompts, answer schemas, cards, channels, networks, schedules and a timer's. What is in
     no file, such as the card of a hub id or a package's channel, only `run.json` has.

@@ -57,17 +57,17 @@ class Source(Protocol):
 
     @property
     def kind(self) -> World:
-        """Kind of the evaluation, as a run's manifest has it: `frozen` or `closed-loop`."""
+        """Return the kind of world that scenes are of: `frozen` or `closed-loop`."""
         ...
 
     @property
     def name(self) -> str:
-        """Word for the source in the name of a run's folder."""
+        """Return the word for the source in the name of a run's folder."""
         ...
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Names of the meta-actions, in the environment's order."""
+        """Return the names of the meta-actions, in the environment's order."""
         ...
 
     @property
@@ -75,12 +75,12 @@ class Source(Protocol):
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Numbers of the episodes to evaluate; a run that stops early has the first of them."""
+        """Return the numbers of the episodes to evaluate; a run that stops early has the first."""
         ...
 
     @property
     def choice(self) -> Choice | None:
-        """What chose some of the episodes; None if it is all of them, or the first."""
+        """Return what chose some of the episodes; None if it is all of them, or the first."""
         ...
 
     def first(self, count: int) -> "Source":
@@ -101,7 +101,7 @@ class Source(Protocol):
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
         """Yield one scene of each of up to `most` episodes, such as to time a model on.
 
-        With `ego_alone`, helpers' scene graphs may be left out.
+        With `ego_alone`, what helpers know, their scene graphs, may be left out.
         """
         ...
 
@@ -318,7 +318,7 @@ class Spec:
 
     @property
     def fusion_obstacle(self) -> str | None:
-        """Why the ego's prompt cannot show helpers' messages; None if it can."""
+        """Return why the ego's prompt cannot show helpers' messages; None if it can."""
         if bare := [agent.answer for agent in self.agents if agent.answer in BARE]:
             return f"a {bare[0]} gives no messages to fuse; use --answer json or constrained"
         return role_agents.of_helpers().unlike(self) if self.helpers else None
@@ -329,7 +329,10 @@ class Spec:
 
     @property
     def cards(self) -> tuple[Card, ...]:
-        """The agents' model cards, with the servers of the settings put into a served model's."""
+        """Return the agents' model cards, the ego's first: what a file says of each model.
+
+        A served model's has the servers of the settings, if they name any.
+        """
         return tuple(agent.card.at(self.settings.server) for agent in self.agents)
 
     def scenario_of(self, scene: Scene) -> Scenario:
@@ -337,17 +340,18 @@ class Spec:
         return scene.seat or self.scenario
 
     def agent(self, place: int) -> int:
-        """Return the index in `agents` of who answers for the vehicle at a place, 0 the ego.
+        """Return the index in `agents` of the agent that answers for a vehicle of a scene.
 
-        Places are those of `Scene.place`. Helpers take the helpers' agents in turn.
+        An agent is a model, its prompt and how it answers. `place` is the vehicle's index
+        (`Scene.place`), 0 the ego; helpers take the helpers' agents in turn.
         """
         return 1 + (place - 1) % len(self.helpers) if place and self.helpers else 0
 
     def agent_of_answer(self, agent: int) -> int | UnsetType:
-        """Return what an answer of an agent says of it: its index, where its place would not say.
+        """Return the index of an agent as an answer states it, unset where it follows without.
 
-        So it is unset with one agent of helpers, or where every helper is asked in turn, and for
-        the ego unless other vehicles decide as well.
+        It follows from whose answer it is with one agent of helpers, or where every helper is asked
+        in turn, and for the ego unless other vehicles decide as well.
         """
         if self.several_decide and self.helpers:
             return agent
@@ -364,12 +368,12 @@ class Spec:
 
     @property
     def several_decide(self) -> bool:
-        """Whether other vehicles decide for themselves, too, as agents."""
+        """Return whether vehicles beside the ego decide for themselves, too."""
         return agent_share(self.scenario) > 0
 
     @property
     def asks_all(self) -> bool:
-        """Whether all helpers are asked, not only those whose answers a condition uses.
+        """Return whether all helpers are asked, not only those whose answers a condition uses.
 
         It is so with `ask = "all"`, with a timer, which counts what all answers cost, and for a
         driver (`ego_alone`).
@@ -378,12 +382,15 @@ class Spec:
 
     @property
     def frozen(self) -> bool:
-        """Whether scenes are recorded (`harness eval`), not simulated with the actions taken."""
+        """Return whether scenes are recorded (`harness eval`), not simulated (`harness drive`)."""
         return self.source.kind == "frozen"
 
     @property
     def ego_alone(self) -> bool:
-        """Whether the model, a rule-based driver, answers only for the ego; no helper is asked."""
+        """Return whether the model answers only for the ego, so that no helper is asked.
+
+        It is a rule-based driver then.
+        """
         return not self.ego.can.asks_helpers
 
     def viewers(self, scene: Scene) -> tuple[str, ...]:
@@ -391,10 +398,10 @@ class Spec:
         return scene.viewers[:1] if self.ego_alone else scene.viewers
 
     def changed(self, **settings: Any) -> "Spec":
-        """Return this evaluation with other values of plain settings, such as `temperature`.
+        """Return a copy of this evaluation with other values of some of its `settings`.
 
-        Raises ValueError for a setting that opens a file or model, which a field of this object
-        holds.
+        Keywords are the settings' names, such as `temperature`. Raises ValueError for one that
+        names a file or model, since a field of this object holds what was opened.
         """
         spec = replace(self, settings=structs.replace(self.settings, **settings))
         if lost := [
@@ -404,13 +411,16 @@ class Spec:
         return spec
 
     def stopped(self, looks: InterimLooks) -> "Spec":
-        """Return this evaluation as its rule has stopped it, by these looks of a run."""
+        """Return this evaluation cut to the episodes after which its stopping rule ended a run.
+
+        `looks` says after how many layouts the run was looked at.
+        """
         looks = replace(looks, layouts=len(self.source.numbers))
         return replace(self, source=self.source.first(looks.at[-1]), interim_looks=looks)
 
     @property
     def world(self) -> FrozenScenes | ClosedLoop:
-        """The record of the scenes for a run's manifest, with what may stop the run."""
+        """Return the record of the scenes for a run's manifest, with what may stop the run."""
         world = self.source.record()
         if self.stopping_rule is None:
             return world
@@ -500,7 +510,10 @@ class Spec:
 
     @property
     def ties(self) -> str:
-        """How ties between actions fall, `drawn` or `first`: by default as in a replayed run."""
+        """Return which of equally likely actions is taken: one `drawn`, or the `first`.
+
+        By default it is as in the run that is replayed.
+        """
         if self.settings.ties is not None:
             return self.settings.ties
         manifest = replayed(self.ego)
@@ -508,7 +521,7 @@ class Spec:
 
     @property
     def opening(self) -> dict[str, Any]:
-        """Options with which the models are opened: `device`, `dtype` and `batch_size`."""
+        """Return the options with which models are opened: `device`, `dtype` and `batch_size`."""
         return {name: getattr(self.settings, name) for name in ("device", "dtype", "batch_size")}
 
     @property

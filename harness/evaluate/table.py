@@ -16,9 +16,9 @@ from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 @lru_cache(maxsize=1 << 10)
 def busy_ratio(point: OperatingPoint) -> float:
-    """Return the channel's busy ratio, 0 to 1, under its background load.
+    """Return the share of time, 0 to 1, that a point's channel is busy with others' packets.
 
-    NaN if the channel model has no such figure.
+    NaN if the channel model does not know it.
     """
     return point.physical.busy_ratio() if point.physical else float("nan")
 
@@ -57,8 +57,8 @@ def table(
 ) -> Decisions:
     """Return a row for each decision, sorted by episode, step, decision point, condition and seed.
 
-    `decided` may be in any order; `more` has further columns `(n,)` in that order, by name.
-    `actions` are the names of actions, in order.
+    `decided` has n decisions in parts, in any order; `more` has further columns by name, `(n,)`, in
+    that order. `actions` are the names of the meta-actions, in order.
     """
     points_by_id = {id(part.decision_points): part.decision_points for part in decided}
     lengths = [len(decision_points) for decision_points in points_by_id.values()]

@@ -34,10 +34,10 @@ def refuse_others(run: Run) -> None:
 
 
 def others(run: Run) -> Iterator[tuple[Answer, str]]:
-    """Yield each answer of a run that states what its raw text does not say, and the first field
-    that it does so of.
+    """Yield each answer of a run that states what its raw text does not say, and in which field.
 
-    Raises UserError if a prompt of the run is neither here nor kept in it.
+    It is the first such field. Raises UserError if a prompt of the run is neither here nor kept in
+    it.
     """
     if gone := lacking(run):
         raise UserError(
@@ -62,8 +62,9 @@ def refuse_other_kept(
 ) -> None:
     """Raise UserError if an answer in `file` states what its raw text says by no agent's parsing.
 
-    So a run that somebody else began goes on from what its answers say. Also if it states a delay
-    that no agent's card declares.
+    So a run that somebody else began goes on from what its answers say. Also if an answer states a
+    delay that no agent's model card declares. `agents` are those of the run, each a model with its
+    prompt, and `actions` the names of the meta-actions, in order.
     """
     readers = []
     for agent in agents:

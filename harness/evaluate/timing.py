@@ -50,7 +50,7 @@ def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
 
 
 def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
-    """Return a latency of the median seconds of answers by role, each request sent alone.
+    """Measure how long a model takes to answer: the median seconds by role, each request alone.
 
     A role in which no answer can be timed gets the ego's time. `backend` must be the model itself:
     a cache would answer in no time. Raises Unanswered if the ego's requests got no answer, and

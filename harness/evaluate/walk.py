@@ -43,26 +43,34 @@ AskedPoint = TypeVar("AskedPoint", contravariant=True)
 class Due:
     """Hold the n decisions to be made now under one condition, in all episodes and seeds."""
 
-    at: Ints  # the index of each decision among the decision points that the world shows, (n,)
-    episode: Ints  # the episode's number of each, (n,)
-    seed: Ints  # the seed of the channel's draws for each, (n,)
+    # index of each decision's point among the decision points that the world shows now, (n,)
+    at: Ints
+    episode: Ints  # number of each decision's episode, (n,)
+    seed: Ints  # seed of the channel's draws for each, (n,)
     draws: Draws  # those draws, (n, ...)
-    # the decision that each helper makes itself now, in the same world, (n, H): its place among
-    # these; -1 where it makes none. None where messages hold no plans
+    # index among these n decisions of the one that each of H helpers makes itself now, in the same
+    # world, (n, H); -1 where it makes none. None where messages hold no plans
     senders: Ints | None = None
 
     @property
     def episodes(self) -> list[tuple[int, int]]:
-        """Number and seed of the episode of each decision; together they name a walk."""
+        """Return the episode's number and the channel's seed of each decision.
+
+        Together they name a walk: one episode under the condition.
+        """
         return list(zip(self.episode.tolist(), self.seed.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
 class Decided(Generic[DecisionPoint]):
-    """Hold the n decisions that were made at one step under one condition."""
+    """Hold the n decisions that were made at one step under one condition.
+
+    A step is one round of decisions in all episodes.
+    """
 
     point: OperatingPoint  # the condition
-    decision_points: Sequence[DecisionPoint]  # the decision points that the world showed
+    # the decision points, scenes as a rule, that the world showed; `due.at` has indices in them
+    decision_points: Sequence[DecisionPoint]
     due: Due  # the decisions that were due
     result: Coordination  # what was decided, (n, ...)
     said: SentIntents  # what vehicles sent over the channel, attackers' lies included
@@ -75,24 +83,28 @@ class World(Protocol[DecisionPoint]):
     """
 
     def observe(self) -> Sequence[DecisionPoint]:
-        """Return each distinct decision point to be decided now; none once all episodes ended."""
+        """Return each distinct decision point, such as a scene, at which decisions are due now.
+
+        There is none once all episodes have ended.
+        """
         ...
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return a condition's decisions in the points that `observe` returned last."""
+        """Return the decisions due under a condition in the points that `observe` returned last."""
         ...
 
     def site(self, units: Collection[Unit]) -> Site | None:
-        """Return true positions of vehicles and roadside units at the last observed points.
+        """Return the true positions of vehicles at the n points last observed, `(n, ...)`.
 
-        The shape is `(n, ...)`. None in a world without positions.
+        `units` are the roadside units, antennas beside the road, whose links are wanted, too. None
+        in a world without positions.
         """
         ...
 
     def outlook(self) -> Outlook | None:
-        """Return what egos see of their regions at the last observed points, `(n, ...)`.
+        """Return how much egos see of where a danger may come from at the points last observed.
 
-        None in a world without positions.
+        Arrays are `(n, ...)`. None in a world without positions.
         """
         ...
 
@@ -123,10 +135,10 @@ class World(Protocol[DecisionPoint]):
 
 
 class SceneWorld:
-    """Base class of worlds whose decision points are scenes of a scenario."""
+    """Describe a world whose decision points are scenes of a scenario; a base class."""
 
     scenario: Scenario  # the scenario of the scenes
-    scenes: Sequence[Scene]  # the scenes just shown
+    scenes: Sequence[Scene]  # the scenes that `observe` returned last
 
     def site(self, units: Collection[Unit]) -> Site:
         decision_points = [(scene.state, scene.viewers) for scene in self.scenes]
@@ -168,7 +180,7 @@ class Ask(Protocol[AskedPoint]):
         ...
 
     def others(self, points: Sequence[AskedPoint], /, question: Question, at: Ints) -> Intents:
-        """Return the intents, `(n, ...)`, where helpers are asked another question.
+        """Return the intents at n points, `(n, ...)`, where helpers are asked another question.
 
         Only the points at the indices `at` need values.
         """
@@ -177,27 +189,29 @@ class Ask(Protocol[AskedPoint]):
     def helpers(
         self, points: Sequence[AskedPoint], /, wanted: Bools, question: Question = PLAIN
     ) -> Intents:
-        """Ask the helpers marked in `wanted`, `(n, H)`: n points, H helpers.
+        """Ask some helpers, those marked in `wanted`, `(n, H)`, at n points with H helpers.
 
-        Returns the intents of the points in which a helper is marked.
+        Returns the intents at the points in which a helper is marked, in their order.
         """
         ...
 
     def fusion_call(
         self, points: Sequence[AskedPoint], /, codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return the ego's answers to K sets of messages, by their codes (`codes_of`), `(K,)`.
+        """Return what egos answer if they are asked once more, with each of K sets of messages.
 
-        `rewrites` says how the messages are shown.
+        `codes`, `(K,)`, has for each set an integer that says at which point who was heard
+        (`codes_of`); `rewrites` says how the messages are shown.
         """
         ...
 
     def call_of_agents(
         self, points: Sequence[AskedPoint], /, at: Ints, intents: Intents
     ) -> FusionCall:
-        """Return the fusion call of the agents at the points `at`, `(n,)`.
+        """Return the function that asks n agents once more, with the plans that each has heard.
 
-        It asks them again with the plans in `intents`, `(n, ...)`, that each has heard.
+        An agent is a vehicle that decides for itself. `at`, `(n,)`, has the index of each one's
+        point, and `intents`, `(n, ...)`, the plans.
         """
         ...
 
@@ -208,10 +222,11 @@ def walk(
     ask: Ask[DecisionPoint],
     ties: str,
 ) -> Iterator[Sequence[Decided[DecisionPoint]]]:
-    """Yield the decisions of each step, until every episode under every condition has ended.
+    """Play a world: yield the decisions of each step until every episode has ended.
 
-    `ask` gives the intents, `points` are the conditions. Of actions that are equally likely, `ties`
-    takes the `first`, or one that is `drawn`.
+    `points` are the conditions, under each of which every episode is played; `ask` gives what
+    vehicles intend. Of actions that are equally likely, `ties` takes the `first`, or one that is
+    `drawn`.
     """
     steps = _steps(world, points, ask, ties)
     while True:
@@ -353,11 +368,12 @@ def _answers_of_helpers(
 
 
 def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) -> Intents:
-    """Return the intents of n decisions with what their helpers send under a condition.
+    """Return what vehicles intend in n decisions that are due, as the ego may hear it.
 
-    `answers` has the intents at all decision points, by question. Helpers' may be answers to
-    another question, or come from another decision's scene; who has no other to hear from hears
-    nobody. Distances and inference times stay the decision's own.
+    `point` is the condition and `answers` has the intents at all decision points, by question.
+    Helpers' may be answers to another question, or come from another decision's scene, as in a
+    control; who has no other to hear from hears nobody. Distances and inference times stay the
+    decision's own.
     """
     intents = _able(point, answers[PLAIN], due)
     if point.question != PLAIN:
@@ -385,7 +401,10 @@ def _able(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
-    """Return the intents with the sizes of replies by the point's content and encoding."""
+    """Return intents with the sizes of replies by what messages hold and how they are encoded.
+
+    Both are settings of the operating point `point`.
+    """
     sizes = bits(point, intents)
     return intents if sizes is intents.payload_bits else replace(intents, payload_bits=sizes)
 
@@ -400,17 +419,20 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
 
 
 class Memory:
-    """Keep the state of a condition's consensus rule between steps, for each episode and seed."""
+    """Keep the memory of a condition's consensus rule between the decisions of each episode.
+
+    Each episode and channel seed has its own.
+    """
 
     def __init__(self) -> None:
         self._state: dict[tuple[int, int], Floats] = {}
 
     def recall(self, due: Due) -> Floats | None:
-        """Return the rule's state for n decisions, K numbers each, `(n, K)`; None at the first."""
+        """Return the rule's memory for n decisions, K numbers each, `(n, K)`; None at the first."""
         return np.array([self._state[place] for place in due.episodes]) if self._state else None
 
     def keep(self, due: Due, state: Floats) -> None:
-        """Store the rule's state after n decisions, `(n, K)`; nothing if K is 0."""
+        """Store the rule's memory after n decisions, `(n, K)`; nothing if K is 0."""
         if state.shape[-1]:
             self._state |= dict(zip(due.episodes, state, strict=True))
 
@@ -443,10 +465,11 @@ def heard_codes(
     sent: Mapping[OperatingPoint, Exchange],
     n: int,
 ) -> Ints:
-    """Return the codes (`codes_of`) of all sets of messages that some condition's ego hears.
+    """Return all K sets of messages that some ego hears, each as an integer (`codes_of`), `(K,)`.
 
-    They are sorted and distinct, `(K,)`. Only conditions with a fusion call count. The mappings
-    have decisions, messages and exchanges by condition; `n` is the number of decision points.
+    They are sorted and distinct. Only conditions count whose egos are asked once more with what
+    they heard. The mappings have by condition the decisions due, what was sent, and who was heard;
+    `n` is the number of decision points.
     """
     codes = [np.empty(0, dtype=int)]
     for point, due_here in due.items():
@@ -460,14 +483,18 @@ def heard_codes(
 
 
 def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
-    """Return for each decision the number of its point that is used in codes, `(n_decisions,)`.
+    """Return for each decision the number of its decision point that stands in codes, `(m,)`.
 
-    It is the point's index, or where messages come from another point, `n` times that plus the
-    other's index, with `n` the number of points.
+    There are m decisions due under the condition `point`, and `n` decision points. The number is
+    the point's index, or where messages come from another point, as in a control, `n` times that
+    plus the other's index.
     """
     return due.at * n + due.at[_sources(point, due)] if point.rewrites.elsewhere else due.at
 
 
 def shown_attackers(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:
-    """Return who attacks, `(n, H)`, if the prompt of a fusion call depends on it; else None."""
+    """Return a mask of the senders that attack, `(n, H)`; None if no prompt depends on it.
+
+    A prompt that shows messages depends on it if attacks change these.
+    """
     return broadcast.attackers if point.rewrites.changes.of_attackers else None

@@ -15,18 +15,14 @@ Colour = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Ambient:
-    """Describe one kind of light and weather by its effect on cameras and rendered pictures.
+    """Describe one kind of light and weather by its effect on cameras and rendered pictures."""
 
-    `camera_m` and `fades_m` are in m; within `glare_rad` of a low sun a camera tells nothing (0
-    without one).
-    """
-
-    camera_m: float  # distance up to which a camera tells class, indicator and brake lamps
-    fades_m: float  # distance over which contrast falls to 1/e
+    camera_m: float  # distance up to which a camera tells class, indicator and brake lamps, m
+    fades_m: float  # distance over which contrast falls to 1/e, m
     light: float = 1.0  # brightness of what the sky lights, 1 by day; lamps keep their brightness
-    haze: Colour = (205, 217, 228)  # colour to which everything fades
-    sky: Colour = (134, 178, 222)  # colour overhead
-    # angle around a low sun within which a camera tells nothing; 0 without a low sun
+    haze: Colour = (205, 217, 228)  # colour to which everything fades: red, green and blue
+    sky: Colour = (134, 178, 222)  # colour overhead: red, green and blue
+    # angle around a low sun within which a camera tells nothing, radians; 0 without a low sun
     glare_rad: float = 0.0
 
 

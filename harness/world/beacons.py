@@ -94,8 +94,8 @@ def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> Ve
 def lead_in(p: Parameters, poses: Floats) -> Floats:
     """Extrapolate poses at the start back in time at constant speed, to when beacons begin.
 
-    `poses` are x, y, heading and speed of V vehicles, (V, 4); the result is (F, V, 4) for F frames,
-    the start last.
+    `poses` are x and y (m), heading (rad) and speed (m/s) of V vehicles, (V, 4); the result is (F,
+    V, 4) for F frames, the start last.
     """
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz

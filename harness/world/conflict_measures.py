@@ -43,19 +43,19 @@ DECIMALS = 3  # decimals of both, s
 
 @dataclass(frozen=True, eq=False)
 class Conflicts:
-    """Hold an agent's least times of conflict since a decision, and poses that are still needed.
+    """Hold how near in time others came to an agent since a decision, and poses still needed.
 
-    They are the time to collision (TTC) and the post-encroachment time (PET), in s; inf where
-    nobody came near. `trail` has x, y and heading of V vehicles at the last T moments, (T, V, 3),
-    and `box` a bounding box around all positions of each so far, (4, V).
+    An agent is a vehicle that decides for itself; there are V vehicles, the agent among them.
     """
 
-    ttc_s: float = np.inf  # least time to collision; inf where missing
-    pet_s: float = np.inf  # least post-encroachment time; inf where missing
-    # x, y and heading lately, (T, V, 3)
+    ttc_s: float = np.inf  # least time to collision, s; inf if nobody came near
+    # least post-encroachment time, s: from when one vehicle leaves a place to when another arrives;
+    # inf if nobody came near
+    pet_s: float = np.inf
+    # x and y, m, and heading, radians, of each vehicle at the last T moments, (T, V, 3)
     trail: Floats = field(default_factory=lambda: np.empty((0, 0, 3)))
-    # the box around all outlines of each vehicle so far: least x and y, and negative greatest, (4,
-    # V)
+    # the box around all outlines of each vehicle so far, m: least x, least y, and the negatives of
+    # greatest x and greatest y, (4, V)
     box: Floats = field(default_factory=lambda: np.empty((4, 0)))
 
     def anew(self) -> "Conflicts":
@@ -68,8 +68,8 @@ class Conflicts:
     def recast(self, places: Sequence[int]) -> "Conflicts":
         """Return these records for a changed list of vehicles.
 
-        `places` has, for each vehicle now, its index in the list before, or -1 for a new one. The
-        past poses of a vehicle that has left are dropped.
+        `places` has for each vehicle now its index in the list before, -1 for a new one. The past
+        poses of a vehicle that has left are dropped.
         """
         at = np.array(places)
         trail = (
@@ -108,9 +108,10 @@ def observe(
 ) -> list[Conflicts]:
     """Return the conflicts of each of W worlds, updated by some more frames.
 
-    `poses` are x, y, heading and speed, (W, frames, vehicles, 4), the ego first, NaN where there is
-    none, and `sizes_m` length and width, (W, vehicles, 2). `first_frame`, (W,), is the number of
-    each world's first frame here, and `hz` is frames a second.
+    `before` has each world's until then. `poses` are x and y, m, heading, radians, and speed, m/s,
+    (W, frames, vehicles, 4), the ego first, NaN where there is no vehicle, and `sizes_m` length and
+    width, (W, vehicles, 2). `first_frame`, (W,), is the number of each world's first frame here,
+    and `hz` is frames a second.
     """
     every = max(1, round(hz / MOMENTS_HZ))
     numbers = first_frame[:, None] + np.arange(poses.shape[1])
@@ -173,9 +174,9 @@ def times_to_collision(
 ) -> Floats:
     """Return the time to collision of n pairs of vehicles that drive straight on, (n,) s.
 
-    It is inf for never. `poses` and `others` are x, y, heading and speed, (n, 4), and the sizes
-    length and width, (n, 2). The rectangles touch when their extents overlap on all four of their
-    axes.
+    It is inf for never. `poses` and `others` are x and y, m, heading, radians, and speed, m/s, of
+    the one and the other of each pair, (n, 4), and the sizes length and width, m, (n, 2). The
+    rectangles touch when their extents overlap on all four of their axes.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     its_cos, its_sin = np.cos(others[:, 2]), np.sin(others[:, 2])

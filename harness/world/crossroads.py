@@ -126,7 +126,10 @@ def _approach(path: Path) -> Floats:
 
 @cache
 def network() -> Any:
-    """Return highway-env's road network of its intersection environment."""
+    """Return the road network of highway-env's `IntersectionEnv`.
+
+    It is a `highway_env.road.road.RoadNetwork`.
+    """
     from highway_env.envs.intersection_env import IntersectionEnv
 
     env = IntersectionEnv.__new__(IntersectionEnv)

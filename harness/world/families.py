@@ -16,11 +16,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Family(Protocol):
-    """Read the names of scenarios that an extension makes by name, such as `env:merge-v0`.
-
-    `heading` stands above its options in the help of commands; `options` has the help of each
-    option that names one of its scenarios.
-    """
+    """Read the names of scenarios that an extension makes by name, such as `env:merge-v0`."""
 
     heading: str  # above its options in the help of commands
     # options of commands that take a scenario, which name one of the family instead, and their

@@ -124,29 +124,33 @@ def _measure(
 
 @dataclass(frozen=True)
 class Lanes:
-    """Hold the L lanes of a network as arrays, so that many vehicles are located at once.
+    """Hold the L lanes of a road network as arrays, so that many vehicles are located at once.
 
-    Lanes that are neither straight nor an arc are left to highway-env.
+    Lanes are numbered from 0. A lane is known by highway-env's index: the two nodes of its road,
+    and its number from the left. Lanes that are neither straight nor an arc are left to
+    highway-env.
     """
 
-    number: dict[Lane, int]  # number of each lane
-    names: list[Lane]  # lane of each number
-    base: Floats  # beginning of a straight lane, or centre of an arc, (L, 2)
-    along: Floats  # direction of a straight lane, (L, 2)
-    across: Floats  # direction to its right, (L, 2)
-    heading: Floats  # heading of a straight lane
-    length: Floats  # m
-    width: Floats  # m
-    arc: Bools  # whether the lane is an arc
-    radius: Floats  # radius of an arc
-    phase: Floats  # phase of an arc's beginning, rad
-    sign: Floats  # 1 if an arc turns clockwise as pictures show it, else -1
-    others: dict[int, Any]  # highway-env's lane of each number that is neither
+    number: dict[Lane, int]  # number of each lane by highway-env's index
+    names: list[Lane]  # highway-env's index of each lane, by number
+    base: Floats  # beginning of a straight lane, or centre of an arc, m, (L, 2)
+    along: Floats  # direction of a straight lane, a vector of length 1, (L, 2)
+    across: Floats  # direction to its right, a vector of length 1, (L, 2)
+    heading: Floats  # heading of a straight lane, radians, (L,)
+    length: Floats  # length of each lane, m, (L,)
+    width: Floats  # width of each lane, m, (L,)
+    arc: Bools  # whether each lane is an arc, (L,)
+    radius: Floats  # radius of an arc, m, (L,)
+    phase: Floats  # angle on its circle at which an arc begins, radians, (L,)
+    sign: Floats  # 1 if an arc turns clockwise as pictures show it, else -1, (L,)
+    # by number each lane that is neither, a `highway_env.road.lane.AbstractLane`
+    others: dict[int, Any]
 
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
-        """Return positions along and to the right of lanes (m), (...), as highway-env has them.
+        """Return how far positions are along lanes, and how far to the right of their middle, m.
 
-        `xy` are positions, (..., 2) m, and `lane` is the number of each one's lane, (...).
+        Both are (...). `xy` are positions, (..., 2) m, and `lane` is the number of each one's lane,
+        (...).
         """
         away = xy - self.base[lane]
         along, lateral = np.vecdot(away, self.along[lane]), np.vecdot(away, self.across[lane])
@@ -167,7 +171,10 @@ class Lanes:
             yield from zip(*np.nonzero(np.isin(lane, list(self.others))), strict=True)
 
     def heading_at(self, along: Floats, lane: Ints) -> Floats:
-        """Return the heading (rad) of lanes (...) at positions (m) along them, (...)."""
+        """Return the heading of lanes at distances along them, radians, (...).
+
+        `along` are the distances, m, (...), and `lane` the lanes' numbers, (...).
+        """
         heading = self.heading[lane]
         arcs = self.arc[lane]
         if arcs.any():
@@ -285,7 +292,7 @@ class Fleet:
         self.section[at] = v.route.index(v.target_lane_index)
 
     def keep(self, rows: Bools) -> None:
-        """Drop the worlds whose entry in `rows`, (B,), is false."""
+        """Drop the worlds, B rows of all arrays, whose entry in the mask `rows`, (B,), is false."""
         self.worlds = [
             world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept
         ]
@@ -295,9 +302,10 @@ class Fleet:
         self._index()
 
     def write(self, row: int, world: "World") -> set[str]:
-        """Copy the vehicles of one row back into its world.
+        """Copy the vehicles of one row of the arrays back into its world.
 
-        Returns the ids of vehicles that had crashed before the last frame.
+        `row` is the world's index among the B. Returns the ids of vehicles that had crashed before
+        the last frame.
         """
         world.frame = int(self.frame[row])
         names = self.lanes.names

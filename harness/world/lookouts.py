@@ -34,10 +34,9 @@ DANGER = "danger"
 class Draft:
     """Hold one random draw of an episode's start, not yet checked for who sees the danger.
 
-    `phantoms` are the danger as it would come from each sector, whether or not it is in the layout.
-
-    `layout` has nobody in the blind seats, from which no danger can be seen; `seats` are the cars
-    there, none if the draw names none.
+    A danger is the vehicle that would meet an ego which keeps its speed; a sector is a direction
+    that it may come from. Lookouts are helpers that see it wherever it comes from, and blind seats
+    places from which it cannot be seen.
     """
 
     layout: Layout  # with the lookouts as helpers, and nobody in the blind seats

@@ -31,23 +31,20 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 class Outcome:
     """Describe how an episode ended for one agent (usually the ego), or that it still runs.
 
-    `result` is `running`, `cleared` (the only success), `collision`, `time_out`, `late` or
-    `off_road`, decided at `time_s` (None while running). Of a collision `partner` is the other's
-    id, `striker` whose front hit and `fault` who should have given way; all three are None without
-    one. `least_gap_m` is the smallest distance so far to another vehicle's outline.
+    What is said of a collision is None without one.
     """
 
     # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure:
     # `time_out` (never), `late` (too long after the full-view driver) or `off_road`; `running`
     # while undecided
     result: Result = "running"
-    time_s: float | None = None  # when it was decided; None while running
+    time_s: float | None = None  # seconds from the start until it was decided; None while running
     partner: str | None = None  # id of the vehicle that the ego collided with
     # whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe)
     striker: str | None = None
     # who should have given way, or drove into the other's back: `ego` or `other`
     fault: str | None = None
-    # smallest distance so far between the ego's outline and any other vehicle's
+    # smallest distance so far between the ego's outline and any other vehicle's, m
     least_gap_m: float = 1000.0
     other_crashes: int = 0  # number of vehicles that crashed without the ego
 
@@ -57,7 +54,7 @@ class Outcome:
 
     @property
     def success(self) -> bool:
-        """Whether the ego reached its goal in time and without a collision."""
+        """Return whether the ego reached its goal in time and without a collision."""
         return self.result == "cleared"
 
     def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":

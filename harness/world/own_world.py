@@ -10,10 +10,11 @@ from harness.world.world import World
 
 
 class OwnWorld(World):
-    """An episode that is played elsewhere, and goes on from its seed and the actions so far.
+    """Play an episode elsewhere, from its seed and the actions so far; a base class.
 
-    A scenario of such worlds names the class (`Scenario.world`). The harness knows neither its
-    layout nor a danger.
+    Something beside the harness's simulator plays it, such as a gymnasium environment. A scenario
+    of such worlds names the class (`Scenario.world`). The harness knows neither its layout, where
+    vehicles start, nor a danger.
     """
 
     @classmethod
@@ -23,7 +24,10 @@ class OwnWorld(World):
 
     @classmethod
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> World:
-        """Restore the world of a state: its episode is played again with the actions taken."""
+        """Restore the world of a state: play its episode again with the actions taken.
+
+        `snapshot` is what `snapshot` returned for it, an `ActionsTaken`.
+        """
         world = cls.begun(scenario, state.episode_seed)
         for frame, action in snapshot.taken:
             world.advance(frame)

@@ -31,7 +31,10 @@ ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000
 
 
 def frames(latency_s: float, simulation_hz: int) -> int:
-    """Return a latency in whole frames, rounded up."""
+    """Return a latency in whole frames of the simulation, rounded up.
+
+    `simulation_hz` is the number of frames a second.
+    """
     return math.ceil(latency_s * simulation_hz - ROUNDING_FRAMES)
 
 
@@ -42,18 +45,20 @@ class Parameters:
     Raises UserError if a value is out of bounds.
     """
 
-    # the levels that SLOWER, IDLE and FASTER step through
+    # speeds that SLOWER, IDLE and FASTER step through, m/s
     target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
-    braking_mps2: float = 8.0  # hardest braking
-    acceleration_mps2: float = 3.0  # hardest acceleration
+    braking_mps2: float = 8.0  # hardest braking, m/s2
+    acceleration_mps2: float = 3.0  # hardest acceleration, m/s2
     decisions: int = 6  # number of decisions in an episode
     decision_period_s: float = 1.0  # seconds between two decisions
     # seconds from seeing to acting, below the period, in decision trees and for reference drivers:
     # the paper's inference. Until then the ego keeps to its last action
     decision_lag_s: float = 0.145
     simulation_hz: int = 50  # frames a second
-    time_limit_s: float = 10.0  # an ego that has not reached its goal by then has failed
-    # how much later than the full-view driver an ego may reach its goal
+    # seconds after which an ego that has not reached its goal has failed
+    time_limit_s: float = 10.0
+    # seconds later than the full-view driver, which sees everything, at which an ego may still
+    # reach its goal
     delay_allowance_s: float = 1.0
     # the same in a layout without a danger, where `limits` is 2: half of what one needless SLOWER
     # costs (`benchmarks/caution.py`)
@@ -64,14 +69,14 @@ class Parameters:
     # `harness.world.beacons` has the sources of these parameters
     beacon_rule: BeaconRule = "fixed"
     beacon_hz: float = 10.0  # beacons a second; under `cam`, checks a second whether one is due
-    beacon_delay_s: float = 0.02  # time from a beacon's pose until receivers have it
+    beacon_delay_s: float = 0.02  # seconds from a beacon's pose until receivers have it
     beacon_loss: float = 0.08  # probability that a receiver does not receive a beacon
     # physical radio that gives this loss on each link instead, and settings of its own, each
     # behind `+`
     beacon_channel: str = ""
-    beacon_noise_m: float = 0.2  # standard deviation of a beacon's position on each axis
-    beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed
-    beacon_noise_rad: float = 0.0035  # standard deviation of a beacon's heading
+    beacon_noise_m: float = 0.2  # standard deviation of a beacon's position on each axis, m
+    beacon_noise_mps: float = 0.1  # standard deviation of a beacon's speed, m/s
+    beacon_noise_rad: float = 0.0035  # standard deviation of a beacon's heading, radians
     ambient: str = DAY  # light and weather, one of `harness.world.ambient`
     # how many helpers have the danger in sight at the first decision: `0` to `3`; `each` of these
     # in turn, by the layout seed modulo 4; `drawn` evenly from these; or `any`, as many as the
@@ -146,7 +151,7 @@ class Parameters:
 
     @property
     def lag_frames(self) -> int:
-        """`decision_lag_s`, the time from seeing to acting, in whole frames."""
+        """Return `decision_lag_s`, the time from seeing to acting, in whole frames."""
         return frames(self.decision_lag_s, self.simulation_hz)
 
     def allowance_s(self, danger: str | None) -> float:
@@ -170,7 +175,7 @@ class Witnessed(Parameters):
     """Hold the parameters of a scenario in which the number of witnesses can be declared.
 
     A witness is a helper that has the danger in sight at the first decision. The defaults are those
-    of the suite `v2v-safety-2`.
+    of the suite `v2v-safety-2`. Raises UserError if a value is out of bounds.
     """
 
     witnesses: str = "each"
@@ -181,9 +186,9 @@ class Witnessed(Parameters):
 
 @dataclass(frozen=True)
 class Shared(Parameters):
-    """Hold the parameters of a scenario whose helpers have goals of their own (`Scenario.seats`).
+    """Hold the parameters of a scenario whose helpers may be agents, with goals of their own.
 
-    Raises UserError if a value is out of bounds.
+    An agent decides for itself (`Scenario.seats`). Raises UserError if a value is out of bounds.
     """
 
     # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them

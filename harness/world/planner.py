@@ -45,18 +45,15 @@ Point = tuple[Floats, Floats]
 class Sequences:
     """Hold n sequences of meta-actions that the planner tries, with what each does to the ego.
 
-    `first` has each one's first action and `calm` its rank, the calmest first. `levels`, (n,
-    decisions), are changes of the target speed's level. A way is one of the ego's paths that lie
-    side by side: `ends` is the final one, counted to the right, and `right_m`, (n, steps of
-    `STEP_S`), the distance to the right of the present one; None if the ego stays. `shift` is the
-    index of its lateral motion.
+    A way is one of the ego's paths that lie side by side, as lanes do. A step is `STEP_S` seconds
+    of the motion.
     """
 
-    first: Sequence[str]  # first action of each, (n,)
+    first: Sequence[str]  # name of each one's first action, (n,)
     levels: Ints  # levels by which each decision changes the target speed, (n, decisions)
     ends: Ints  # final way, counted to the right from the present one, (n,)
     calm: Ints  # rank of each among all of them, the calmest first, (n,)
-    # distance to the right of the way that the ego is on now, (n, steps); None if it stays
+    # distance to the right of the way that the ego is on now, m, (n, steps); None if it stays
     right_m: Floats | None
     shift: Ints  # index of each one's lateral motion among the distinct ones, (n,)
 
@@ -65,15 +62,13 @@ class Sequences:
 class Rollouts:
     """Hold the ego's predicted motions, each shared by all action sequences that lead to it.
 
-    `travelled_m` is the distance along the ego's way, its present path, and `right_m` that to the
-    right of it (None if it stays), both (motions, steps of `STEP_S`); `motion` has the index of
-    each sequence's motion.
+    A way is one of the ego's paths that lie side by side, as lanes do. A step is `STEP_S` seconds.
     """
 
-    travelled_m: Floats  # distance along the ego's way, (motions, steps)
-    # distance to the right of the way that the ego is on now, (motions, steps); None if it stays
+    travelled_m: Floats  # distance along the ego's way, m, (motions, steps)
+    # distance to the right of the way that the ego is on now, m, (motions, steps); None if it stays
     right_m: Floats | None
-    motion: Ints  # index of the motion to which each sequence leads, (n,)
+    motion: Ints  # index of the motion to which each of n sequences leads, (n,)
 
     @cached_property
     def speed_mps(self) -> Floats:
@@ -196,7 +191,10 @@ def _sequences(
 
 
 def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
-    """Return by how many target speed levels each decision changes the target, (n, decisions)."""
+    """Return by how many levels each decision changes the ego's target speed, (n, decisions).
+
+    `sequences` are n sequences of meta-actions; the levels are the scenario's target speeds.
+    """
     return _changes(sequences, SPEED)
 
 
@@ -283,15 +281,14 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
 class Motion:
     """Describe the predicted motion of another vehicle, and the ego's path that it may meet.
 
-    `way` and `path` are the ego's and the other's paths; `begin_m` is the ego's present arc length,
-    `arc_m`, (steps,), the other's later ones, and `size_m` the other's length and width.
+    A position on a path is its distance along it from the beginning.
     """
 
-    way: Path  # the ego's way
-    begin_m: float  # the ego's present position on it
+    way: Path  # the ego's path
+    begin_m: float  # the ego's present position on it, m
     path: Path  # the other's path
-    arc_m: Floats  # the other's position on its path, (steps,)
-    size_m: tuple[float, float]  # the other's length and width
+    arc_m: Floats  # the other's position on its path after each step of `STEP_S`, m, (steps,)
+    size_m: tuple[float, float]  # the other's length and width, m
 
 
 def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:

@@ -34,21 +34,21 @@ NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
 class Path:
     """Describe one path along the road, in consecutive sections, each a lane of highway-env.
 
-    `approach` is where it comes from and `route` what it does, such as `straight`. It has n evenly
-    spaced `points`, (n, 2) m, at arc lengths `arc_m`, (n,). Its sections end at `ends_m`, and have
-    the names `roles` in scene graphs and the lanes `lanes`. Of two paths the one with the higher
-    `priority` has the right of way.
+    An arc length is the distance along the path from its beginning.
     """
 
-    approach: str  # where it comes from
+    approach: str  # where it comes from, such as `left`
     route: str  # what it does, such as `straight`. A vehicle on a route `left` or `right` indicates
-    points: Floats  # evenly spaced points, (n, 2) m
-    arc_m: Floats  # distance of each point along the path, (n,)
-    # arc lengths at which a section ends and the next begins; paths of one approach share the first
-    # section
+    # n evenly spaced points, m to the east and to the south of the road's origin, (n, 2)
+    points: Floats
+    arc_m: Floats  # arc length of each point, m, (n,)
+    # arc lengths at which a section ends and the next begins, m; paths of one approach share the
+    # first section
     ends_m: tuple[float, ...]
     roles: tuple[str, ...]  # name of each section in a scene graph
-    lanes: tuple[Lane, ...]  # lane of each section
+    # highway-env's index of each section's lane: the two nodes of its road, and a number from the
+    # left
+    lanes: tuple[Lane, ...]
     priority: int  # right of way; the higher one goes first
 
     @classmethod
@@ -63,10 +63,11 @@ class Path:
         origin_m: tuple[float, float] = (0.0, 0.0),
         reach_m: float = math.inf,
     ) -> "Path":
-        """Build a path along the middle of consecutive lanes of highway-env.
+        """Build a path along the middle of consecutive lanes of a road network.
 
-        `roles` names each lane as scene graphs do. Only the part of a lane within `reach_m` of the
-        origin (`origin_m` in highway-env's frame) counts, but at least one point.
+        `network` is a `highway_env.road.road.RoadNetwork`, and `lanes` are the lanes' indices in
+        it; `roles` names each lane as scene graphs do. Only the part of a lane within `reach_m` of
+        the origin (`origin_m` in highway-env's frame) counts, but at least one point.
         """
         middles = [_within(_middle(network.get_lane(lane), origin_m), reach_m) for lane in lanes]
         corners = np.concatenate(middles)
@@ -87,19 +88,19 @@ class Path:
 
     @cached_property
     def columns(self) -> Floats:
-        """The points' coordinates, (2, n) m, each in contiguous memory."""
+        """Return the points' coordinates x and y, (2, n) m, each in contiguous memory."""
         return np.ascontiguousarray(self.points.T)
 
     @cached_property
     def headings_rad(self) -> Floats:
-        """Direction of travel at each point (rad, from +x towards +y), (n,)."""
+        """Return the direction of travel at each point (rad, from +x towards +y), (n,)."""
         along = np.gradient(self.points, axis=0)
         heading: Floats = np.arctan2(along[:, 1], along[:, 0])
         return heading
 
     @cached_property
     def bends(self) -> Floats:
-        """Absolute curvature at each point in 1/m, (n,)."""
+        """Return the absolute curvature at each point in 1/m, (n,)."""
         reach = round(BEND_M / float(self.arc_m[1]))
         turned = np.unwrap(self.headings_rad)
         padded = np.pad(turned, reach, mode="edge")
@@ -207,25 +208,20 @@ def _within(points: Floats, reach_m: float) -> Floats:
 class Crossing:
     """Describe the point where another path meets the ego's.
 
-    Its position is in m to the east and south; `ego_arc_m` and `other_arc_m` are the arc lengths
-    there along both paths.
+    An arc length is the distance along a path from its beginning.
     """
 
-    x_m: float  # position, m to the east
-    y_m: float  # position, m to the south
-    ego_arc_m: float  # arc length along the ego's path
-    other_arc_m: float  # arc length along the other path
+    x_m: float  # position, m to the east of the road's origin
+    y_m: float  # position, m to the south of it
+    ego_arc_m: float  # arc length along the ego's path, m
+    other_arc_m: float  # arc length along the other path, m
     # whether the other path crosses, or merges into a lane that the ego takes as well
     kind: Literal["crossing", "merging"] = "crossing"
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Hold what pictures show of a road's ground, in m to the east and to the *north*.
-
-    `outlines` are the edges of the surface, `marks` centre lines and `stops` stop lines, (n, 2)
-    each; `boxes` are corners (2, 2) of areas that labels must avoid.
-    """
+    """Hold what pictures show of a road's ground, in m to the east and to the *north*."""
 
     # edges of the surface, (n, 2) each: the outer one, and those of islands
     outlines: tuple[Floats, ...]
@@ -239,12 +235,8 @@ class Ground:
 class Road:
     """Describe a road with all of its paths, and which of its places matter to the ego.
 
-    `paths` are keyed by approach and route, and `ego` is the key of the ego's; `ways` are those
-    that it reaches by changing lane, from left to right. `crossings` are the points where others
-    meet the ego's path, `zone_m` the position of the conflict zone, and `sectors` the points (k, 2)
-    m that must be seen in each direction that danger can come from. `network` returns highway-env's
-    network, and `goal_m` the arc length of the goal (m); None if the goal is not a place on the
-    path. Positions are in m to the east and south of the origin.
+    A path is known by its approach (where it comes from) and its route (what it does). The conflict
+    zone is where others may meet the ego. Positions are in m to the east and south of the origin.
     """
 
     # description in frozen records: texts, and numbers with their unit in the name
@@ -257,7 +249,8 @@ class Road:
     zone_m: tuple[float, float]
     # sectors that danger can come from, each with the points (k, 2) m that must be seen
     sectors: Mapping[str, Floats]
-    # returns highway-env's network, always the same object, which must not be written to
+    # returns the road network, a `highway_env.road.road.RoadNetwork`, always the same object, which
+    # must not be written to
     network: Callable[[], Any]
     # paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie
     # side by side and are equally long
@@ -298,7 +291,11 @@ class Road:
         }
 
     def project(self, keys: Sequence[PathKey], x_m: Floats, y_m: Floats) -> Floats:
-        """Project n positions, each on the path of its own key; arc, offset and heading, (3, n)."""
+        """Project n positions, each on the path of its own key, as `Path.project` does, (3, n).
+
+        Rows of the result are arc lengths along the paths (m), unsigned offsets to the side (m) and
+        the paths' headings there (rad). `x_m` and `y_m` are (n,).
+        """
         projected, places = np.empty((3, len(keys))), defaultdict[PathKey, list[int]](list)
         for n, key in enumerate(keys):
             places[key].append(n)
@@ -326,12 +323,12 @@ class Road:
 
     @cached_property
     def zone_arc_m(self) -> float:
-        """Arc length (m) of the ego's path at the point nearest to the conflict zone."""
+        """Return the arc length (m) of the ego's path at the point nearest to the conflict zone."""
         return self.ego_path.project(*self.zone_m)[0]
 
     @cached_property
     def watched(self) -> Floats:
-        """The watched points of all sectors, one after another, (points, 2) m."""
+        """Return the points of all sectors, where a danger may come from, (points, 2) m."""
         return np.concatenate(list(self.sectors.values()))
 
 
@@ -370,9 +367,11 @@ def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Cros
 
 
 def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple[int, int]]) -> Any:
-    """Build a network of highway-env from straight lanes parallel to the x axis.
+    """Build a `highway_env.road.road.RoadNetwork` of straight lanes parallel to the x axis.
 
-    A lane is given by its two nodes, its begin, end and y in metres, and its two line types.
+    A lane is given by its two nodes, the x where it begins, the x where it ends and its y, in m,
+    and its two line types (`highway_env.road.lane.LineType`), left and right. All are `width_m`
+    wide.
     """
     from highway_env.road.lane import StraightLane
     from highway_env.road.road import RoadNetwork
@@ -407,7 +406,10 @@ def to_the_left(
 
 
 def lanes_of(network: Any) -> dict[Lane, Any]:
-    """Return the lanes of a highway-env network by their index: two nodes and a number."""
+    """Return the lanes of a road network by their index: two nodes and a number from the left.
+
+    `network` is a `highway_env.road.road.RoadNetwork`, and a lane an object of highway-env.
+    """
     lanes: dict[Lane, Any] = {}
     for begin, following in network.graph.items():
         for end, beside in following.items():
@@ -416,7 +418,11 @@ def lanes_of(network: Any) -> dict[Lane, Any]:
 
 
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
-    """Build the ground of all lanes within `far_m` of the origin: surface, and lines within it."""
+    """Build the ground that pictures show of all lanes within `far_m` of the origin.
+
+    `network` is a `highway_env.road.road.RoadNetwork`, and `origin_m` the position of the origin
+    in its frame, m.
+    """
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)
     strips = []

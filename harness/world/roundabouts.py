@@ -24,25 +24,21 @@ NAMES = ("own", "right", "oncoming", "left")
 
 @dataclass(frozen=True)
 class Roundabout:
-    """Describe a one-lane roundabout with four arms around the origin.
+    """Describe a one-lane roundabout with four arms around the origin."""
 
-    `ring_m` is the radius of the ring's middle, `entry_m` that of the arcs by which cars enter and
-    leave, and `beside_m` how far from an arm's centre line its lanes are.
-    """
-
-    ring_m: float  # radius of the middle of the ring's lane
-    entry_m: float  # radius of the arcs by which cars enter and leave
-    # from an arm's centre line to the middle of its lanes, beside the splitter island
+    ring_m: float  # radius of the middle of the ring's lane, m
+    entry_m: float  # radius of the arcs by which cars enter and leave, m
+    # distance of an arm's centre line to the middle of its lanes, beside the splitter island, m
     beside_m: float
 
     @property
     def arc_y_m(self) -> float:
-        """How far south of the centre (m) the south arm's entry and exit arcs begin."""
+        """Return how far south of the centre (m) the south arm's entry and exit arcs begin."""
         return math.sqrt((self.ring_m + self.entry_m) ** 2 - (self.beside_m + self.entry_m) ** 2)
 
     @property
     def touch_rad(self) -> float:
-        """Angle on the ring (rad, from +x towards +y) at which the south arm's entry joins it."""
+        """Return the angle on the ring (rad, from +x towards +y) where the south entry joins it."""
         return math.atan2(self.arc_y_m, self.beside_m + self.entry_m)
 
     def ring_rad(self, node: int) -> float:

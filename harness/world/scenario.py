@@ -21,16 +21,15 @@ KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers a
 class Draws:
     """Draw the random quantities of one layout, each keyed by its name and the layout seed.
 
-    So a parameter that changes one quantity leaves the draws of all others as they are.
-
-    `attempt` counts earlier draws that did not fit; `seats` are the names of cars from which the
-    danger cannot be seen.
+    A layout is the start situation of an episode. So a parameter that changes one quantity leaves
+    the draws of all others as they are.
     """
 
-    scenario: str
-    seed: int
+    scenario: str  # name of the scenario
+    seed: int  # layout seed
     attempt: int = 0  # number of earlier draws that did not fit (`harness.world.lookouts`)
-    seats: tuple[str, ...] = ()  # names of the cars in blind seats
+    # names of the cars in blind seats, places from which no danger can be seen
+    seats: tuple[str, ...] = ()
 
     def share(self, what: str) -> float:
         again = (self.attempt,) if self.attempt else ()
@@ -52,32 +51,28 @@ class Draws:
 
 @dataclass(frozen=True)
 class Spawn:
-    """Describe one vehicle at the start of an episode.
-
-    It begins at `arc_m` (m) of the path (`approach`, `route`) with `speed_mps`. At `brakes_at_s`
-    (None for never) it brakes by itself, with `brakes_mps2`, down to `brakes_to_mps`. `radio` says
-    whether one that does not help sends beacons.
-    """
+    """Describe one vehicle at the start of an episode."""
 
     id: str  # `v1`, `v2`, …
     kind: Kind  # class of vehicle
     part: Part  # `ego`, `helper` or `other`
     approach: str  # where its path comes from
     route: str  # what its path does
-    arc_m: float  # position along the path
-    speed_mps: float  # speed
-    brakes_at_s: float | None = None  # when it begins to brake by itself; None if it does not
-    brakes_mps2: float = 0.0  # its deceleration then
-    brakes_to_mps: float = 0.0  # the speed down to which it brakes
+    arc_m: float  # position along the path, m from its beginning
+    speed_mps: float  # speed, m/s
+    # seconds from the start until it begins to brake by itself; None if it does not
+    brakes_at_s: float | None = None
+    brakes_mps2: float = 0.0  # its deceleration then, m/s2
+    brakes_to_mps: float = 0.0  # the speed down to which it brakes, m/s
     radio: bool = field(default=False, kw_only=True)  # whether one that does not help sends beacons
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Hold the start of one episode: its vehicles, its buildings and its danger.
+    """Hold the start situation of one episode: its vehicles, its buildings and its danger.
 
-    `danger` is the sector that the danger comes from and `danger_id` the id of that vehicle; both
-    are None without a danger.
+    A danger is the vehicle that would meet an ego which keeps its speed; a sector is a direction
+    that it may come from.
     """
 
     spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first
@@ -106,26 +101,21 @@ class Layout:
 class Seat:
     """Describe the scenario as an agent other than the ego plays it: with that agent as the ego.
 
-    The road network, name, actions and parameters are the shared scenario's; road, goal and prompt
-    words are the agent's own.
-
-    `names` maps the key of each path of the shared road to the one that it has for this agent.
+    An agent is a vehicle that decides for itself. The road network, name, actions and parameters
+    are the shared scenario's; road, goal and prompt words are the agent's own.
     """
 
     scenario: "Scenario"  # the scenario with the agent as its ego
-    names: Mapping[PathKey, PathKey]  # the name that each path of the shared road has on the seat's
+    # by key (approach, route) of each path of the shared road the key that it has for this agent
+    names: Mapping[PathKey, PathKey]
 
 
 @dataclass(frozen=True)
 class Scenario:
     """Describe one scenario: its road, layouts, goal, actions, parameters and words for prompts.
 
-    Pickled by name and parameters, so it must be found by name in the registry.
-
-    `road` returns the road, `layout(seed, parameters)` the start of an episode, and `cleared(xy_m,
-    approaches, parameters)` whether the ego has reached its goal. `dials` are the parameters that a
-    name may set. `seats` returns the scenario as other agents play it, None if only the ego has a
-    goal; `world` is the class that plays the episodes, None for the harness's simulator.
+    A layout is the start situation of an episode. A scenario is pickled by name and parameters, so
+    it must be found by name in the registry.
     """
 
     name: str  # its name for users, and in manifests and frozen states
@@ -176,7 +166,7 @@ class Scenario:
 
     @property
     def prompt_words(self) -> dict[str, str]:
-        """Texts for prompts by name: `words`, and `speeds`, the target speeds in m/s."""
+        """Return texts for prompts by name: `words`, and `speeds`, the target speeds in m/s."""
         speeds = ", ".join(f"{speed:g}" for speed in reversed(self.parameters.target_speeds_mps))
         return {**self.words, "speeds": speeds}
 

@@ -19,7 +19,7 @@ from harness.world.state import VehicleState, WorldState
 
 
 def agent_share(scenario: Scenario) -> float:
-    """Return the probability that a vehicle that could decide for itself is an agent (ego aside).
+    """Return the probability that a vehicle which could decide for itself does so, the ego aside.
 
     0 in scenarios where only the ego has a goal.
     """
@@ -40,10 +40,11 @@ def refuse_agents(scenario: Scenario, what: str) -> None:
 
 @lru_cache(maxsize=64)
 def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
-    """Return the `Seat` of each agent that is not the ego, by the path on which it starts.
+    """Return the seat of each agent that is not the ego, by the path on which it starts.
 
-    A seat is the scenario with that agent as its ego; it has the parameters of `scenario`. Empty if
-    only the ego has a goal.
+    An agent is a vehicle that decides for itself. A seat is the scenario with that agent as its
+    ego; it has the parameters of `scenario`. A path is known by approach and route. Empty if only
+    the ego has a goal.
     """
     seats = scenario.seats() if scenario.seats else {}
     p = scenario.parameters
@@ -53,11 +54,11 @@ def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
 
 
 def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tuple[int, ...]]:
-    """Return the layout, and the indices in it of the agents: the vehicles that decide.
+    """Return a layout, and the indices among its vehicles of the agents, which decide.
 
-    The ego comes first. If `agent_share` is 0 the ego is the only agent and the layout is
-    unchanged. Otherwise agents are drawn by the layout seed, and a vehicle that could be one and
-    was not drawn becomes traffic (`other`).
+    A layout is the start situation of an episode, drawn by `seed`. The ego comes first. If
+    `agent_share` is 0 the ego is the only agent and the layout is unchanged. Otherwise agents are
+    drawn by the seed, and a vehicle that could be one and was not drawn becomes traffic (`other`).
     """
     share, seats = agent_share(scenario), seats_of(scenario)
     if not share:
@@ -77,7 +78,7 @@ def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tu
 
 
 def offsets(scenario: Scenario) -> list[int]:
-    """Return by how many frames agents' decisions may lag the common clock, ascending.
+    """Return by how many frames agents may decide later than the ego's clock, ascending.
 
     [0] unless the parameter `clock` is `apart`: then multiples of a quarter of the decision period.
     """
@@ -100,12 +101,15 @@ def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
 
 
 def seat_of(scenario: Scenario, vehicle: VehicleState | Spawn) -> Seat:
-    """Return the `Seat` of an agent other than the ego; KeyError if its path has none."""
+    """Return the seat of an agent other than the ego: the scenario with that agent as its ego.
+
+    Raises KeyError if its path has none.
+    """
     return seats_of(scenario)[vehicle.approach, vehicle.route]
 
 
 def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
-    """Return the positions in the sequence at which each scenario occurs, by first occurrence."""
+    """Return the indices at which each scenario stands in a sequence, in order of the first."""
     places: dict[Scenario, list[int]] = {}
     for n, scenario in enumerate(scenarios):
         places.setdefault(scenario, []).append(n)

@@ -24,7 +24,7 @@ def site(
     units: Collection[Unit] = (),
     zone_m: Place = (0.0, 0.0),
 ) -> Site:
-    """Return the radio links from the ego to each helper in n states, as arrays (n, ...).
+    """Return where the ego and its helpers are in n states, and what is between them, (n, ...).
 
     Each of the n `points` is a state with the ids of its ego and helpers, the ego first. Antennas
     are at vehicle centres; if a building and a vehicle both block a link, the building counts.

@@ -48,7 +48,7 @@ class _OnRoute:
 
 
 class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
-    """A vehicle that keeps its route and speed, but brakes for a slower one ahead in its lane.
+    """Drive a vehicle that keeps route and speed, but brakes for a slower one ahead in its lane.
 
     It also brakes at a fixed time if its layout says so (`Spawn.brakes_at_s`).
     """
@@ -115,9 +115,9 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
 
 
 def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)) -> Any:
-    """Return a highway-env road with the layout's vehicles on it, in order, the ego first.
+    """Return a `highway_env.road.road.Road` with a layout's vehicles on it, the ego first.
 
-    `agents` are the indices of the vehicles that decide.
+    `agents` are the indices among the layout's vehicles of those that decide.
     """
     road, static = new_road(scenario), scenario.road()
     for n, spawn in enumerate(layout.spawns):
@@ -140,7 +140,7 @@ def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)
 
 
 def copied(road: Any) -> Any:
-    """Return a copy of a highway-env road that can be simulated without changing the original."""
+    """Return a copy of a `highway_env.road.road.Road`, simulated without changing the original."""
     new = copy(road)
     new.vehicles = [copy(v) for v in road.vehicles]
     for v in new.vehicles:
@@ -149,7 +149,7 @@ def copied(road: Any) -> Any:
 
 
 def new_road(scenario: Scenario) -> Any:
-    """Return a highway-env road of the scenario, without vehicles."""
+    """Return the scenario's road without vehicles, a `highway_env.road.road.Road`."""
     return Road(network=scenario.road().network(), np_random=NOBODY_DRAWS)
 
 
@@ -164,8 +164,9 @@ def vehicle_on(
 ) -> ControlledVehicle:
     """Create a highway-env vehicle on the given section of its path, at a position and heading.
 
-    `position` is in m in highway-env's frame, `heading` in rad. If `agent` is true it takes actions
-    and follows a target speed, else it is traffic.
+    `road` is a `highway_env.road.road.Road`, and `section` the number from 0 of a section of the
+    path. `position` is in m in highway-env's frame, `heading` in rad. If `agent` is true it takes
+    actions and follows a target speed, else it is traffic.
     """
     p, static = scenario.parameters, scenario.road()
     route = list(static.paths[spawn.approach, spawn.route].lanes)
@@ -185,7 +186,7 @@ def vehicle_on(
 
 
 def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
-    """Return a spawn at a vehicle's present position and speed, as if it began there."""
+    """Return the start of a vehicle, a `Spawn`, at its present position and speed."""
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     start = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
     plans = (start.brakes_at_s, start.brakes_mps2, start.brakes_to_mps) if start else ()

@@ -20,8 +20,9 @@ W = TypeVar("W", bound=World)
 def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float]]:
     """Return when each agent would reach its goal with the road to itself, in s.
 
-    The result is keyed by layout seed, then by the agent's index among the vehicles. The agent
-    keeps its initial target speed; one that does not arrive gets the scenario's time limit.
+    An agent is a vehicle that decides for itself. The result is keyed by layout seed, then by the
+    agent's index among the vehicles. The agent keeps its initial target speed; one that does not
+    arrive gets the scenario's time limit.
     """
     worlds: dict[tuple[int, int], World] = {}
     for seed in seeds:
@@ -54,7 +55,8 @@ def on_seat(
 ) -> tuple[Scenario, Layout]:
     """Return the scenario with an agent as its ego, and the layout as that scenario names it.
 
-    The layout holds only this agent, first, and `others` (indices among the layout's vehicles).
+    `agent` is its index among the layout's vehicles. The returned layout, a start situation, holds
+    only this agent, first, and `others`, given by their indices.
     """
     spawns = [layout.spawns[n] for n in (agent, *others)]
     if not agent:

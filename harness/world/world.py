@@ -33,11 +33,7 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class Journey:
-    """Hold what has happened to one agent of an episode so far.
-
-    `hard_brakings` counts how often it began to brake harder than `HARD_BRAKING_MPS2`, and
-    `conflicts` has how near in time others came to it.
-    """
+    """Hold what has happened to one agent, a vehicle that decides, of an episode so far."""
 
     outcome: Outcome = field(default_factory=Outcome)  # its `ended` says whether it is decided
     hard_brakings: int = 0  # how often it began to brake harder than HARD_BRAKING_MPS2
@@ -49,9 +45,11 @@ class Journey:
         return replace(self, outcome=Outcome(), hard_brakings=0, conflicts=self.conflicts.anew())
 
     def passed(self, speeds_mps: Floats, gap_m: float, conflicts: Conflicts, hz: int) -> None:
-        """Record F frames: the agent's speeds, its least gap so far (m), and its conflicts so far.
+        """Record F more frames of the agent's drive.
 
-        `speeds_mps` is (F + 1,), from the frame before; `hz` is frames a second.
+        `speeds_mps` are its speeds, (F + 1,), from the frame before; `gap_m` is its least gap to
+        another vehicle so far, m, `conflicts` how near in time others came so far, and `hz` frames
+        a second.
         """
         self.outcome = replace(self.outcome, least_gap_m=gap_m)
         self.conflicts = conflicts.collided() if self.outcome.result == "collision" else conflicts
@@ -65,15 +63,15 @@ class Journey:
 class World:
     """Simulate one episode: its vehicles, its agents' records and its clock.
 
-    `journeys` are the agents' records by their index among the vehicles, 0 for the ego; `step`
-    counts decisions and `frame` simulated frames. `beacons` are those that receivers may still
-    read.
+    An agent is a vehicle that decides for itself, known by its index among the vehicles; the ego
+    has 0.
     """
 
     scenario: Scenario  # the episode's scenario
     seed: int  # seed of the episode's layout
-    layout: Layout  # its start
-    road: Any  # highway-env's road with its vehicles, the ego first
+    layout: Layout  # its start situation
+    # a `highway_env.road.road.Road` with the episode's vehicles, the ego first
+    road: Any
     step: int = 0  # number of decisions taken so far
     frame: int = 0  # number of frames simulated so far
     # what has become of each agent, by its place among the vehicles; the ego is the first
@@ -96,7 +94,7 @@ class World:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Names of the meta-actions that agents choose from, the most careful first."""
+        """Return the names of the meta-actions that agents choose from, the most careful first."""
         return self.scenario.actions
 
     @property
@@ -106,22 +104,22 @@ class World:
 
     @property
     def time_s(self) -> float:
-        """Simulated time, counted in frames (highway-env's own clock drifts)."""
+        """Return the simulated time, s, counted in frames (highway-env's own clock drifts)."""
         return self.frame / self.scenario.parameters.simulation_hz
 
     @property
     def outcome(self) -> Outcome:
-        """The ego's outcome so far."""
+        """Return the ego's outcome so far."""
         return self.journeys[0].outcome
 
     @property
     def journey(self) -> Journey:
-        """The record of the ego."""
+        """Return the record of the ego."""
         return self.journeys[0]
 
     @property
     def ended(self) -> bool:
-        """Whether the outcome of every agent is decided."""
+        """Return whether the outcome of every agent is decided."""
         return all(journey.outcome.ended for journey in self.journeys.values())
 
     def branch(self) -> "World":
@@ -235,8 +233,8 @@ class World:
     def passed(self, poses: Floats) -> None:
         """Add the beacons that vehicles sent in the last F frames.
 
-        `poses` are x, y, heading and speed of each vehicle in each frame, (F, V, 4), from the
-        origin of the scenario's road.
+        `poses` are x and y (m from the origin of the scenario's road), heading (rad) and speed
+        (m/s) of each of V vehicles in each frame, (F, V, 4).
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
 
@@ -292,7 +290,7 @@ class World:
 
     @property
     def answering(self) -> list[int]:
-        """Indices of the vehicles that can be asked for an intent: the ego, helpers and agents."""
+        """Return the indices of the vehicles that can be asked: the ego, helpers and agents."""
         return [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
 
     def _cleared(self, agent: int) -> bool:

@@ -65,7 +65,7 @@ LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
 
 
 class Frame(Image):
-    """A picture of a vehicle's cameras, with the ids of the vehicles and buildings that it shows.
+    """Hold a picture of a vehicle's cameras, with the ids of the vehicles and buildings in it.
 
     `owners`, (height, width), has for each pixel the index in `ids` of what it shows; -1 for road,
     grass and sky.
@@ -120,21 +120,19 @@ def frame(
 
 @dataclass(frozen=True, eq=False)
 class Sight(Image):
-    """A picture of a vehicle's cameras that is rendered when its pixels are read.
+    """Hold a picture of a vehicle's cameras that is rendered when its pixels are read.
 
     It holds the state instead of pixels, but is pickled as its pixels.
-
-    `size_px` is width and height.
     """
 
-    scenario: Scenario
-    state: WorldState
-    viewer_id: str
-    size_px: tuple[int, int]
+    scenario: Scenario  # the scenario of the state, whose road is drawn
+    state: WorldState  # what is around
+    viewer_id: str  # id of the vehicle whose cameras these are
+    size_px: tuple[int, int]  # width and height of the picture, pixels
 
     @property
     def frame(self) -> Frame:
-        """The rendered picture, with the owner of each pixel."""
+        """Return the rendered picture, with the owner of each pixel."""
         return _drawn(self.scenario, self.state, self.viewer_id, self.size_px)
 
     @property
@@ -152,9 +150,9 @@ _drawn = lru_cache(maxsize=KEPT)(frame)
 class Box:
     """Describe a vehicle or building as a box with painted walls."""
 
-    name: str  # id
-    corners: Floats  # corners, (4, 2) m
-    height_m: float  # height above the road
+    name: str  # id of the vehicle or building
+    corners: Floats  # its corners on the ground, (4, 2) m
+    height_m: float  # height above the road, m
     walls: Pixels  # paint on its walls, (4, ROWS, COLUMNS, 3)
     lamps: Lit  # which of that is a lamp that shines, (4, ROWS, COLUMNS)
 

@@ -20,14 +20,11 @@ Look = tuple[WorldState, VehicleState]  # a state, and the vehicle that looks ar
 
 @dataclass(frozen=True)
 class Sweep:
-    """Hold the bearings and distances of one full turn of `RAYS` rays, and what each ray hits.
+    """Hold the bearings and distances of one full turn of `RAYS` rays, and what each ray hits."""
 
-    `range_m`, (RAYS,), is inf where a ray meets nothing; `hits` has the indices of the rays that
-    end on each vehicle or building, by its id.
-    """
-
-    bearing_rad: Floats  # direction of each ray in the world frame, (RAYS,)
-    range_m: Floats  # distance to the first surface, (RAYS,); inf if there is none
+    # direction of each ray in the road's frame, radians from +x (east) towards +y (south), (RAYS,)
+    bearing_rad: Floats
+    range_m: Floats  # distance to the first surface that it meets, m, (RAYS,); inf if to none
     # indices of the rays that end on each vehicle or building, by id
     hits: dict[str, NDArray[np.intp]]
 
@@ -36,18 +33,16 @@ class Sweep:
 class Surfaces:
     """Hold the outlines that stop the rays of v viewers, n in all, viewer by viewer.
 
-    A viewer's surfaces are all other vehicles of its state, in their order, then the buildings.
-
-    `viewer`, `place` and `vehicle`, (n,), are the number of a surface's viewer, its index among
-    that viewer's surfaces, and whether it is a vehicle; `corners_m` is (n, 4, 2).
+    A viewer is a vehicle that looks. Its surfaces are all other vehicles of its state, in their
+    order, then the buildings. Positions are in m to the east and south of the road's origin.
     """
 
     origins_m: Floats  # the viewers' centres, (v, 2)
     ids: tuple[tuple[str, ...], ...]  # ids of each viewer's surfaces
-    viewer: Ints  # number of the viewer whose surface each is, (n,)
-    place: Ints  # its place among that viewer's surfaces, (n,)
-    vehicle: Bools  # whether it is a vehicle, (n,)
-    corners_m: Floats  # its corners, (n, 4, 2)
+    viewer: Ints  # number from 0 of the viewer whose surface each is, (n,)
+    place: Ints  # index from 0 of each among that viewer's surfaces, (n,)
+    vehicle: Bools  # whether each is a vehicle, (n,)
+    corners_m: Floats  # the four corners of each, (n, 4, 2)
 
     def by_viewer(self, values: Any) -> Any:
         """Return values (n,) of the surfaces as a table (v, most surfaces of a viewer).
@@ -65,7 +60,10 @@ def turned(angle_rad: Any) -> Any:
 
 
 def surfaces(looks: Sequence[Look]) -> Surfaces:
-    """Return the outlines of all vehicles and buildings around each viewer, itself excluded."""
+    """Return the outlines of all vehicles and buildings around each viewer, itself excluded.
+
+    Each of `looks` is a state and the vehicle in it that looks.
+    """
     states = {id(state): state for state, _ in looks}
     vehicles = [
         (v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in states.values() for v in s.vehicles
@@ -151,14 +149,11 @@ def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Hold m possible meetings of a ray with a surface, by ascending number of the surface.
+    """Hold m possible meetings of a ray with a surface, by ascending number of the surface."""
 
-    `t` is the distance (m) at which the ray meets it; inf if it passes by.
-    """
-
-    surface: Ints  # number of the surface, (m,)
-    target: Ints  # number of the ray, RAYS for each viewer, (m,)
-    t: Floats  # distance, m; inf if the ray passes by, (m,)
+    surface: Ints  # number of the surface among all of `Surfaces`, (m,)
+    target: Ints  # number of the ray, with `RAYS` of them for each viewer, (m,)
+    t: Floats  # distance at which the ray meets the surface, m, (m,); inf if it passes by
 
     def of(self, which: Bools) -> "Rays":
         return Rays(self.surface[which], self.target[which], self.t[which])
@@ -176,7 +171,10 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
 
 
 def cast(around: Surfaces, of: Bools) -> Rays:
-    """Cast, from all viewers, the rays that may meet one of the surfaces selected by `of`, (n,)."""
+    """Cast, from all viewers, the rays that may meet some surfaces, and return where they do.
+
+    `of` is a mask, (n,), of the surfaces that count.
+    """
     begin, count = _towards(around)
     surface = np.repeat(np.arange(len(count)), count)
     ray = np.arange(len(surface)) + (begin - np.cumsum(count) + count)[surface]

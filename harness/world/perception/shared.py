@@ -42,13 +42,12 @@ ROUNDED_M = 0.1 / 12**0.5  # standard deviation of the rounding of a graph's pla
 class Heard(NamedTuple):
     """Hold what the ego sees by itself, and the scene graphs that it got from helpers.
 
-    `source` is the state in which the helpers made `helpers`, their graphs; None for `state`, in
-    which the ego is.
+    A scene graph is what one vehicle knows of a state.
     """
 
-    state: WorldState
-    own: SceneGraph  # the ego's graph
-    helpers: Sequence[SceneGraph]  # the graphs of the helpers that were heard
+    state: WorldState  # the state in which the ego is
+    own: SceneGraph  # the ego's scene graph
+    helpers: Sequence[SceneGraph]  # the scene graphs of the helpers that were heard
     source: WorldState | None = None  # the state in which these helpers are; None for the ego's
 
 
@@ -56,18 +55,17 @@ class Heard(NamedTuple):
 class Report:
     """Describe one object as one sender reports it, with the covariance of its errors.
 
-    `node` is the object in the ego's own scene graph; None for one out of a message. `place_m2` is
-    the covariance of its position, (2, 2), and `speed_m2ps2` the variance of its speed.
+    The sender is the ego itself or a helper.
     """
 
-    detection: Detection  # in the frame of the road
-    node: Node | None  # the ego's own node; None in a message
-    place_m2: Floats  # covariance of the position, (2, 2)
-    speed_m2ps2: float  # variance of the speed
+    detection: Detection  # the object, in the frame of the road
+    node: Node | None  # the object in the ego's own scene graph; None for one out of a message
+    place_m2: Floats  # covariance of its position, m2, (2, 2)
+    speed_m2ps2: float  # variance of its speed, m2/s2
 
     @property
     def spread_m2(self) -> float:
-        """Sum of the position's variances along both axes, m²."""
+        """Return the sum of the position's variances along both axes, m²."""
         return float(np.trace(self.place_m2))
 
 

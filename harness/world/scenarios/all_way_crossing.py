@@ -36,27 +36,35 @@ AHEAD = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """Hold the parameters of scenario `all-way-crossing`; a pair bounds a uniform draw."""
+    """Hold the settings of `all-way-crossing`: cars meet at a crossing without signs.
 
-    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0)  # up to 36 km/h
-    speed_mps: float = 10.0  # of every agent at the start
-    # when an agent that keeps its speed is in the middle
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that an agent's actions step through, m/s: up to 36 km/h
+    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0)
+    speed_mps: float = 10.0  # speed of every agent at the start, m/s
+    # seconds from the start until an agent that keeps its speed is in the middle of the crossing
     arrival_s: tuple[float, float] = (3.2, 4.8)
-    # probability of agents from the left and the right; else from one of them
+    # probability of agents from both the left and the right of the ego; else from one of them
     both_share: float = 0.4
-    oncoming_share: float = 0.5  # probability of an agent from ahead
-    danger_share: float = 0.5  # probability of a car from a side that is no agent
-    # when it would be in the middle, after a cruising ego; behind an agent on its arm, later if
-    # need be
+    oncoming_share: float = 0.5  # probability of an agent from ahead of the ego
+    # probability of a danger: a car from the left or right, which is no agent
+    danger_share: float = 0.5
+    # seconds at which a danger would be in the middle, after a cruising ego; behind an agent on its
+    # arm, later if need be
     danger_offset_s: tuple[float, float] = (-0.3, 0.8)
-    follow_s: tuple[float, float] = (1.2, 1.8)  # how long after the agent before it, at the soonest
-    car_mps: tuple[float, float] = (8.5, 10.0)  # speed of a car that is no agent
+    # seconds by which a car that is no agent is behind the agent on its arm, at the least
+    follow_s: tuple[float, float] = (1.2, 1.8)
+    car_mps: tuple[float, float] = (8.5, 10.0)  # speed of a car that is no agent, m/s
     late_share: float = 0.4  # probability of a harmless car from any other arm, long after
-    # when it is in the middle, after a cruising ego
+    # seconds at which that harmless car is in the middle, after a cruising ego
     late_offset_s: tuple[float, float] = (4.5, 6.0)
-    # distance of a building's walls from the centre lines
+    # distance of a building's walls from the centre lines of the roads, m
     corner_m: tuple[float, float] = (7.0, 11.0)
-    cleared_m: float = 2.5  # how far behind the junction's exit an agent's centre has cleared it
+    # distance of an agent's centre behind the junction's exit at which it has reached its goal, m
+    cleared_m: float = 2.5
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:

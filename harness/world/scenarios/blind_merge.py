@@ -41,40 +41,49 @@ SEATS_MPS = (3.0, 4.5)
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """Hold the parameters of scenario `blind-merge`; a pair bounds a uniform draw."""
+    """Hold the settings of `blind-merge`: the ego merges from a ramp into a lane hidden by a wall.
 
-    ego_speed_mps: float = 14.0  # speed at the start: 50 km/h
-    # from the start to where the ego's way has run into the right lane
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    ego_speed_mps: float = 14.0  # speed of the ego at the start, m/s: 50 km/h
+    # distance of the ego's start to the merge, m: where its way has run into the right lane
     ego_start_m: tuple[float, float] = (58.0, 70.0)
-    cleared_m: float = 12.0  # where the ego has cleared, m beyond that point
-    danger_share: float = 0.65  # probability that an episode holds a danger
-    # when a danger is where the ego comes into its lane, after a cruising ego
+    cleared_m: float = 12.0  # distance beyond the merge at which the ego has reached its goal, m
+    # probability of a danger: a car on the right lane that is at the merge when the ego is
+    danger_share: float = 0.65
+    # seconds at which a danger is at the merge, after a cruising ego
     danger_offset_s: tuple[float, float] = (-0.1, 0.5)
-    # speed of cars on the main road, dangerous or not: 50 to 60 km/h
+    # speed of cars on the main road, dangerous or not, m/s: 50 to 60 km/h
     main_mps: tuple[float, float] = (14.0, 16.5)
-    left_share: float = 0.5  # probability of a car on the left lane at the same time
-    before_share: float = 0.4  # probability of a car on the right lane that has passed
-    # when it is where the ego comes into its lane, after a cruising ego
+    # probability of a harmless car on the left lane, beside the merge when a danger would be there
+    left_share: float = 0.5
+    before_share: float = 0.4  # probability of a harmless car on the right lane before the ego
+    # seconds at which that car is at the merge, after a cruising ego
     before_offset_s: tuple[float, float] = (-3.2, -2.2)
-    # probability of a car on the right lane that comes later than the critical headway of a merge,
-    # 3.7 s (HCM 7, equation 31-50)
+    # probability of a harmless car on the right lane that comes later than the critical headway of
+    # a merge, 3.7 s (HCM 7, equation 31-50)
     late_share: float = 0.4
-    late_offset_s: tuple[float, float] = (5.5, 7.5)  # when it is there, after a cruising ego
-    # from the wall's end to where the ego's way has run into the right lane
+    # seconds at which that later car is at the merge, after a cruising ego
+    late_offset_s: tuple[float, float] = (5.5, 7.5)
+    # distance of the wall's end to the merge, m
     wall_end_m: tuple[float, float] = (30.0, 42.0)
-    # when the truck on the left lane is beside that point, after a cruising ego
+    # seconds at which the helper truck on the left lane is beside the merge, after a cruising ego
     truck_offset_s: tuple[float, float] = (2.6, 3.6)
-    truck_mps: tuple[float, float] = (13.0, 14.0)  # speed of the truck
-    # where a helper ahead starts, m beyond that point: within LiDAR's reach of a danger
+    truck_mps: tuple[float, float] = (13.0, 14.0)  # speed of that truck, m/s
+    # where a helper car starts, m beyond the merge: within LiDAR's reach of a danger
     ahead_m: tuple[float, float] = (-10.0, 5.0)
-    ahead_mps: tuple[float, float] = (16.5, 17.5)  # its speed, not below that of who is behind it
+    # speed of a helper car, m/s, not below that of who is behind it
+    ahead_mps: tuple[float, float] = (16.5, 17.5)
 
 
 @cache
 def network() -> Any:
-    """Build a shorter version of the lanes of highway-env's `MergeEnv`.
+    """Build the road network, a `highway_env.road.road.RoadNetwork`: a main road and a ramp.
 
-    The ramp's last lane ends in the right lane of the main road.
+    It is a shorter version of that of highway-env's `MergeEnv`. The ramp's last lane ends in the
+    right lane of the main road.
     """
     from highway_env.road.lane import LineType
 

@@ -40,32 +40,45 @@ SEATS_M = (8.0, 9.5), (7.5, 8.5), (7.5, 8.5)  # from the ego to the first, and f
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """Hold the parameters of scenario `do-not-pass`; a pair bounds a uniform draw."""
+    """Hold the settings of `do-not-pass`: the ego follows a truck that hides the oncoming lane.
 
-    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)  # up to 54 km/h
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that the ego's actions step through, m/s: up to 54 km/h
+    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)
+    # seconds after which an ego that has not reached its goal has failed
     time_limit_s: float = 12.0
+    # seconds later than the full-view driver at which an ego may still reach its goal
     delay_allowance_s: float = 1.0
-    # of the ego and the truck at the start, and of the car behind: one of the target speeds
+    # speed at the start, m/s, of the ego, of the truck and of the helper behind the ego: one of the
+    # target speeds
     speed_mps: float = 5.0
     # where the ego starts, m before the conflict zone, which is where it would be beside the truck
     ego_start_m: tuple[float, float] = (28.0, 32.0)
-    ahead_m: float = 6.0  # gap to the truck's front that the ego needs when it is back on its lane
-    # an ego that has let go by what came is no farther behind the truck's rear
+    # gap from the ego's rear to the truck's front, m, with which it has passed the truck
+    ahead_m: float = 6.0
+    # gap from the ego's front to the truck's rear, m, at most, with which an ego that let the
+    # oncoming vehicle go by has reached its goal
     behind_m: float = 40.0
-    # probability that a car comes in time to meet an ego that passes at once
+    # probability that a danger comes: a car in time to meet an ego that passes at once
     danger_share: float = 0.6
-    gap_m: tuple[float, float] = (8.0, 11.0)  # from the ego to the truck, bumper to bumper
-    oncoming_mps: tuple[float, float] = (12.0, 16.0)  # speed of what comes, dangerous or not
-    # when a danger would meet an ego that stays where it is
+    gap_m: tuple[float, float] = (8.0, 11.0)  # gap from the ego to the truck, bumper to bumper, m
+    # speed of a car on the oncoming lane, dangerous or not, m/s
+    oncoming_mps: tuple[float, float] = (12.0, 16.0)
+    # seconds from the start until a danger is where the ego started
     danger_s: tuple[float, float] = (4.2, 5.9)
-    late_share: float = 0.4  # probability of a harmless car that comes later
-    # when it would meet an ego that stays where it is: 9 s is what a deployed do-not-pass warning
-    # takes for safe (Open-V2X)
+    late_share: float = 0.4  # probability of a harmless car on the oncoming lane that comes later
+    # seconds from the start until that harmless car is where the ego started: 9 s is what a
+    # deployed do-not-pass warning takes for safe (Open-V2X)
     late_s: tuple[float, float] = (15.0, 19.0)
-    # how far ahead of the truck the helper there is, bumper to bumper
+    # gap from the truck to the helper ahead of it, bumper to bumper, m
     leader_m: tuple[float, float] = (20.0, 35.0)
-    leader_mps: tuple[float, float] = (11.0, 14.0)  # its speed: it has just passed
-    follower_m: tuple[float, float] = (12.0, 20.0)  # how far behind the ego the helper there is
+    # speed of the helper ahead of the truck, m/s: it has just passed
+    leader_mps: tuple[float, float] = (11.0, 14.0)
+    # gap from the ego to the helper behind it, bumper to bumper, m
+    follower_m: tuple[float, float] = (12.0, 20.0)
 
 
 @cache
@@ -92,7 +105,7 @@ def road() -> Road:
 
 @cache
 def network() -> Any:
-    """Return a lane network like that of highway-env's `TwoWayEnv`.
+    """Build the road network, a `highway_env.road.road.RoadNetwork`, like that of `TwoWayEnv`.
 
     The left lane is in it twice, once in each direction, so that the ego may use it to pass.
     """

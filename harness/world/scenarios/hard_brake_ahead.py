@@ -40,34 +40,45 @@ SEATS_MPS = (3.0, 4.5)
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """Hold the parameters of scenario `hard-brake-ahead`; a pair bounds a uniform draw."""
+    """Hold the settings of `hard-brake-ahead`: a car brakes beyond the van that the ego follows.
 
-    target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)  # 72 km/h, half of it, and standing
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that the ego's actions step through, m/s: 72 km/h, half of it, and standing
+    target_speeds_mps: tuple[float, ...] = (0.0, 10.0, 20.0)
+    # seconds after which an ego that has not reached its goal has failed
     time_limit_s: float = 14.0
+    # seconds later than the full-view driver at which an ego may still reach its goal
     delay_allowance_s: float = 1.0
-    # everybody's at the start: motorway traffic that has come close together
+    # speed of everybody at the start, m/s: motorway traffic that has come close together
     speed_mps: float = 20.0
     # where the ego starts, m before the conflict zone
     ego_start_m: tuple[float, float] = (88.0, 92.0)
-    cleared_m: float = 45.0  # where it has passed, m behind the conflict zone
-    danger_share: float = 0.65  # probability that the car beyond the van brakes
-    # of the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in dense
-    # traffic; at 1.5 s the van's own lamps come in time, and no message is needed
+    # distance behind the conflict zone at which the ego has reached its goal, m
+    cleared_m: float = 45.0
+    danger_share: float = 0.65  # probability of a danger: that the car beyond the van brakes
+    # seconds from the ego to the van, bumper to bumper. Below 1 s, half of a motorway's drivers in
+    # dense traffic; at 1.5 s the van's own lamps come in time, and no message is needed
     headway_s: tuple[float, float] = (0.55, 0.75)
-    # of the van to the car before it: from 1.7 s on the van, which brakes late, does not crash
-    # itself
+    # seconds from the van to the car beyond it, bumper to bumper: from 1.7 s on the van, which
+    # brakes late, does not crash itself
     lead_headway_s: tuple[float, float] = (1.7, 2.0)
-    brakes_at_s: tuple[float, float] = (0.1, 1.4)  # when that car begins to brake
-    # how hard: an emergency, 6 to 9 m/s2 (SUMO's defaults; NHTSA DOT HS 811 731: above 0.6 g)
+    # seconds from the start until the car beyond the van begins to brake
+    brakes_at_s: tuple[float, float] = (0.1, 1.4)
+    # how hard it brakes, m/s2: an emergency, 6 to 9 m/s2 (SUMO's defaults; NHTSA DOT HS 811 731:
+    # above 0.6 g)
     brakes_mps2: tuple[float, float] = (6.0, 8.0)
-    # how far ahead of the ego's middle the car beside is
+    # how far ahead of the ego's middle the helper car beside it is, on the left lane, m
     beside_m: tuple[float, float] = (-3.0, 4.0)
-    # how far ahead of the ego the helper on the left lane is
+    # how far ahead of the ego the other helper on the left lane is, m
     front_m: tuple[float, float] = (48.0, 60.0)
     slow_share: float = 0.4  # probability that the farthest car on the left lane slows down
-    slow_m: tuple[float, float] = (85.0, 100.0)  # how far ahead of the ego that car is
-    slows_at_s: tuple[float, float] = (0.5, 2.5)  # when it does
-    slows_to_mps: tuple[float, float] = (14.0, 16.0)  # down to which speed
+    slow_m: tuple[float, float] = (85.0, 100.0)  # how far ahead of the ego that farthest car is, m
+    # seconds from the start until that farthest car begins to slow down
+    slows_at_s: tuple[float, float] = (0.5, 2.5)
+    slows_to_mps: tuple[float, float] = (14.0, 16.0)  # speed down to which it slows, m/s
 
 
 @cache
@@ -95,7 +106,10 @@ def road() -> Road:
 
 @cache
 def network() -> Any:
-    """Return highway-env's own straight road network of `HighwayEnv`, with two lanes."""
+    """Return the road network of highway-env's `HighwayEnv`, straight and with two lanes.
+
+    It is a `highway_env.road.road.RoadNetwork`.
+    """
     from highway_env.road.road import RoadNetwork
 
     return RoadNetwork.straight_road_network(2, start=BEGIN_M, length=END_M - BEGIN_M)

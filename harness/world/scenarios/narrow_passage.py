@@ -48,28 +48,42 @@ FROM_EAST = {
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """Hold the parameters of scenario `narrow-passage`; a pair bounds a uniform draw."""
+    """Hold the settings of `narrow-passage`: cars from both sides meet where only one fits.
 
-    target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)  # up to 29 km/h
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that an agent's actions step through, m/s: up to 29 km/h
+    target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)
+    # seconds after which an agent that has not reached its goal has failed
     time_limit_s: float = 18.0
-    speed_mps: float = 8.0  # of every agent at the start
-    # when the first agent of a side is in the middle, if it keeps its speed
+    speed_mps: float = 8.0  # speed of every agent at the start, m/s
+    # seconds from the start until the first agent of a side, if it keeps its speed, is in the
+    # middle of the passage
     arrival_s: tuple[float, float] = (3.5, 4.7)
     second_share: float = 0.5  # probability of a second agent on a side
-    headway_s: tuple[float, float] = (1.1, 1.4)  # of that one behind the first
-    danger_share: float = 0.5  # probability of a car from the side road
-    # when it is where the ego crosses the side road, after a cruising ego
+    # seconds by which a second agent is behind the first of its side
+    headway_s: tuple[float, float] = (1.1, 1.4)
+    # probability of a danger: a car from the side road, which is no agent
+    danger_share: float = 0.5
+    # seconds at which a danger is where the ego crosses the side road, after a cruising ego
     danger_offset_s: tuple[float, float] = (-0.4, 0.4)
-    side_mps: tuple[float, float] = (6.0, 8.0)  # speed of cars from the side road
-    embankment_m: tuple[float, float] = (3.0, 4.0)  # from the middle of the passage to its foot
-    # from the middle of the lane to the walls of the passage
+    side_mps: tuple[float, float] = (6.0, 8.0)  # speed of a danger, m/s
+    # distance of the middle of the passage to the foot of the embankment, along the street, m
+    embankment_m: tuple[float, float] = (3.0, 4.0)
+    # distance of the middle of the lane to the walls of the passage, m
     opening_m: tuple[float, float] = (1.6, 2.0)
-    cleared_m: float = 21.0  # how far behind the middle of the passage an agent has cleared it
+    # distance beyond the middle of the passage at which an agent has reached its goal, m
+    cleared_m: float = 21.0
 
 
 @cache
 def network() -> Any:
-    """Build the lanes of the street: three in a row for each direction, and the side road."""
+    """Build the street's road network, a `highway_env.road.road.RoadNetwork`.
+
+    It has three lanes in a row for each direction, and the side road.
+    """
     from highway_env.road.lane import LineType, StraightLane
     from highway_env.road.road import RoadNetwork
 

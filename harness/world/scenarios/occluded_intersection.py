@@ -39,40 +39,47 @@ SPARE_S = 0.15  # more than rounding, between the truck's tail and a car that cr
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """Hold the parameters of scenario `occluded-intersection`; a pair bounds a uniform draw."""
+    """Hold the settings of `occluded-intersection`: the ego crosses where buildings hide traffic.
 
-    time_limit_s: float = 10.0  # an ego that has not cleared the intersection by then never will
-    # how much later than the full-view driver an ego may clear the intersection. A needless SLOWER
-    # costs about 0.65 s: one is forgiven, two are not
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # seconds after which an ego that has not cleared the intersection never will
+    time_limit_s: float = 10.0
+    # seconds later than the full-view driver at which an ego may still clear the intersection. A
+    # needless SLOWER costs about 0.65 s: one is forgiven, two are not
     delay_allowance_s: float = 1.0
-    ego_speed_mps: float = 14.0  # speed at the start
-    # distance from the start to the centroid of the conflict zone
+    ego_speed_mps: float = 14.0  # speed of the ego at the start, m/s
+    # distance of the ego's start to the centroid of the conflict zone, m
     ego_start_m: tuple[float, float] = (61.0, 69.0)
-    # arc length behind the junction's exit at which the ego's centre has cleared it
+    # distance of the ego's centre behind the junction's exit at which it has reached its goal, m
     cleared_m: float = 2.5
     danger_share: float = 0.75  # probability that an episode holds a danger
-    # probability of left, right, oncoming, given a danger (`mechanism`: .40/.27/.33)
+    # probability that a danger comes from the left, from the right, oncoming (`mechanism`:
+    # .40/.27/.33)
     sector_shares: tuple[float, float, float] = (0.40, 0.27, 0.33)
-    # when a danger from a side reaches the conflict point, after a cruising ego would; as soon as
-    # the truck has passed, if that is later
+    # seconds at which a danger from a side is at the conflict point, after a cruising ego would be;
+    # as soon as the truck has passed, if that is later
     danger_offset_s: tuple[float, float] = (-0.4, 0.9)
-    # speed of a car from a side, dangerous or not
+    # speed of a car from a side, dangerous or not, m/s
     crossing_speed_mps: tuple[float, float] = (8.5, 12.5)
-    # when the truck passes where an oncoming danger would meet the ego, after a cruising ego would
+    # seconds at which the oncoming truck passes where an oncoming danger would meet the ego, after
+    # a cruising ego would
     truck_offset_s: tuple[float, float] = (-2.3, -1.9)
-    # speed of the truck, and of an oncoming car, dangerous or not
+    # speed of the truck, and of an oncoming car, dangerous or not, m/s
     truck_speed_mps: tuple[float, float] = (7.5, 8.5)
-    # from the truck's centre to that of an oncoming danger behind it
+    # distance of the truck's centre to that of an oncoming danger behind it, m
     follow_m: tuple[float, float] = (10.5, 13.0)
-    # distance of a building's walls from the centre lines
+    # distance of a building's walls from the centre lines of the roads, m
     corner_m: tuple[float, float] = (8.0, 15.0)
     # probability of a harmless car that comes as a danger would, from any sector, but later
     late_share: float = 0.4
-    # when that car reaches the conflict point, after a cruising ego would
+    # seconds at which that harmless car is at the conflict point, after a cruising ego would be
     late_offset_s: tuple[float, float] = (4.0, 7.0)
-    # how far behind the junction helpers are at the start
+    # how far behind the junction helpers are at the start, m
     helper_start_m: tuple[float, float] = (2.0, 8.0)
-    helper_speed_mps: tuple[float, float] = (4.0, 7.0)  # speed at which they leave
+    helper_speed_mps: tuple[float, float] = (4.0, 7.0)  # speed at which helpers leave, m/s
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:

@@ -39,39 +39,50 @@ SEATS_M = 6.0, 7.5  # blind seats: cars parked ahead of the van ahead, from cent
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """Hold the parameters of scenario `parking-exit`; a pair bounds a uniform draw."""
+    """Hold the settings of `parking-exit`: the ego pulls out between vans into a hidden lane.
 
-    target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)  # up to a driver's pace in a car park
-    ego_speed_mps: float = 4.0  # speed at the start
-    # how far before the pull-out's beginning the ego starts
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that the ego's actions step through, m/s: up to a driver's pace in a car park
+    target_speeds_mps: tuple[float, ...] = (0.0, 2.0, 4.0)
+    ego_speed_mps: float = 4.0  # speed of the ego at the start, m/s
+    # how far before the pull-out's beginning the ego starts, m
     ego_start_m: tuple[float, float] = (2.0, 8.0)
-    cleared_m: float = 6.0  # where the ego has cleared, m beyond the pull-out's end
-    danger_share: float = 0.65  # probability that an episode holds a danger
-    # when a danger is where the ego comes into the lane, after a cruising ego
+    # distance beyond the pull-out's end at which the ego has reached its goal, m
+    cleared_m: float = 6.0
+    # probability of a danger: a car from behind that is where the ego comes into the lane
+    danger_share: float = 0.65
+    # seconds at which a danger is where the ego comes into the lane, after a cruising ego
     danger_offset_s: tuple[float, float] = (-0.5, 0.3)
-    # speed of a car in the lane, dangerous or not: 8 to 28 km/h is what crossing-traffic alerts
+    # speed of a car in a lane, dangerous or not, m/s: 8 to 28 km/h is what crossing-traffic alerts
     # cover, 30 km/h and more what a street has
     lane_mps: tuple[float, float] = (8.0, 11.0)
     # probability of a harmless car that comes from behind as well, but later
     late_share: float = 0.5
-    # when it is where the ego comes into the lane, after a cruising ego
+    # seconds at which that harmless car is where the ego comes into the lane, after a cruising ego
     late_offset_s: tuple[float, float] = (8.0, 10.5)
     oncoming_share: float = 0.5  # probability of a car on the lane for the other direction
-    oncoming_m: tuple[float, float] = (30.0, 60.0)  # where it starts, m ahead of the ego
-    # gap from the ego's rear to the van behind it, at the start
+    oncoming_m: tuple[float, float] = (30.0, 60.0)  # where that car starts, m ahead of the ego
+    # gap from the ego's rear to the van behind it at the start, m
     behind_m: tuple[float, float] = (0.8, 2.0)
-    vans_m: tuple[float, float] = (0.8, 1.6)  # gap between two vans of the row
-    ahead_m: tuple[float, float] = (2.0, 8.0)  # gap from the pull-out's end to the van ahead
-    # where the car that is parked opposite stands, m before the pull-out's end
+    vans_m: tuple[float, float] = (0.8, 1.6)  # gap between two vans of the row, m
+    ahead_m: tuple[float, float] = (2.0, 8.0)  # gap from the pull-out's end to the van ahead, m
+    # where the helper car that is parked opposite stands, m before the pull-out's end
     opposite_m: tuple[float, float] = (5.0, 20.0)
-    # where the car that has just driven past is, m beyond the pull-out's end
+    # where the helper car that has just driven past is, m beyond the pull-out's end
     passed_m: tuple[float, float] = (10.0, 20.0)
-    passed_mps: tuple[float, float] = (8.0, 11.0)  # its speed
+    # speed of the helper car that has just driven past, m/s
+    passed_mps: tuple[float, float] = (8.0, 11.0)
 
 
 @cache
 def network() -> Any:
-    """Build the lanes of the street: one in each direction, the parking rows, and the pull-out."""
+    """Build the street's road network, a `highway_env.road.road.RoadNetwork`.
+
+    It has a lane in each direction, the parking rows, and the pull-out.
+    """
     from highway_env.road.lane import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED

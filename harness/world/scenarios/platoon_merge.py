@@ -35,22 +35,28 @@ RAMP, MAIN = ("ramp", "merge"), ("main", "straight")  # where agents begin
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """Hold the parameters of scenario `platoon-merge`; a pair bounds a uniform draw."""
+    """Hold the settings of `platoon-merge`: the ego merges from a ramp into a row of cars.
 
-    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)  # up to 54 km/h
-    speed_mps: float = 15.0  # speed of everybody at the start
-    # from the start to where the ramp has run into the right lane
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that an agent's actions step through, m/s: up to 54 km/h
+    target_speeds_mps: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0)
+    speed_mps: float = 15.0  # speed of everybody at the start, m/s
+    # distance of the ego's start to the merge, m: where the ramp has run into the right lane
     ego_start_m: tuple[float, float] = (58.0, 70.0)
-    cleared_m: float = 12.0  # where an agent has cleared, m beyond that point
-    third_share: float = 0.5  # probability of a third car in the platoon
-    headway_s: tuple[float, float] = (0.85, 1.05)  # from one place of the row to the next
-    # when the row's place that may be free is at the merge, after a cruising ego
+    cleared_m: float = 12.0  # distance beyond the merge at which an agent has reached its goal, m
+    third_share: float = 0.5  # probability of a third car in the platoon, the row of agents
+    # seconds from one place of the row to the next, one place more than there are cars
+    headway_s: tuple[float, float] = (0.85, 1.05)
+    # seconds at which the row's place without an agent is at the merge, after a cruising ego
     offset_s: tuple[float, float] = (-1.1, 1.1)
-    danger_share: float = 0.65  # probability that a car which is no agent takes that place
-    left_share: float = 0.5  # probability of a car on the left lane beside that place
-    # when it is beside the merge, after that place
+    danger_share: float = 0.65  # probability of a danger: a car that is no agent, in that place
+    left_share: float = 0.5  # probability of a harmless car on the left lane beside that place
+    # seconds at which that harmless car is beside the merge, after that place
     left_offset_s: tuple[float, float] = (-0.3, 0.3)
-    # from the wall's end to where the ramp has run into the right lane
+    # distance of the wall's end to the merge, m
     wall_end_m: tuple[float, float] = (30.0, 42.0)
 
 

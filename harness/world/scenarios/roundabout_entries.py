@@ -58,26 +58,39 @@ PRIORITY = {"left": 2, "oncoming": 2, "own": 1, "right": 0}
 
 @dataclass(frozen=True)
 class Parameters(Shared):
-    """Hold the parameters of scenario `roundabout-entries`; a pair bounds a uniform draw."""
+    """Hold the settings of `roundabout-entries`: cars enter a roundabout from several arms.
 
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that an agent's actions step through, m/s
     target_speeds_mps: tuple[float, ...] = (0.0, 3.5, 7.0)
+    # seconds after which an agent that has not reached its goal has failed
     time_limit_s: float = 18.0
-    # speed of everybody at the start: 25 km/h; NCHRP 672 has 23 for a circle of 12 m (8.76 R^0.386)
+    # speed of everybody at the start, m/s: 25 km/h; NCHRP 672 has 23 for a circle of 12 m (8.76
+    # R^0.386)
     speed_mps: float = 7.0
     third_share: float = 0.34  # probability of agents from three arms, not two
-    ego_s: tuple[float, float] = (3.4, 4.0)  # when the ego enters if it keeps its speed
-    # when an agent enters if both keep their speed, after the one from the arm before passes there
+    # seconds from the start until the ego enters the ring if it keeps its speed
+    ego_s: tuple[float, float] = (3.4, 4.0)
+    # seconds at which an agent enters, after the one from the arm before passes there, if both keep
+    # their speed
     offset_s: tuple[float, float] = (-1.4, 1.4)
-    danger_share: float = 0.65  # probability that an episode holds a danger
-    # how long after the car from the west a danger passes the south entry
+    # probability of a danger: a car that is no agent and goes on past the south arm
+    danger_share: float = 0.65
+    # seconds by which a danger passes the south entry behind the car from the west
     headway_s: tuple[float, float] = (1.1, 1.5)
-    # without that car, when a danger passes the south entry, after a cruising ego would
+    # without a car from the west: seconds at which a danger passes the south entry, after a
+    # cruising ego would
     danger_offset_s: tuple[float, float] = (-0.4, 0.4)
     # probability, without a danger, of a car in its place that leaves at the south arm
     leaver_share: float = 0.6
-    mound_m: tuple[float, float] = (6.0, 8.0)  # radius of the planted part of the island
-    hedge_end_m: tuple[float, float] = (15.0, 17.0)  # from the ring's centre to the end of a hedge
-    hedge_half_m: float = 0.8  # half its width; the splitter islands are 2 m wide
+    mound_m: tuple[float, float] = (6.0, 8.0)  # radius of the planted part of the island, m
+    # distance of the ring's centre to the end of a hedge, m
+    hedge_end_m: tuple[float, float] = (15.0, 17.0)
+    # half the width of a hedge, m; the splitter islands are 2 m wide
+    hedge_half_m: float = 0.8
 
 
 def key_of(begin: str, leaves: int, home: str = EGO) -> PathKey:

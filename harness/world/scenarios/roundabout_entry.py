@@ -40,39 +40,49 @@ SEATS_MPS = (1.0, 2.0)
 
 @dataclass(frozen=True)
 class Parameters(Witnessed):
-    """Hold the parameters of scenario `roundabout-entry`; a pair bounds a uniform draw."""
+    """Hold the settings of `roundabout-entry`: the ego enters a roundabout past a hedge.
 
+    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
+    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    """
+
+    # speeds that the ego's actions step through, m/s
     target_speeds_mps: tuple[float, ...] = (0.0, 4.0, 8.0)
-    # speed at the start: 29 km/h, which a circle of 22 m allows (NCHRP 672: 8.76 R^0.386)
+    # speed of the ego at the start, m/s: 29 km/h, which a circle of 22 m allows (NCHRP 672: 8.76
+    # R^0.386)
     ego_speed_mps: float = 8.0
-    # from the start to where the ego's way joins the ring
+    # distance of the ego's start to its entry, m: where its way joins the ring
     ego_start_m: tuple[float, float] = (33.0, 39.0)
-    danger_share: float = 0.65  # probability that an episode holds a danger
-    sector_shares: tuple[float, float] = (0.5, 0.5)  # probability of left, oncoming, given a danger
-    # when a danger passes where the ego enters, after a cruising ego would
+    # probability of a danger: a car on the ring that is at the entry when the ego is
+    danger_share: float = 0.65
+    # probability that a danger comes from the left arm, from the oncoming arm
+    sector_shares: tuple[float, float] = (0.5, 0.5)
+    # seconds at which a danger passes the entry, after a cruising ego would
     danger_offset_s: tuple[float, float] = (0.0, 0.6)
-    # speed of everybody on the ring (NCHRP 672: 7.7 m/s for a circle of 20 m)
+    # speed of everybody on the ring, m/s (NCHRP 672: 7.7 m/s for a circle of 20 m)
     ring_mps: tuple[float, float] = (6.8, 7.8)
-    # probability, without a danger, of a car in its place that leaves at the ego's arm
+    # probability, without a danger, of a harmless car in its place that leaves at the ego's arm
     leaver_share: float = 0.6
-    before_share: float = 0.4  # probability of a car that leaves there shortly before
-    # when that car would pass where the ego enters if it went on
+    before_share: float = 0.4  # probability of a car that leaves at the ego's arm shortly before
+    # seconds at which that car would pass the entry if it went on, after a cruising ego would
     before_offset_s: tuple[float, float] = (-1.8, -1.3)
     # probability of a car that comes as a danger would, but later than the critical headway of 4.98
     # s (HCM 7, equation 22-1) allows the ego to be in its way
     late_share: float = 0.4
-    # when it passes where the ego enters, after a cruising ego would
+    # seconds at which that later car passes the entry, after a cruising ego would
     late_offset_s: tuple[float, float] = (5.0, 7.0)
-    mound_m: tuple[float, float] = (12.0, 15.0)  # radius of the planted part of the island
-    # from the ring's centre to the end of the hedge
+    mound_m: tuple[float, float] = (12.0, 15.0)  # radius of the planted part of the island, m
+    # distance of the ring's centre to the end of the hedge, m
     hedge_end_m: tuple[float, float] = (24.0, 32.0)
-    hedge_half_m: float = 1.5  # half its width; the splitter island is 4 m wide at its narrowest
-    # how far behind the ring's edge the helper that left at the ego's arm starts
+    # half the width of the hedge, m; the splitter island is 4 m wide at its narrowest
+    hedge_half_m: float = 1.5
+    # how far behind the ring's edge the helper that left at the ego's arm starts, m
     helper_south_m: tuple[float, float] = (16.0, 22.0)
-    helper_west_m: tuple[float, float] = (6.0, 12.0)  # how far the one that left at the west arm is
-    # how far beyond the point of entry the one that entered before the ego is
+    # how far behind the ring's edge the helper that left at the west arm starts, m
+    helper_west_m: tuple[float, float] = (6.0, 12.0)
+    # how far beyond the entry the helper that entered before the ego starts, m
     helper_ahead_m: tuple[float, float] = (8.0, 14.0)
-    helper_mps: tuple[float, float] = (5.5, 7.0)  # speed of helpers
+    helper_mps: tuple[float, float] = (5.5, 7.0)  # speed of helpers, m/s
 
 
 @cache
