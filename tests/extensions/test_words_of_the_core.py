@@ -202,7 +202,6 @@ OTHER_THINGS = {
     ("coordination/operating_point.py", "text"): "of a message's key",
     ("coordination/part_settings.py", "messages"): "whose changes parts know",
     ("coordination/part_settings.py", "text"): "of a message's key",
-    ("evaluate/asking.py", "text"): "what a model says",
     ("evaluate/spec.py", "objects"): "what a prompt shows",
     ("evaluate/spec.py", "text"): "of a prompt",
     ("evaluate/walk.py", "objects"): "of the world, which lists them",
