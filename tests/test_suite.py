@@ -440,6 +440,14 @@ def test_a_run_counts_for_the_family_whose_scenes_it_has(evaluated: Harness) -> 
     assert "has a run of parking-exit as that of roundabout" in error
 
 
+def test_a_suite_that_lacks_a_dataset_of_its_name_is_named(evaluated: Harness) -> None:
+    suites = Path("datasets/suites.toml")
+    suites.write_text(suites.read_text().replace('"small", ', '"small", "blind-merge-v2", '))
+    code, out, _ = evaluated("run", "check", DONE)
+    assert code == 1
+    assert "suite.json has 2 of the 3 datasets of suite" in " ".join(out.split())
+
+
 def test_a_suite_that_nobody_changed_is_equal(evaluated: Harness) -> None:
     code, out, _ = evaluated("run", "check", DONE)
     assert (code, "not equal" in out) == (0, False)

@@ -113,7 +113,10 @@ class Failures:
 
     @property
     def texts(self) -> dict[str, float]:
-        """Return the shares of spoilt texts by field name, without those of slow answers."""
+        """Return the shares of answers, 0 to 1, whose text is made to fail, by kind of failure.
+
+        Slow answers, whose text is as it would be, are left out.
+        """
         return {name: rate for name, rate in asdict(self).items() if not name.startswith("slow_")}
 
 

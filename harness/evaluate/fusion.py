@@ -90,9 +90,11 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
 def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> str:
     """Return the text that names a helper's message, and how it is shown, in a fusion call's id.
 
-    Such as `v2`, `v2~blind` (another question), `v3!liar&schema` (changed by attack and defence),
-    `v2!text` where it holds words alone, `v2!objects` where the ego's graph has its objects, or
-    `v2!objects&from:00012-3` where it comes from the scene `source`.
+    A fusion call asks the ego's model again, with the messages. `rewrites` says how messages are
+    changed and shown; with `attacks`, changes by an attack are named, too. Such as `v2`, `v2~blind`
+    (another question), `v3!liar&schema` (changed by attack and defence), `v2!text` where it holds
+    words alone, `v2!objects` where the ego's graph has its objects, or `v2!objects&from:00012-3`
+    where it comes from the scene `source`.
     """
     of_attackers, of_all = rewrites.changes
     changed = [*([of_attackers] if attacks and of_attackers else []), *of_all]

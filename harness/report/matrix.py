@@ -301,7 +301,10 @@ def _close(condition: str, results: Sequence[Line]) -> list[str]:
 
 
 def headline(results: Sequence[Line]) -> str:
-    """Return a sentence on the best run under each condition, or the runs that tie for it."""
+    """Return a sentence on the run with the most of the headline metric under each condition.
+
+    Runs that cannot be told from it are named, too. Each of `results` is a run under a condition.
+    """
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):
         lines = [line for line in results if line.condition == condition]

@@ -4,6 +4,7 @@ each follows from others, and a file can state any number.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,13 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.formats import SUITE
 from harness.core.versions import FIGURES
+from harness.dataset.suites import PREFIX, named
 from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run, read
 from harness.runs.headline import PAIRED
 from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
-from harness.runs.records import Episode, Score
+from harness.runs.records import Episode, FrozenScenes, Score
 from harness.runs.reliability import SAME
 from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
@@ -106,6 +108,7 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
     scenes = [run.manifest.world.pinned for run in suite.runs.values()]
     if any(scenes.count(each) > 1 for each in scenes):
         yield f"{SUITE} has two families of the same scenes"
+    yield from _of_families(suite)
     older = next((run for run in suite.runs.values() if not current(run)), None)
     columns = ("value",) if older else _COLUMNS
     stated_scores = {
@@ -213,6 +216,20 @@ def _key(run: Run, score: Score) -> Key:
     """
     gain = score.metric in GAINS.values() and score.interval == pinned.KIND
     return (score.condition, score.metric, PAIRED) if gain and not current(run) else score.key
+
+
+def _of_families(suite: SuiteRun) -> Iterator[str]:
+    """Yield whether a suite's run lacks datasets of the suite that it names, or has others.
+
+    A suite that is not here is not compared.
+    """
+    with suppress(UserError):
+        here = named(f"{PREFIX}{suite.name}")
+        worlds = [run.manifest.world for run in suite.runs.values()]
+        datasets = [world.name for world in worlds if isinstance(world, FrozenScenes)]
+        if here and sorted(datasets) != sorted(here.datasets):
+            count, of = len(set(datasets) & set(here.datasets)), len(here.datasets)
+            yield f"{SUITE} has {count} of the {of} datasets of suite {printable(suite.name)}"
 
 
 def _otherwise(score: Score, other: Score, columns: Sequence[str], whose: str) -> Iterator[str]:

@@ -59,8 +59,9 @@ def settings(
 ) -> tuple[Setting, ...]:
     """Return the grid points of one axis, or of several crossed, for each condition.
 
-    A condition is an operating point by its name; `axes` are what varies, and `grids` has the
-    values of each. A grid of None stands for the axis's default values that the condition allows.
+    `sources` are the runs and models that are swept. A condition is an operating point by its name;
+    `axes` are what varies, and `grids` has the values of each. A grid of None
+    stands for the axis's default values that the condition allows.
 
     Raises:
         UserError: there is no such condition, it has no channel or an axis changes nothing in it,

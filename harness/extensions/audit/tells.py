@@ -272,7 +272,10 @@ class Ranks:
         return float(self.above.sum() / self.pairs.sum())
 
     def estimate(self) -> Estimate:
-        """Return the AUC with a 95 % interval: percentiles of a bootstrap over the n layouts."""
+        """Return how well a feature alone tells layouts with a danger from those without, the AUC.
+
+        Its 95 % interval has the percentiles of a bootstrap over the n layouts that were ranked.
+        """
         have, have_not = self.pairs.shape
         draws = noise.generator("audit", "bootstrap")
         times = draws.multinomial(have, np.full(have, 1 / have), RESAMPLES)

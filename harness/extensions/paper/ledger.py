@@ -147,7 +147,11 @@ def tally(ledger: "pd.DataFrame") -> dict[str, int]:
 
 
 def headline(ledger: "pd.DataFrame") -> list[str]:
-    """Return sentences on how many numbers of the paper are met, and which are not."""
+    """Return sentences on how many of the paper's numbers lie within the aim, and which do not.
+
+    `ledger` is the table of the function of this name, with a row for each number: its difference
+    to ours, the aim for that, and the verdict.
+    """
     counts = tally(ledger)
     sentences = [
         f"{counts['within']} of {counts['total']} numbers within the aim, {counts['misses']} miss "

@@ -260,7 +260,11 @@ def many(comparison: Comparison) -> str:
 
 
 def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """Return (`lost`, text) and (`gained`, text) with up to `most` episodes each, if any."""
+    """Return (`lost`, text) and (`gained`, text) of one condition of a comparison of B with A.
+
+    Lost are the episodes that succeed in A alone, gained those that succeed in B alone. Each text
+    has up to `most` of them and how they failed; one without episodes is left out.
+    """
     ways = (("lost", c.lost), ("gained", c.gained))
     return [(way, _flips(some, pair, most)) for way, some in ways if some]
 
