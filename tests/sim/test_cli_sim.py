@@ -22,10 +22,8 @@ def test_scenarios_are_listed_and_shown_for_people_and_machines(harness):
     ] == listed
     _, out, _ = harness("dataset", "scenario", "show", NAME)
     assert "actions: SLOWER, IDLE, FASTER" in out
-    assert (
-        "ego_start_m = 61, 69\n    distance from the start to the centroid of the conflict zone."
-        in out
-    )
+    meaning = "distance of the ego's start to the centroid of the conflict zone, m."
+    assert f"ego_start_m = 61, 69\n    {meaning}" in out
     assert max(map(len, out.splitlines())) <= 110
 
 
