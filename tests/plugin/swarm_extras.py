@@ -19,7 +19,6 @@ from harness.extend import (
     Floats,
     Formula,
     Fused,
-    Hook,
     Links,
     Messages,
     Metric,
@@ -124,7 +123,7 @@ class Notebook:
 
 
 SMOOTHING = Smoothing()
-NOTEBOOK: Hook = Notebook()
+NOTEBOOK = Notebook()  # a `Hook`
 FOG = Fog()
 NEAR = Formula(near, 0.5)
 SURE = Metric(
