@@ -150,7 +150,7 @@ class Wanderer(Scripted):
 
     def _say(self, request: Request) -> Completion:
         action = request.actions[(len(request.id) + sum(map(ord, request.id)) + request.sample) % 3]
-        return Completion(request.id, sure(action, request.role), 1, 1, "stop", None, 1)
+        return Completion(request.id, sure(action, request.role), 1000, 100, "stop", None, 1)
 
 
 class Writes:
