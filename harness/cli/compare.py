@@ -59,7 +59,6 @@ def command(
     for option, file in (("--html", html), ("--junit", junit)):
         if file and file.is_dir():
             raise UserError(f"{option} {printable(file)} is a folder; name a file in it")
-    for option, file in (("--html", html), ("--junit", junit)):
         if file:
             refuse_data(option, file)
     if html and junit and realpath(html) == realpath(junit):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
 
 from harness.core import resources
 from harness.core.errors import UserError, one_line, printable
@@ -294,6 +294,42 @@ class Shipped(Plugins[T]):
 
     def _entries(self) -> Mapping[str, Any]:
         return {name: entry for name, entry in super()._entries().items() if is_ours(entry)}
+
+
+class ChosenBySettings(Protocol):
+    """Describe a plug-in that a run's settings of its extension choose."""
+
+    @property
+    def chosen_by(self) -> tuple[str, ...]:
+        """Return the names of these settings."""
+        ...
+
+    def opened(self, settings: Mapping[str, Any], /) -> Any:
+        """Return the plug-in as these settings, by name, open it; None if they choose none."""
+        ...
+
+
+Chosen = TypeVar("Chosen", bound=ChosenBySettings)
+
+
+class ShippedChoices(Shipped[Chosen]):
+    """Plug-ins that ship, one of which a run's settings of extensions may choose."""
+
+    def chosen(self, settings: Mapping[str, Any]) -> Chosen | None:
+        """Return the plug-in that settings, values by name, choose, opened; None for none."""
+        for each in self.values():
+            if opened := each.opened(settings):
+                return cast(Chosen, opened)
+        return None
+
+    def settings(self) -> set[str]:
+        """Return the names of the settings that choose."""
+        return {name for each in self.values() for name in each.chosen_by}
+
+    def without(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Return settings, values by name, without those that choose."""
+        choosing = self.settings()
+        return {name: value for name, value in settings.items() if name not in choosing}
 
 
 class FilesAndPlugins(Plugins[T]):

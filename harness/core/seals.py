@@ -85,14 +85,18 @@ def _place(part: Path) -> str:
 
 def _key() -> bytes | None:
     """Return the user's key, which is made where there is none or a broken one; else None."""
-    stored = kept.recall(KEY)
-    if stored is None or len(stored) != KEY_BYTES:
-        file = kept.folder() / KEY
-        with suppress(OSError):
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.unlink(missing_ok=True)
-            descriptor = os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
-            with open(descriptor, "wb") as opened:
-                opened.write(secrets.token_bytes(KEY_BYTES))
+    if key := _stored_key():
+        return key
+    file = kept.folder() / KEY
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)
+        descriptor = os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
+        with open(descriptor, "wb") as opened:
+            opened.write(secrets.token_bytes(KEY_BYTES))
+    return _stored_key()
+
+
+def _stored_key() -> bytes | None:
     key = kept.recall(KEY)
     return key if key and len(key) == KEY_BYTES else None

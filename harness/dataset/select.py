@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TypeVar
 from harness.core import noise
 from harness.core.errors import UserError, printable
 from harness.core.extensions import extensions, owner_of_plugin, part_of
-from harness.core.plugins import Shipped
+from harness.core.plugins import ShippedChoices
 from harness.dataset.load import Dataset
 
 T = TypeVar("T")
@@ -53,21 +53,7 @@ class Selection(ABC):
         """
 
 
-SELECTIONS = Shipped[Selection]("swarmdrive.selections", Selection, {})
-
-
-def opened(settings: Mapping[str, Any]) -> Selection | None:
-    """Return what chooses episodes by a run's settings of extensions; None if nothing does."""
-    for each in SELECTIONS.values():
-        if selection := each.opened(settings):
-            return selection
-    return None
-
-
-def without(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings of extensions, values by name, without those that choose episodes."""
-    choosing = {name for each in SELECTIONS.values() for name in each.chosen_by}
-    return {name: value for name, value in settings.items() if name not in choosing}
+SELECTIONS = ShippedChoices[Selection]("swarmdrive.selections", Selection, {})
 
 
 def recorded(record: Mapping[str, Any]) -> Selection | None:
@@ -77,7 +63,7 @@ def recorded(record: Mapping[str, Any]) -> Selection | None:
     """
     if owner := lacking(record):
         raise UserError(f"what selected the episodes of a run is {part_of(owner)}")
-    selection = opened(record)
+    selection = SELECTIONS.chosen(record)
     if record and selection is None:
         name = printable(next(iter(record)))
         raise UserError(f"a run says that its episodes were selected by {name}, as nothing does")

@@ -17,11 +17,11 @@ from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
-from harness.runs import folder, formats, stopping
+from harness.runs import folder, formats
 from harness.runs.formats import EXTENSIONS
 from harness.runs.records import Latency, Manifest, Score
 from harness.runs.settings import PLAIN, difference, of_words, words
-from harness.runs.stopping import InterimLooks
+from harness.runs.stopping import STOPPING_RULES, InterimLooks
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
@@ -218,7 +218,7 @@ def _comparable(settings: Mapping[str, Any]) -> dict[str, Any]:
             if key not in ("world", "settings", "beside", *formats.BESIDE)
         },
         **{key: value for key, value in plain.items() if key in PLAIN},
-        **stopping.without(_named(plain.get(EXTENSIONS))),
+        **STOPPING_RULES.without(_named(plain.get(EXTENSIONS))),
         **{f"content of {name}": value for name, value in opened.items()},
         **{f"{key} of the world": value for key, value in world.items() if key != "path"},
     }

@@ -15,14 +15,16 @@ from harness.core.errors import UserError, in_range
 from harness.core.files import text_of
 from harness.core.resources import folder
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose
-from harness.dataset import load, select
+from harness.dataset import load
+from harness.dataset.select import SELECTIONS
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Source, Spec, replayed
 from harness.prompts import versions
-from harness.runs import role_agents, stopping, timers
+from harness.runs import role_agents
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
-from harness.runs.timers import Timer
+from harness.runs.stopping import STOPPING_RULES
+from harness.runs.timers import TIMERS, Timer
 from harness.world.scenario import Scenario
 from harness.world.scenarios import DEFAULT
 
@@ -44,8 +46,8 @@ def spec(settings: Settings, source: Source) -> Spec:
         source=source,
         seeds=parse_seeds(settings.seeds),
         points=points(settings.condition or tuple(POINTS), settings.extensions),
-        timer=timers.chosen(settings.extensions) or _of_replayed(ego, settings),
-        stopping_rule=stopping.chosen(settings.extensions),
+        timer=TIMERS.chosen(settings.extensions) or _of_replayed(ego, settings),
+        stopping_rule=STOPPING_RULES.chosen(settings.extensions),
         settings=settings,
     )
 
@@ -61,7 +63,7 @@ def frozen(settings: Settings, dataset: str) -> FrozenSource:
 
     Raises UserError if there is no such dataset, or the selection is not allowed.
     """
-    world, selection = settings.world, select.opened(settings.extensions)
+    world, selection = settings.world, SELECTIONS.chosen(settings.extensions)
     assert isinstance(world, FrozenSettings)
     whole = load.load(load.find(dataset), None if selection else world.limit)
     choice = selection.choice(whole.episodes, whole) if selection else None
@@ -80,7 +82,7 @@ def driven(settings: Settings, scenario: str | None = None) -> "LiveSource":
     # A base install evaluates without the simulator.
     from harness.evaluate.live_world import LiveSource
 
-    world, selection = settings.world, select.opened(settings.extensions)
+    world, selection = settings.world, SELECTIONS.chosen(settings.extensions)
     assert isinstance(world, DriveSettings)
     name = scenario or world.scenario or DEFAULT
     shipped = _shipped(name.partition(":")[0])

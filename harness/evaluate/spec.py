@@ -21,15 +21,14 @@ from harness.coordination.schedules import SCHEDULES
 from harness.core import extensions
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import LAST_SEED
-from harness.dataset import select
 from harness.dataset.load import Scene
-from harness.dataset.select import Choice
+from harness.dataset.select import SELECTIONS, Choice
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.command_options import Guard
 from harness.evaluate.latency import MEASURED, NAMES, declared
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
-from harness.runs import formats, role_agents, stopping, timers
+from harness.runs import formats, role_agents
 from harness.runs.folder import read
 from harness.runs.metrics import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Manifest
@@ -39,8 +38,8 @@ from harness.runs.settings import (
     Settings,
     of_extensions,
 )
-from harness.runs.stopping import InterimLooks, StoppingRule
-from harness.runs.timers import Timer
+from harness.runs.stopping import STOPPING_RULES, InterimLooks, StoppingRule
+from harness.runs.timers import TIMERS, Timer
 from harness.world.perception.graph import truth_graph
 from harness.world.scenario import Scenario
 from harness.world.seats import agent_share
@@ -493,7 +492,9 @@ class Spec:
         for name, setting in of_extensions().items():
             if name not in beside and setting.default not in (None, *formats.NO_TEXTS):
                 settings[name] = setting.default
-        others = stopping.without(timers.without(select.without(self.settings.extensions)))
+        others = self.settings.extensions
+        for choices in (SELECTIONS, TIMERS, STOPPING_RULES):
+            others = choices.without(others)
         for name, value in others.items():
             if name not in (*COUNTERPARTS, *role_agents.settings()):
                 settings[name] = value

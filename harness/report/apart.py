@@ -1,9 +1,11 @@
 """Give packages copies of what they read, so that they change nothing that others read."""
 
+from collections.abc import Callable, Iterable
 from copy import copy, deepcopy
 from dataclasses import replace
 from typing import Any, TypeVar, cast
 
+from harness.core.plugins import Plugins, texts
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.records import Manifest
@@ -31,3 +33,14 @@ def apart(thing: T, built_in: bool) -> T:
     else:
         copied = replace(thing, runs=tuple(apart(run, False) for run in thing.runs))
     return cast(T, copied)
+
+
+def said_of(
+    registry: Plugins[Callable[[Any], Iterable[str]]], name: str, thing: Manifest | Run | SuiteRun
+) -> list[str]:
+    """Return the sentences that a plug-in of a registry has on a thing, which it cannot change.
+
+    Raises UserError if the plug-in fails, or they are no texts.
+    """
+    copied = apart(thing, registry.is_ours(name))
+    return registry.ask(name, lambda of: texts(of(copied)))

@@ -5,16 +5,15 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 
 from harness.backends.registry import reads_prompts
 from harness.coordination.part_settings import more_parts
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
-from harness.core.plugins import Plugins, texts
+from harness.core.plugins import Plugins
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
-from harness.report.apart import apart
+from harness.report.apart import said_of
 from harness.runs import doubts, pinned
 from harness.runs.folder import Run
 from harness.runs.listing import UNREAD
@@ -219,14 +218,9 @@ def of_extensions(run: Run) -> Iterator[str]:
     """Yield the sentences that extensions have on a run; for one that fails, its error message."""
     for name in CAVEATS:
         try:
-            manifest = apart(run.manifest, CAVEATS.is_ours(name))
-            yield from CAVEATS.ask(name, partial(_sentences, manifest))
+            yield from said_of(CAVEATS, name, run.manifest)
         except UserError as error:
             yield str(error)
-
-
-def _sentences(manifest: Manifest, of: Callable[[Manifest], Iterable[str]]) -> list[str]:
-    return texts(of(manifest))
 
 
 def by_letter(run: Run) -> Iterator[str]:

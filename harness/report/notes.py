@@ -3,12 +3,11 @@
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 
 from harness.core.errors import UserError, printable
 from harness.core.figures import Unit
-from harness.core.plugins import Plugins, texts
-from harness.report.apart import apart
+from harness.core.plugins import Plugins
+from harness.report.apart import said_of
 from harness.runs.folder import Run
 from harness.runs.metrics import ALL, written
 from harness.runs.records import Latency, Score, role_word, roles
@@ -86,13 +85,9 @@ def of_extensions(run: Shown) -> Iterator[str]:
     """
     for name in NOTES:
         try:
-            yield from NOTES.ask(name, partial(_lines, apart(run, NOTES.is_ours(name))))
+            yield from said_of(NOTES, name, run)
         except UserError as error:
             yield str(error)
-
-
-def _lines(run: Shown, of: Callable[[Shown], Iterable[str]]) -> list[str]:
-    return texts(of(run))
 
 
 def answer_times(run: Shown) -> Iterator[str]:

@@ -407,9 +407,9 @@ def _without_record(record: Mapping[str, Any]) -> set[str]:
     if not record.get("helpers"):
         names |= {*role_agents.settings()}
     if not scenes.get("selection"):
-        names |= {name for each in SELECTIONS.values() for name in each.chosen_by}
+        names |= SELECTIONS.settings()
     if not scenes.get(LOOKS):
-        names |= {name for each in STOPPING_RULES.values() for name in each.chosen_by}
+        names |= STOPPING_RULES.settings()
     return names & extensions.beside().keys()
 
 

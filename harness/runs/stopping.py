@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from harness.core.errors import UserError
 from harness.core.extensions import owner_of_plugin, part_of
-from harness.core.plugins import Shipped
+from harness.core.plugins import ShippedChoices
 from harness.runs.formats import LOOKS
 
 if TYPE_CHECKING:
@@ -145,21 +145,7 @@ def looked_otherwise(
             return
 
 
-STOPPING_RULES = Shipped[StoppingRule]("swarmdrive.stopping_rules", StoppingRule, {})
-
-
-def chosen(settings: Mapping[str, Any]) -> StoppingRule | None:
-    """Return the stopping rule that a run's settings of extensions choose; None if it has none."""
-    for each in STOPPING_RULES.values():
-        if opened := each.opened(settings):
-            return opened
-    return None
-
-
-def without(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings of extensions, values by name, without those that choose a stopping rule."""
-    choosing = {name for each in STOPPING_RULES.values() for name in each.chosen_by}
-    return {name: value for name, value in settings.items() if name not in choosing}
+STOPPING_RULES = ShippedChoices[StoppingRule]("swarmdrive.stopping_rules", StoppingRule, {})
 
 
 def rule_of(record: Any) -> StoppingRule | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.extensions import owner_of_plugin, part_of
-from harness.core.plugins import Shipped
+from harness.core.plugins import ShippedChoices
 
 if TYPE_CHECKING:
     from harness.coordination.exchange import Exchange
@@ -146,7 +146,7 @@ class Timer(ABC):
         """
 
 
-TIMERS = Shipped[Timer]("swarmdrive.timers", Timer, {})
+TIMERS = ShippedChoices[Timer]("swarmdrive.timers", Timer, {})
 
 
 def timer(source: str) -> Timer:
@@ -161,26 +161,9 @@ def timer(source: str) -> Timer:
     raise ValueError(f"nothing of the name {printable(source)} times answers")
 
 
-def chosen(settings: Mapping[str, Any]) -> Timer | None:
-    """Return the timer that a run's settings of extensions choose; None for `--latency`.
-
-    `settings` are values by name.
-    """
-    for each in TIMERS.values():
-        if opened := each.opened(settings):
-            return opened
-    return None
-
-
 def options() -> list[str]:
     """Return what is typed on the command line to choose each timer."""
     return [each.option for each in TIMERS.values()]
-
-
-def without(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings of extensions without those that choose a timer."""
-    choosing = {name for each in TIMERS.values() for name in each.chosen_by}
-    return {name: value for name, value in settings.items() if name not in choosing}
 
 
 def added_columns() -> dict[str, str]:

@@ -22,9 +22,9 @@ from harness.core import extras, resources, work
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import WORK
 from harness.core.seeds import FIRST, LAST_EPISODE
-from harness.runs import stopping
 from harness.runs.formats import settings_as_file
 from harness.runs.settings import OUTPUT, FrozenSettings, Settings
+from harness.runs.stopping import STOPPING_RULES
 
 if TYPE_CHECKING:
     from harness.evaluate.frozen_world import FrozenSource
@@ -102,7 +102,8 @@ def command(
     base = _base(settings, scenarios, budget)
     settings = structs.replace(settings, prompt=base.version)
     # What may stop a run is for those that certify: the search says how many tune layouts it asks.
-    tune_settings = structs.replace(settings, extensions=stopping.without(settings.extensions))
+    others = STOPPING_RULES.without(settings.extensions)
+    tune_settings = structs.replace(settings, extensions=others)
     sizes = {} if reflect else choices(base)
     given_layouts = given(tune, [manifest for manifest, _ in manifests]) if tune else []
     in_range("--layouts", layouts, 2, FIRST["train"])
