@@ -417,7 +417,7 @@ def test_a_condition_of_another_type_is_named(
 def test_a_condition_of_another_version_may_have_other_settings(run: Path) -> None:
     stated = json.loads((run / "run.json").read_text())
     stated["conditions"][0]["of_a_later_version"] = 1
-    del stated["conditions"][0]["edge"]
+    del stated["conditions"][0]["encoding"]
     (run / "run.json").write_text(json.dumps(stated))
     assert folder.read(run).conditions[0] == stated["conditions"][0]["name"]
 

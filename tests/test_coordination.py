@@ -120,7 +120,7 @@ def test_a_request_is_one_message_of_its_own_and_costs_bits_and_airtime():
     assert (decision.requests, decision.messages) == (1, 3)
     assert (decision.request_bits, decision.reply_bits) == (400, 3000)
     assert decision.airtime_s == pytest.approx(340e-6)
-    twice = play(V2X.changed(edge="relay"))
+    twice = play(V2X.changed(further="roadside_edge=true"))
     assert (twice.requests, twice.reply_bits) == (1, 3000)
     assert twice.airtime_s == pytest.approx(640e-6), "replies go twice, the request once"
     long = play(V2X.changed(request_bits=10_000.0))
@@ -269,7 +269,7 @@ def test_the_papers_proxy_stands_for_the_egos_distance_in_equation_2():
 
 def test_a_roadside_edge_saves_a_lost_reply_and_takes_a_second_hop():
     draws = ((0.9, 0.05), (0.9, 0.9), (0.05, 0.9))
-    decision = play(V2X.changed(edge="relay"), link=draws)
+    decision = play(V2X.changed(further="roadside_edge=true"), link=draws)
     assert decision.delivered.tolist() == [True, True, False]
     assert decision.arrival_s == pytest.approx([0.19524, 0.24544, np.inf])
     assert decision.on_time.tolist() == [True, False, False]

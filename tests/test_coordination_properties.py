@@ -49,7 +49,7 @@ points = st.builds(
     tau_nats=st.floats(0, 1.2),
     max_helpers=st.integers(0, 5),
     ego_distance_m=st.none() | st.floats(0.1, 50),
-    edge=st.sampled_from(["none", "relay"]),
+    further=st.sampled_from(["", "roadside_edge=true"]),
     on_demand=st.booleans(),
     consensus=st.sampled_from(sorted(POOLS)),
 )

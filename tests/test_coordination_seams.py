@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from channel_checks import check_channel
 from packaged import register
 from swarm_extras import FOG, SMOOTHING, Fog
 
@@ -27,9 +28,8 @@ from harness.coordination.scheduling import Formula, ScheduleInputs
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.plugins import Plugins
-from harness.radio.channel import Channel, Delivery, Draws, Links, Site, Unit
+from harness.radio.channel import Channel, Delivery, Draws, Links
 from harness.radio.constant import Radio
-from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
 
 
@@ -131,12 +131,12 @@ def test_a_points_overrides_are_fields_of_its_channel():
     point = OperatingPoint.of("x", "fog", tau_nats=0.5, latency_s=0.05)
     assert point.channel == Fog(latency_s=0.05)
     assert coordinate(point, *three()).arrival_s == pytest.approx([0.15, 0.15, 0.15])
-    v2x = OperatingPoint.of("x", "v2x", loss=0.0, edge="relay")
-    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+    v2x = OperatingPoint.of("x", "v2x", loss=0.0)
+    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0)
     assert OperatingPoint.of("x", None, loss=0.5).channel == NO_CHANNEL
 
 
-@pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}, {"edge": "relay"}])
+@pytest.mark.parametrize("override", [{"loss": 0.0}, {"density_coupled": True}])
 def test_an_override_that_a_channel_does_not_have_is_refused(override):
     [name] = override
     with pytest.raises(
@@ -148,59 +148,9 @@ def test_an_override_that_a_channel_does_not_have_is_refused(override):
 # -- every plug-in, those of installed packages included -------------------------------------------
 
 
-def somewhere(shape: tuple[int, ...], rng: np.random.Generator) -> Site:
-    return Site(
-        rng.uniform(-90, 90, (shape[0], 1 + shape[1], 2)),
-        rng.integers(0, 3, shape),
-        rng.choice([0.0, 1.5, 3.6], shape),
-        rng.choice([30.0, np.nan], (*shape, 1)) * np.ones(2),
-    )
-
-
-def links_and_draws(shape: tuple[int, ...], seed: int = 0) -> tuple[Links, Draws]:
-    rng = np.random.default_rng(seed)
-    asked = rng.random(shape) < 0.6
-    links = Links(
-        asked,
-        np.where(asked, rng.uniform(0, 0.1, shape), np.nan),
-        np.where(asked, rng.uniform(1, 90, shape), np.nan),
-        np.where(asked, rng.uniform(0, 8000, shape), np.nan),
-        asked | (rng.random(shape) < 0.5),
-        asked & (rng.random(shape) < 0.5),
-        400.0,
-        replace(
-            somewhere(shape, rng),
-            units={Unit(0.0, 0.0, 5.0): somewhere((shape[0], 1 + shape[1]), rng)},
-        ),
-    )
-    trips = Trips(
-        rng.integers(0, 3, shape[0]), rng.integers(0, 9, shape[0]), rng.integers(0, 6, shape[0]), 6
-    )
-    return links, Draws(rng.random((*shape, 2)), rng.random(shape), trips)
-
-
-RELAYED = ["mode4:edge=relay,edge_delay_s=0.01", "its-g5:edge=relay", "mode2:edge=relay,loss=0.3"]
-
-
-@pytest.mark.parametrize("name", [*CHANNELS, "fog", "mode2:loss=0.3", *RELAYED])
+@pytest.mark.parametrize("name", [*CHANNELS, "fog", "mode2:loss=0.3"])
 def test_every_channel_gives_each_link_a_fate_and_no_row_another_rows(name: str):
-    channel = named_point(name).channel
-    links, draws = links_and_draws((40, 4))
-    up, delay_s, loss, airtime_s = channel.deliver(links, draws)
-    assert up.shape == delay_s.shape == (40, 4)
-    assert loss.shape in ((40, 4), (40, 1))
-    assert airtime_s.shape == (40, 4)
-    small, large = (channel.request(bits, draws) for bits in (400.0, 800.0))
-    assert np.all(np.asarray(small.heard_s) >= 0)
-    assert np.all(np.asarray(small.heard_s) <= np.asarray(large.heard_s))
-    assert 0 <= small.airtime_s <= large.airtime_s
-    assert np.array_equal(np.isfinite(delay_s), links.asked)
-    assert np.all((delay_s >= links.ready_s)[links.asked])
-    assert np.nanmin(loss) >= 0
-    assert np.nanmax(loss) <= 1
-    alone = channel.deliver(links.take(7), draws.take(7))
-    for batch, single in zip((up, delay_s, loss, airtime_s), alone, strict=True):
-        assert np.array_equal(batch[7], single, equal_nan=True)
+    check_channel(named_point(name).channel)
 
 
 @pytest.mark.parametrize("name", [*RULES, "smoothing"])

@@ -70,17 +70,6 @@ def test_zero_threshold_zero_loss_and_zero_helpers_are_allowed():
         ({"max_helpers": 2.0}, "max_helpers is 2.0; it must be a whole number, 0 or more"),
         ({"max_helpers": True}, "max_helpers is True"),
         ({"max_helpers": -1}, "max_helpers is -1"),
-        ({"edge": "relays"}, "unknown edge 'relays'; did you mean 'relay'?"),
-        (
-            {"edge": "fusion"},
-            "edge is 'fusion'; it must be none or relay: links of channel profile 6g have no",
-        ),
-        (
-            {"edge": "relay", "edge_x_m": 3},
-            "edge_x_m is 3.0; it must be left out: links of channel profile 6g",
-        ),
-        ({"edge_delay_s": -1}, "edge_delay_s is -1; it must be seconds, 0 or more"),
-        ({"edge_antenna_m": 0.5}, "edge_antenna_m is 0.5; it must be metres from 1 to 100"),
         ({"density_coupled": 1}, "density_coupled is 1; it must be true or false"),
         ({"name": " "}, "operating point name ' ': give it some text"),
     ],
@@ -163,9 +152,7 @@ def test_only_a_point_with_a_channel_asks_again():
     assert not named_point("single-local:consensus=ego-prompt").has_fusion_call
 
 
-@pytest.mark.parametrize(
-    "setting", ["loss=.1", "latency_s=0.1", "density_coupled=true", "edge=relay", "edge_x_m=3"]
-)
+@pytest.mark.parametrize("setting", ["loss=.1", "latency_s=0.1", "density_coupled=true"])
 def test_a_setting_of_the_channel_is_refused_where_there_is_none(setting: str) -> None:
     with pytest.raises(
         UserError, match=r"single-local has no channel, so .* changes nothing; leave it out"
@@ -194,12 +181,9 @@ def project(tmp_path, monkeypatch):
 
 IDLE = [
     ("timed", "latency_s", "its table timed.csv has latencies of its own"),
-    ("timed:edge=relay,loss=0.1", "latency_s", "its table timed.csv has latencies of its own"),
     ("timed", "beyond", "its table timed.csv ends where nothing is received"),
     ("untimed:loss=0.1", "beyond", "its loss is given"),
     ("timed", "helper_rounds", "the load of its channel does not depend on it"),
-    ("6g", "edge_delay_s", "it has no roadside unit (edge is none)"),
-    ("mode4", "edge_x_m", "it has no roadside unit (edge is none)"),
     ("6g:schedule=margin", "tau_nats", "schedule margin has a threshold of its own"),
     ("6g:schedule=never", "loss", "schedule never asks nobody"),
     ("6g:schedule=never", None, "schedule never asks nobody"),
@@ -226,8 +210,8 @@ def test_a_setting_that_changes_nothing_says_why(project, condition, setting, wh
 @pytest.mark.parametrize(
     ("condition", "setting"),
     [
-        ("untimed", "latency_s"), ("untimed", "beyond"), ("6g", "latency_s"), ("6g:edge=relay", "tau_nats"),
-        ("mode4:edge=relay", "edge_delay_s"), ("6g:schedule=margin,helper_rounds=true", "tau_nats"),
+        ("untimed", "latency_s"), ("untimed", "beyond"), ("6g", "latency_s"),
+        ("6g:schedule=margin,helper_rounds=true", "tau_nats"),
         ("6g:schedule=never", "schedule"), ("6g:max_helpers=0", "max_helpers"), ("6g", None),
         ("6g:schedule=never", "fallback"), ("6g", "weight_cap"), ("cloud", "round_trip_s"),
         ("6g:content=both", "consensus"), ("6g:content=objects", "fallback"),

@@ -316,13 +316,6 @@ def test_a_struct_has_the_defaults_that_the_table_states(kind: type, added: dict
         assert (formats.UNSET if default is msgspec.UNSET else default) == entry.absent
 
 
-def test_renamed_settings_are_mapped() -> None:
-    point = {"name": "6g", "roadside_edge": True}
-    [read] = formats.upgraded({"conditions": [point]})["conditions"]
-    assert read["edge"] == "relay"
-    assert OperatingPoint.from_dict({**read, "profile": "6g"}).radio.edge == "relay"
-
-
 @pytest.mark.parametrize(
     ("version", "why"),
     [

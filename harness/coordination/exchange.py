@@ -12,8 +12,7 @@ In seconds from the start of the decision:
     ready                 a helper has the request and its own intent, and its reply can leave:
                           max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
     + slots               replies are on air, one after another or at once, as the profile says; a
-                          slot is nominal latency + payload / bandwidth + jitter, twice over a
-                          roadside edge
+                          slot is nominal latency + payload / bandwidth + jitter
     arrival_s[h]          the end of the helper's slot if request and reply arrived; else inf
     window_s              what has arrived by now is fused
     exchange_s            the end of the last slot: the ego also waits for a lost or late reply
@@ -33,7 +32,6 @@ import numpy as np
 from harness.coordination.contents import INTENTS
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.coordination.parts import FUSION
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import ScheduleInputs, chosen
 from harness.coordination.trigger import entropy_nats, normalised_entropy, triggered
@@ -42,7 +40,7 @@ from harness.core.errors import UserError, printable
 from harness.core.statistics import known_mean
 from harness.core.strangers import worded
 from harness.radio.channel import Channel, Draws, Links
-from harness.radio.roadside import Consulted, by_unit
+from harness.radio.consulted import Consulted
 from harness.radio.wrapped import broadcast, delivered, heard_s, is_ours
 
 
@@ -51,8 +49,8 @@ class Exchange:
     """Hold who was asked, what was sent and who was heard in each decision.
 
     Made by `exchange`. Times are seconds from the start of the decision. Arrays are of decisions of
-    any shape `(...)`, with H helpers, index h for helper h, and A actions. A unit is an antenna
-    beside the road, which may ask the helpers for the ego and fuse what they reply.
+    any shape `(...)`, with H helpers, index h for helper h, and A actions. Another, such as an
+    antenna beside the road, may ask the helpers for the ego and fuse what they reply.
     """
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`
@@ -67,11 +65,11 @@ class Exchange:
     # not, or on demand those that are asked. None without a channel, or where messages hold no
     # intents
     infers: Bools
-    # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of a unit that
-    # asks for the ego; 0 if nobody is asked
+    # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of another
+    # that asks for the ego; 0 if nobody is asked
     requests: Ints
     request_bits: Floats  # size of all requests, bits, `(...)`; 0 if nobody is asked
-    # size of all scheduled replies, and of the policy that a unit sends, bits, `(...)`
+    # size of all scheduled replies, and of the policy that another sends, bits, `(...)`
     reply_bits: Floats
     # seconds that the request and the scheduled replies are on air, `(...)`; NaN if the channel
     # model does not know it
@@ -79,10 +77,10 @@ class Exchange:
     # packet loss, the probability that one transmission was lost, `(...)`: the mean over the
     # helpers asked if links differ; NaN without a channel
     loss: Floats
-    # whether the helper was asked, and request and reply arrived, `(..., H)`; if a unit fuses, its
+    # whether the helper was asked, and request and reply arrived, `(..., H)`; if another fuses, its
     # policy must have arrived, too
     delivered: Bools
-    # when each helper's reply ends where it is fused, by the ego or a unit, `(..., H)`; inf if it
+    # when each helper's reply ends where it is fused, by the ego or another, `(..., H)`; inf if it
     # is lost or not asked for
     arrival_s: Floats
     # whether it arrived within the decision window and so is fused, `(..., H)`
@@ -246,18 +244,9 @@ def _ask_helpers(
         intents.site,
     )
     with worded(f"channel profile {point.radio.profile}", built_in=is_ours(point.channel)):
-        if point.radio.edge == FUSION and point.physical and point.unit:
-            until_s = np.maximum(point.fusion.window_s, request_s[..., 0])
-            remaining_s = until_s - request_s[..., 0]
-            outcome = by_unit(
-                point.physical,
-                point.unit,
-                point.radio.edge_delay_s,
-                links,
-                draws,
-                ready,
-                remaining_s,
-            )
+        until_s = np.maximum(point.fusion.window_s, request_s[..., 0])
+        outcome = point.ask_for_ego(links, draws, ready, until_s - request_s[..., 0])
+        if outcome is not None:
             return request_s, outcome, until_s
         return request_s, _ask_directly(point.channel, links, draws, ready), np.array(np.inf)
 
@@ -332,7 +321,7 @@ def _in_time(point: OperatingPoint, intents: Intents, may_ask: Bools, draws: Dra
     over imagined exchanges.
 
     These have draws of their own. The transmissions of request and reply count as independent. A
-    second path, over a roadside unit, is left out.
+    second path is left out.
     """
     total = np.zeros(may_ask.shape)
     for n in range(IMAGINED):

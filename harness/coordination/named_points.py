@@ -3,11 +3,12 @@
 from collections.abc import Mapping
 from typing import Any
 
-from harness.coordination.operating_point import UNIT, OperatingPoint, as_here
+from harness.coordination.operating_point import OperatingPoint, as_here
 from harness.coordination.part_settings import (
     OVERRIDES,
     gone_setting,
     lacking_setting,
+    settings_of_radio,
     typed_settings,
 )
 from harness.coordination.parts import Cloud, Radio
@@ -78,7 +79,7 @@ def named_point(text: str) -> OperatingPoint:
             continue
         parsed = setting_of(field, value)
         settings[field] = parsed * scale if isinstance(parsed, float) else parsed
-    for key in (*OVERRIDES, "edge", *UNIT):
+    for key in settings_of_radio():
         if key in settings and point.radio.profile is None:
             raise UserError(
                 f"operating point {printable(text)!r}: {name} has no channel, so {key} changes "

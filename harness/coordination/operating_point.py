@@ -2,7 +2,7 @@
 model.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import chain
@@ -31,9 +31,7 @@ from harness.coordination.part_settings import (
     without_gone,
 )
 from harness.coordination.parts import (
-    FUSION,
     PLAIN,
-    RELAY,
     ActsOn,
     Ask,
     Changes,
@@ -53,22 +51,21 @@ from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
 from harness.coordination.sent import Honest, SentIntents, Speaker
+from harness.core.arrays import Floats
 from harness.core.config import changed
 from harness.core.errors import UserError, printable, unknown
 from harness.core.pairs import pairs
 from harness.radio import constant
-from harness.radio.channel import Channel, Physical, Unit
+from harness.radio.channel import Antenna, Channel, Draws, Links, Physical
+from harness.radio.consulted import Consulted
 from harness.radio.networks import Network, network
 from harness.radio.profiles import CHANNELS, NO_CHANNEL
-from harness.radio.roadside import Relay
 from harness.radio.wrapped import AtLoss
 
 if TYPE_CHECKING:
     from harness.coordination.coordinate import Coordination
     from harness.coordination.exchange import Exchange
 
-# settings of a roadside unit with a place
-UNIT = ("edge_delay_s", "edge_x_m", "edge_y_m", "edge_antenna_m")
 WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 # Settings of helpers' intents: how they are fused, and when a helper's model is asked.
 OF_INTENTS = ("consensus", *WEIGHING, "on_demand", "helper_rounds")
@@ -123,9 +120,9 @@ class OperatingPoint:
             )
         try:
             self._check_together()
+            _ = self.channel
         except ValueError as error:
             raise _error_of(self.name, error) from None
-        _ = self.channel
 
     def _check_together(self) -> None:
         self._check_reads()
@@ -137,9 +134,6 @@ class OperatingPoint:
         if self.cloud.round_trip and self.has_fusion_call:
             allowed = f"left out where {self.asks_twice}, which asks twice"
             raise wrong("round_trip", self.cloud.round_trip, allowed)
-        if self.asks_again and self.radio.edge == FUSION:
-            allowed = f"none or relay where {self.asks_twice}: a unit has no model"
-            raise wrong("edge", FUSION, allowed)
 
     def _check_reads(self) -> None:
         """Raise ValueError for a content that holds nothing that its rule reads."""
@@ -280,13 +274,11 @@ class OperatingPoint:
         channel = replace(channel, **overrides)
         if isinstance(channel, Physical):
             channel = channel if loss is None else AtLoss(channel, loss)
-            return (
-                Relay(channel, self._unit, radio.edge_delay_s) if radio.edge == RELAY else channel
-            )
-        if radio.edge != "none":
-            channel = self._relayed(channel)
-        if radio.loss is not None and getattr(channel, "density_coupled", False):
+        elif radio.loss is not None and getattr(channel, "density_coupled", False):
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
+        for part in self.more:
+            if is_ours_part(part):
+                channel = part.carried(self, channel)
         return channel
 
     @cached_property
@@ -294,34 +286,16 @@ class OperatingPoint:
         """Return the channel if its losses follow from vehicles' positions, else None."""
         return self.channel if isinstance(self.channel, Physical) else None
 
-    def _relayed(self, channel: Channel) -> Channel:
-        """Return a channel without places, with the relay as a second path of the same kind."""
-        profile = self.radio.profile
-        if self.radio.edge == FUSION:
-            raise self._wrong(
-                "edge", f"none or relay: links of channel profile {profile} have no places"
-            )
-        if not hasattr(channel, "roadside_edge"):
-            raise self._wrong("edge", f"left out: channel profile {profile} has no such setting")
-        for key in UNIT:
-            if getattr(self.radio, key) != getattr(Radio(), key):
-                raise self._wrong(
-                    key, f"left out: links of channel profile {profile} have no places"
-                )
-        return replace(channel, roadside_edge=True)
-
     @property
-    def _unit(self) -> Unit:
-        return Unit(self.radio.edge_x_m, self.radio.edge_y_m, self.radio.edge_antenna_m)
+    def antennas(self) -> Collection[Antenna]:
+        """Return the antennas on no vehicle whose links the channel needs, such as by the road.
 
-    @property
-    def unit(self) -> Unit | None:
-        """Return position and antenna height of the roadside unit, an antenna beside the road.
-
-        None without one, and where the channel is not `physical`, since links then have no
-        positions.
+        There are none where the channel is not `physical`, since links then have no positions.
         """
-        return self._unit if self.radio.edge != "none" and self.physical else None
+        if self.physical is None:
+            return ()
+        ours = [part for part in self.more if is_ours_part(part)]
+        return tuple(chain(*(part.antennas for part in ours)))
 
     @cached_property
     def network(self) -> Network | None:
@@ -357,8 +331,10 @@ class OperatingPoint:
             return f"schedule {ask.schedule} has a threshold of its own"
         if setting == "request_bits" and self.radio.encoding != JSON:
             return f"encoding {self.radio.encoding} has a size of its own for requests"
-        if setting in UNIT and self.radio.edge == "none":
-            return "it has no roadside unit (edge is none)"
+        if setting is not None and setting in part_of_settings():
+            part = self._part(part_of_settings()[setting])
+            if is_ours_part(part) and (why := part.idle(setting)):
+                return why
         on_demand = setting == "on_demand" and self.content.asks_helpers
         fuses_none = self.content.holds.isdisjoint((INTENTS, PLANS))
         if setting in OF_INTENTS and fuses_none and not on_demand:
@@ -533,6 +509,20 @@ class OperatingPoint:
             if speaker := speaker_of(part):
                 return speaker
         return Honest()
+
+    def ask_for_ego(
+        self, links: Links, draws: Draws, ready: "Callable[[Floats], Floats]", left_s: Floats
+    ) -> Consulted | None:
+        """Return what comes of another asking the helpers for the ego; None if the ego asks itself.
+
+        A part may ask, such as an antenna beside the road; `Part.ask` explains the arguments.
+        """
+        for part in self.more:
+            if is_ours_part(part):
+                consulted = part.ask(self, links, draws, ready, left_s)
+                if consulted is not None:
+                    return consulted
+        return None
 
     def again(
         self,

@@ -83,6 +83,12 @@ def settings_alone() -> Collection[str]:
     return {*core, *chain(*of_extensions)}
 
 
+def settings_of_radio() -> tuple[str, ...]:
+    """Return the names of the settings that mean nothing at a point without a channel."""
+    of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_radio]
+    return (*OVERRIDES, *chain(*of_extensions))
+
+
 def change_of(text: str) -> Change:
     """Return the change of helpers' messages, such as by an attack, that a text names.
 

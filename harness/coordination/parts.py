@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 from msgspec import Meta, Struct, ValidationError, convert, structs
 
-from harness.coordination.contents import CONTENTS, INTENT, INTENTS, KINDS, PLANS
+from harness.coordination.contents import CONTENTS, INTENT, KINDS, PLANS
 from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.coordination.schedules import SCHEDULES
@@ -22,6 +22,8 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
 from harness.core.plugins import Plugins
 from harness.core.strangers import worded
+from harness.radio.channel import Antenna, Channel, Draws, Links
+from harness.radio.consulted import Consulted
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
 
@@ -35,14 +37,11 @@ if TYPE_CHECKING:
     from harness.world.scene_graph import SceneGraph
 
 FALLBACKS = ("uniform", "brake")
-RELAY, FUSION = "relay", "fusion"
-EDGES = ("none", RELAY, FUSION)
 MOST_HELPERS = 1000
 
 # what a setting must be whose type says no more
 BARE = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 Metres = Annotated[float, Meta(gt=0, le=1e6, description="metres above 0, at most 1000000")]
-Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -10000 to 10000")]
 Text = Annotated[str, Meta(description="a text")]
 Flag = Annotated[bool, Meta(description="true or false")]
 
@@ -157,6 +156,7 @@ class Part(Struct, frozen=True, kw_only=True):
 
     behind: ClassVar[str] = ""  # the setting behind which its own stand in records
     of_ego: ClassVar[bool] = False  # whether it matters to an ego that asks nobody
+    of_radio: ClassVar[bool] = False  # whether its settings mean nothing without a channel
     # its settings that name something, and what returns the names that there are; empty names
     # nothing
     named: ClassVar[Mapping[str, Callable[[], Collection[str]]]] = {}
@@ -194,6 +194,19 @@ class Part(Struct, frozen=True, kw_only=True):
     def check_with(self, point: "OperatingPoint") -> None:
         """Raise ValueError if this part's settings contradict others of the operating point."""
 
+    def idle(self, setting: str) -> str | None:
+        """Return why changing one of this part's settings cannot change a result; None if it may.
+
+        Unlike other hooks it is also called for a part that has only its defaults.
+        """
+
+    def carried(self, point: "OperatingPoint", channel: Channel) -> Channel:
+        """Return the channel that carries messages under `point`, given that without this part.
+
+        Only a part that ships may return another, such as one with a second path.
+        """
+        return channel
+
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
         """Return why this part cannot be used under `point` in `run`; None if it can.
 
@@ -217,6 +230,11 @@ class Part(Struct, frozen=True, kw_only=True):
     def needs_all(self) -> bool:
         """Return whether it needs the intents of all present helpers, not only of those asked."""
         return False
+
+    @property
+    def antennas(self) -> Collection[Antenna]:
+        """Return the antennas on no vehicle whose links a physical channel needs, if it ships."""
+        return ()
 
     @property
     def question(self) -> Question:
@@ -258,6 +276,27 @@ class Part(Struct, frozen=True, kw_only=True):
             heard: which helpers were heard in time, `(..., H)`.
         """
         return fused
+
+    def ask(
+        self,
+        point: "OperatingPoint",
+        links: Links,
+        draws: Draws,
+        ready: "Callable[[Floats], Floats]",
+        left_s: "Floats",
+    ) -> Consulted | None:
+        """Return what comes of another asking the helpers for the ego; None if the ego asks itself.
+
+        Only a part that ships may ask.
+
+        Args:
+            point: the condition.
+            links: the links of the ego and its H helpers, with those that it wants to ask.
+            draws: the channel's random numbers.
+            ready: returns when replies can leave, `(..., H)`, from when helpers have the request,
+                of the same shape or `(..., 1)`; both in s from the start of the ego's request.
+            left_s: seconds from the start of the ego's request until it waits no longer, `(...)`.
+        """
 
     def again(
         self,
@@ -402,7 +441,7 @@ class Ask(Part, frozen=True, kw_only=True):
 
 
 class Radio(Part, frozen=True, kw_only=True):
-    """Settings of the radio: a channel profile, overrides of it, and a roadside unit."""
+    """Settings of the radio: a channel profile, and overrides of it."""
 
     profile: Text | None = None  # channel profile; None disables V2V
     # Probability that one transmission is lost; None keeps that of the profile or of the link.
@@ -411,18 +450,6 @@ class Radio(Part, frozen=True, kw_only=True):
     density_coupled: Flag = False  # whether loss follows the number of active vehicles
     # Whether a helper whose entropy is above tau opens a round of its own, which loads the channel.
     helper_rounds: Flag = False
-    # What a roadside unit does: `relay` sends replies once more; `fusion` asks the helpers for the
-    # ego and fuses (`harness.radio.roadside`). With the constant model a relay has no place
-    # (`constant.Radio`).
-    edge: Text = "none"
-    # From the end of what the unit receives to the start of what it sends: processing and backhaul.
-    # The default is declared: a unit that has nothing to wait for.
-    edge_delay_s: Seconds = 0.0
-    # to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
-    edge_x_m: Place = 0.0
-    edge_y_m: Place = 0.0  # to the south
-    # Height of the unit's antenna; by default that of TR 37.885, table 6.1.4-1, a roadside unit.
-    edge_antenna_m: Annotated[float, Meta(ge=1, le=100, description="metres from 1 to 100")] = 5.0
     # How messages are encoded, which is their size (`harness.coordination.encodings`).
     encoding: Text = JSON
     further: Text = ""  # further settings of the profile's channel, such as `jitter_s=0.01`
@@ -432,16 +459,8 @@ class Radio(Part, frozen=True, kw_only=True):
             raise unknown(
                 "channel profile", self.profile, CHANNELS, "; leave it out to disable V2V"
             )
-        if self.edge not in EDGES:
-            raise unknown("edge", self.edge, EDGES)
         if self.encoding != JSON and self.encoding not in ENCODINGS:
             raise _lacking("encoding", self.encoding, ENCODINGS, JSON)
-
-    @property
-    def acts_on(self) -> Collection[ActsOn]:
-        if self.edge != FUSION:
-            return ()
-        return (ActsOn("edge", FUSION, (INTENTS,), "none or relay"),)
 
 
 class Fusion(Part, frozen=True, kw_only=True):

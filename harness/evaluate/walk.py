@@ -31,7 +31,7 @@ from harness.evaluate.draws import tie_draws
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.outlook import outlook
 from harness.evaluate.sharing import listed
-from harness.radio.channel import Draws, Site, Unit
+from harness.radio.channel import Antenna, Draws, Site
 from harness.world.scenario import Scenario
 from harness.world.sight_lines import site
 
@@ -93,10 +93,10 @@ class World(Protocol[DecisionPoint]):
         """Return the decisions due under a condition in the points that `observe` returned last."""
         ...
 
-    def site(self, units: Collection[Unit]) -> Site | None:
+    def site(self, antennas: Collection[Antenna]) -> Site | None:
         """Return the true positions of vehicles at the n points last observed, `(n, ...)`.
 
-        `units` are the roadside units, antennas beside the road, whose links are wanted, too. None
+        `antennas` are those on no vehicle whose links are wanted, too. None
         in a world without positions.
         """
         ...
@@ -140,9 +140,9 @@ class SceneWorld:
     scenario: Scenario  # the scenario of the scenes
     scenes: Sequence[Scene]  # the scenes that `observe` returned last
 
-    def site(self, units: Collection[Unit]) -> Site:
+    def site(self, antennas: Collection[Antenna]) -> Site:
         decision_points = [(scene.state, scene.viewers) for scene in self.scenes]
-        return site(decision_points, units, self.scenario.road().zone_m)
+        return site(decision_points, antennas, self.scenario.road().zone_m)
 
     def outlook(self) -> Outlook:
         return outlook(self.scenario, self.scenes)
@@ -295,8 +295,8 @@ def _with_needs(
 ) -> Intents:
     """Return what vehicles intend with all that some condition needs to know of the world."""
     if any(point.physical for point in due):
-        units = {point.unit for point in due if point.unit}
-        intents = replace(intents, site=world.site(units))
+        antennas = {antenna for point in due for antenna in point.antennas}
+        intents = replace(intents, site=world.site(antennas))
     if any(point.needs("outlook") for point in due):
         intents = replace(intents, outlook=world.outlook())
     if any(point.needs("claims") for point in due):

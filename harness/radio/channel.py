@@ -20,12 +20,12 @@ from harness.radio.fading import Trips
 CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 
-class Unit(NamedTuple):
-    """Hold the position and antenna height of a roadside unit, m."""
+class Antenna(NamedTuple):
+    """Hold where an antenna stands that is on no vehicle, such as one beside the road, m."""
 
     x_m: float  # position, m to the east of the centroid of the conflict zone
     y_m: float  # position, m to the south of it
-    antenna_m: float  # height of the antenna
+    height_m: float  # above the ground
 
 
 @dataclass(frozen=True)
@@ -49,9 +49,9 @@ class Site:
     corner_m: Floats
     # height of the antenna at the first position, m; None if it is as high as all others
     first_m: float | None = None
-    # the sites of roadside units, antennas beside the road: each has the unit in the ego's place,
-    # then the ego and the helpers, `(..., 2+H, 2)`
-    units: Mapping[Unit, "Site"] = field(default_factory=dict)
+    # the sites of antennas on no vehicle: each has the antenna in the ego's place, then the ego and
+    # the helpers, `(..., 2+H, 2)`
+    antennas: Mapping[Antenna, "Site"] = field(default_factory=dict)
 
     @property
     def distance_m(self) -> Floats:
@@ -68,18 +68,18 @@ class Site:
 
     def take(self, at: Any) -> "Site":
         """Return the sites of the decisions at `at`, indices or a mask of the leading axis."""
-        units = {unit: site.take(at) for unit, site in self.units.items()}
+        antennas = {antenna: site.take(at) for antenna, site in self.antennas.items()}
         return Site(
             self.xy_m[at],
             self.sight[at],
             self.blocker_m[at],
             self.corner_m[at],
             self.first_m,
-            units,
+            antennas,
         )
 
     def select(self, links: slice) -> "Site":
-        """Return the site of the links in a slice of the H, `(..., h)`; without roadside units."""
+        """Return the site of the links in a slice of the H, `(..., h)`; without antennas."""
         xy_m = np.concatenate(
             [self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2
         )
@@ -98,7 +98,7 @@ class Site:
             np.take_along_axis(self.blocker_m, places, axis=-1),
             np.take_along_axis(self.corner_m, places[..., None], axis=-2),
             self.first_m,
-            {unit: site.of_helpers(with_ego) for unit, site in self.units.items()},
+            {antenna: site.of_helpers(with_ego) for antenna, site in self.antennas.items()},
         )
 
 
@@ -160,18 +160,8 @@ class Draws:
         return self._trips.shadow(xy_m, decorrelation_m)
 
     def of(self, links: str) -> "Draws":
-        """Return independent draws for other links, such as a roadside unit's, by their name."""
+        """Return independent draws for other links, such as an antenna's, by their name."""
         return replace(self, trips=replace(self._trips, links=links), given=None)
-
-    @cached_property
-    def first_packets(self) -> Floats:
-        """Return draws for the link between the ego and a roadside unit, `(..., 3)`.
-
-        A unit is an antenna beside the road. The first draw is for the unit's wait for a free
-        medium, the second for the loss of the ego's message to the unit, the third for that of the
-        unit's to the ego. They exist even in a decision without helpers.
-        """
-        return self._trips.uniforms(1)
 
     @cached_property
     def latency(self) -> Floats:
@@ -182,10 +172,10 @@ class Draws:
         return self.of(f"{self._trips.links}.latency").packet
 
     @cached_property
-    def first(self) -> "Draws":
-        """Return the draws for the link of the ego and a roadside unit, as if it were one helper's.
+    def of_one(self) -> "Draws":
+        """Return the draws for one link alone, as if H were 1, even if there are no helpers.
 
-        H is 1 in the result, even if there are no helpers.
+        That is the link of the ego and an antenna on no vehicle.
         """
         none = np.zeros((*self.jitter.shape[:-1], 1))
         return Draws(np.stack([none, none], axis=-1), none, self._trips)

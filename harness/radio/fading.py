@@ -33,8 +33,8 @@ class Trips:
     layout_seed: Ints  # seed of the episode's layout, its start situation, `(...)`
     step: Ints  # number of the decision in its episode, from 0, `(...)`
     steps: int  # most decisions of an episode
-    # name of the links that the numbers are for, such as those of a roadside unit; empty for those
-    # among vehicles
+    # name of the links that the numbers are for, such as those of an antenna on no vehicle; empty
+    # for those among vehicles
     links: str = ""
 
     def take(self, at: Any) -> "Trips":

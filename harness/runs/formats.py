@@ -104,12 +104,12 @@ CONDITION: Mapping[str, Added] = {
     "round_trip": Added("2026-11-23", "", "a cloud behind a measured network"),
     "round_trip_s": Added("2026-11-23", None, "a cloud behind a constant round trip"),
     "edge": Added(
-        "2026-11-23", "none", "roadside units with a place; see `_condition` for `roadside_edge`"
+        "2026-11-23", "none", "antennas with a place; see `_condition` for `roadside_edge`"
     ),
-    "edge_delay_s": Added("2026-11-23", 0.0, "roadside units with a place"),
-    "edge_x_m": Added("2026-11-23", 0.0, "roadside units with a place"),
-    "edge_y_m": Added("2026-11-23", 0.0, "roadside units with a place"),
-    "edge_antenna_m": Added("2026-11-23", 5.0, "roadside units with a place"),
+    "edge_delay_s": Added("2026-11-23", 0.0, "antennas with a place"),
+    "edge_x_m": Added("2026-11-23", 0.0, "antennas with a place"),
+    "edge_y_m": Added("2026-11-23", 0.0, "antennas with a place"),
+    "edge_antenna_m": Added("2026-11-23", 5.0, "antennas with a place"),
     "attack": Added("2026-11-23", "", "attacks; all helpers were honest"),
     "defence": Added("2026-11-23", "", "guarded fusion prompts"),
     "content": Added("2026-11-27", "intent", "messages that hold objects; all held intents"),

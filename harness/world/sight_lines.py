@@ -9,7 +9,7 @@ from itertools import compress
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Site, Unit
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Antenna, Site
 from harness.world.perception.rays import meetings
 from harness.world.state import HEIGHTS_M, Building, VehicleState, WorldState
 
@@ -21,14 +21,14 @@ Place = tuple[float, float]
 
 def site(
     points: Sequence[tuple[WorldState, Sequence[str]]],
-    units: Collection[Unit] = (),
+    antennas: Collection[Antenna] = (),
     zone_m: Place = (0.0, 0.0),
 ) -> Site:
     """Return where the ego and its helpers are in n states, and what is between them, (n, ...).
 
     Each of the n `points` is a state with the ids of its ego and helpers, the ego first. Antennas
     are at vehicle centres; if a building and a vehicle both block a link, the building counts.
-    `units` are roadside units, which add links to the ego and helpers; their positions are relative
+    `antennas` are on no vehicle, and add links to the ego and helpers; their positions are relative
     to `zone_m`, the centre of the conflict zone (m).
     """
     states = [state for state, _ in points]
@@ -38,13 +38,13 @@ def site(
     egos = [ego for ego, *_ in viewers]
     helpers = [others for _, *others in viewers]
     among = _site(list(zip(states, egos, helpers, strict=True)))
-    of_units = {}
-    for unit in units:
-        place_m = zone_m[0] + unit.x_m, zone_m[1] + unit.y_m
+    of_antennas = {}
+    for antenna in antennas:
+        place_m = zone_m[0] + antenna.x_m, zone_m[1] + antenna.y_m
         places_m = [place_m] * len(points)
         links = _site(list(zip(states, places_m, viewers, strict=True)))
-        of_units[unit] = replace(links, first_m=unit.antenna_m)
-    return replace(among, units=of_units)
+        of_antennas[antenna] = replace(links, first_m=antenna.height_m)
+    return replace(among, antennas=of_antennas)
 
 
 def _site(

@@ -24,7 +24,7 @@ from harness.coordination.encodings import ENCODINGS, JSON
 from harness.coordination.named_points import named_point
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.part_settings import more_parts, typed_settings
-from harness.coordination.parts import EDGES, FALLBACKS
+from harness.coordination.parts import FALLBACKS
 from harness.coordination.rules import names
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError
@@ -41,7 +41,7 @@ Place = tuple[int, int]  # episode and seed
 AT_THE_LAG = Latency("card", "declared: for this test", 0.145, 0.145, 0.0)
 NUMBERS = {bool: ("true", "false"), int: ("0", "1", "2"), float: ("0", "0.05", "0.5", "1", "40")}
 WORDS: Mapping[str, Sequence[str]] = {
-    "edge": EDGES,
+    "edge": ("none", "relay", "fusion"),
     "encoding": (JSON, *ENCODINGS),
     "schedule": [name for name in SCHEDULES if SCHEDULES.is_ours(name)],
     "content": tuple(CONTENTS),

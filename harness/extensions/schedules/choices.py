@@ -249,8 +249,7 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     intents = replace(stored.whole(scenes), outlook=outlook(scenario, scenes))
     if point.physical:
         places = [(scene.state, scene.viewers) for scene in scenes]
-        units = [point.unit] if point.unit else []
-        intents = replace(intents, site=site(places, units, scenario.road().zone_m))
+        intents = replace(intents, site=site(places, point.antennas, scenario.road().zone_m))
     seed, node = (index.ravel() for index in np.indices(shape))
     steps, width = scenario.parameters.decisions, intents.range_m.shape[1]
     draws = channel_draws(

@@ -18,7 +18,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError
 from harness.extensions.radio.reception import drawn
 from harness.extensions.radio.trace import Spread, Trace, from_profile, read
-from harness.radio.channel import REPLY, REQUEST, Draws, Site, Unit
+from harness.radio.channel import REPLY, REQUEST, Antenna, Draws, Site
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS
 
@@ -26,7 +26,7 @@ MEAN = "distance_m,reception,latency_ms\n"
 SPREAD = "distance_m,reception,latency_p50_ms,latency_p95_ms\n"
 NEAR = "0,1,2\n50,1,10\n100,1,30\n"
 FAR = "101,1,900000\n5000,0.5,1000000\n"
-UNIT = Unit(0.0, 0.0, 5.0)
+UNIT = Antenna(0.0, 0.0, 5.0)
 EDGES = ("none", "relay", "fusion")
 
 
@@ -42,7 +42,7 @@ def line(*at_m: float) -> Site:
 
 
 def scene(unit_m: float = 50.0) -> Intents:
-    where = replace(line(0, 50, 100), units={UNIT: line(unit_m, 0, 50, 100)})
+    where = replace(line(0, 50, 100), antennas={UNIT: line(unit_m, 0, 50, 100)})
     return Intents(
         np.full(3, 1 / 3), np.array([(0.8, 0.1, 0.1), (0.0, 0.0, 1.0)]), np.ones(2, bool),
         np.array([20.0, 10.0, 5.0]), np.array([50.0, 100.0]), np.full(2, 1000.0), np.full(3, 0.1), where,

@@ -12,12 +12,12 @@ counts as large as a request: a distribution over three actions is about 50 byte
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats, Ints
-from harness.radio.channel import ByLink, Delivery, Draws, Links, Physical, Site, Unit
+from harness.core.arrays import Floats
+from harness.radio.channel import Antenna, ByLink, Delivery, Draws, Links, Physical, Site
+from harness.radio.consulted import Consulted
 from harness.radio.wrapped import Wrapped, broadcast, delivered, heard_s, innermost
 
 EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and those to the helpers
@@ -33,7 +33,7 @@ class Relay(Wrapped):
     what it sends does not wait for other messages.
     """
 
-    unit: Unit  # position and antenna height of the unit
+    unit: Antenna  # position and antenna height of the unit
     delay_s: float  # seconds from a reply's end at the unit until its copy is to be sent
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
@@ -45,7 +45,7 @@ class Relay(Wrapped):
         has_request = draws.packet[..., 0] >= link_loss(
             self.channel, links.where, draws, links.request_bits
         )
-        at_unit = links.where.units[self.unit]
+        at_unit = links.where.antennas[self.unit]
         there = delivered(
             self.channel,
             replace(links, asked=links.asked & has_request, site=at_unit.select(HELPERS)),
@@ -73,33 +73,9 @@ class Relay(Wrapped):
         )
 
 
-class Consulted(NamedTuple):
-    """Hold the result of asking H helpers, directly or by a roadside unit.
-
-    A unit is an antenna beside the road; it may ask for the ego, fuse the replies and send the ego
-    a policy. Times are seconds from the start of the ego's request. Arrays are of decisions of any
-    shape `(...)`; index h of an axis of length H is helper h.
-    """
-
-    # which helpers were asked, `(..., H)`; with a unit none if the ego's request to it was lost
-    asked: Bools
-    # whether request and reply were received, and a unit's policy if it sent one, `(..., H)`
-    up: Bools
-    # end of each reply at the place of fusion, `(..., H)`; inf for helpers that were not asked
-    end_s: Floats
-    fused: Bools  # which replies may be part of the policy, `(..., H)`
-    # when the ego has heard all that it waits for, `(...)`, or gives up waiting for a policy
-    acts_s: Floats
-    loss: Floats  # probability that a reply is lost, `(..., H)` or `(..., 1)`
-    requests: Ints  # number of requests of the ego and the unit, `(...)`
-    request_bits: Floats  # their size, with the ego's intent in its request to a unit, `(...)`
-    policy_bits: Floats  # size of the unit's policy, `(...)`
-    airtime_s: Floats  # time on air of all messages, `(...)`
-
-
 def by_unit(
     channel: Physical,
-    unit: Unit,
+    unit: Antenna,
     delay_s: float,
     links: Links,
     draws: Draws,
@@ -123,10 +99,12 @@ def by_unit(
         left_s: seconds from the start of the ego's request until the ego waits for a policy no
             longer, `(...)`.
     """
-    bits, at_unit = links.request_bits, links.where.units[unit]
+    bits, at_unit = links.request_bits, links.where.antennas[unit]
     ego_link, helper_links = (replace(links, site=at_unit.select(ends)) for ends in (EGO, HELPERS))
     to_ego, to_helpers = draws.of(".roadside-ego"), draws.of(".roadside")
-    back_draw, request_draw, policy_draw = np.moveaxis(to_ego.first_packets, -1, 0)
+    one_link = to_ego.of_one
+    back_draw = one_link.wait
+    request_draw, policy_draw = np.moveaxis(one_link.packet[..., 0, :], -1, 0)
 
     def lost(size_bits: float) -> Floats:
         return link_loss(channel, ego_link.where, to_ego, size_bits)[..., 0]
@@ -135,12 +113,12 @@ def by_unit(
     to_unit = broadcast(channel, 2 * bits, draws)
     reached = wanted & (request_draw >= lost(2 * bits))
     ask = broadcast(channel, bits, to_helpers)
-    unit_s = heard_s(channel, to_unit, ego_link, to_ego.first)
+    unit_s = heard_s(channel, to_unit, ego_link, one_link)
     ready_s = ready(unit_s + delay_s + heard_s(channel, ask, helper_links, to_helpers))
     is_asked = links.asked & reached[..., None]
     replies = delivered(channel, replace(helper_links, asked=is_asked, ready_s=ready_s), to_helpers)
     back = broadcast(channel, bits, replace(to_ego, given=back_draw[..., None]))
-    back_s = delay_s + heard_s(channel, back, ego_link, draws.of(".roadside-policy").first)[..., 0]
+    back_s = delay_s + heard_s(channel, back, ego_link, draws.of(".roadside-policy").of_one)[..., 0]
     latest_s = left_s - back_s
     sent = reached & (latest_s >= unit_s[..., 0])
     crossed = sent & (policy_draw >= lost(bits))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from channel_checks import check_channel
 from evaluating import run as evaluate
 from evaluating import spec_of
 from hypothesis import given, settings
@@ -24,12 +25,14 @@ from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.named_points import named_point
 from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.extensions.radio.propagation import Propagation
 from harness.extensions.radio.trace import Point, Spread, Table, Trace
-from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws, Site, Unit
+from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Antenna, Draws, Site
 from harness.radio.fading import Trips
 from harness.radio.profiles import CHANNELS
+from harness.runs import formats
 from harness.world.sight_lines import site
 from harness.world.state import Building, VehicleState, WorldState
 
@@ -47,7 +50,7 @@ SPREAD = Trace(
     ),
     0.0,
 )
-ABOVE = Unit(0.0, 0.0, 5.0)
+ABOVE = Antenna(0.0, 0.0, 5.0)
 DOUBT = (0.3, 0.4, 0.3)
 CROSSES, LOST = 0.9, 0.1  # draws behind the building
 
@@ -74,7 +77,7 @@ def play(
     point: OperatingPoint, request: float = CROSSES, reply: float = LOST, seed: int = 0, to_ego: int = CLEAR,
     inference_s: tuple[float, ...] = (0.145, 0.145, 0.145),
 ) -> Coordination:  # fmt: skip
-    where = replace(places(CLEAR, BUILDING), units={ABOVE: places(to_ego, CLEAR, CLEAR)})
+    where = replace(places(CLEAR, BUILDING), antennas={ABOVE: places(to_ego, CLEAR, CLEAR)})
     intents = Intents(
         np.array(DOUBT), np.array([(0.8, 0.1, 0.1), (0.0, 0.0, 1.0)]), np.ones(2, bool),
         np.array([20.0, 10.0, 5.0]), np.array([20.0, 30.0]), np.full(2, 1000.0), np.array(inference_s), where,
@@ -217,7 +220,7 @@ def cases(draw: st.DrawFn) -> tuple[Intents, Draws]:
         np.full((6, 3), 1 / 3), np.where(valid[..., None], rng.dirichlet(np.ones(3), shape), np.nan), valid,
         rng.uniform(1, 50, (6, 1 + helpers)), np.where(valid, rng.uniform(1, 90, shape), np.nan),
         rng.uniform(100, 4000, shape), rng.uniform(0.1, 0.16, (6, 1 + helpers)),
-        replace(somewhere(helpers), units={ABOVE: somewhere(1 + helpers)}),
+        replace(somewhere(helpers), antennas={ABOVE: somewhere(1 + helpers)}),
     )  # fmt: skip
     trips = Trips(rng.integers(0, 9, 6), rng.integers(0, 9, 6), rng.integers(0, 6, 6), 6)
     return intents, Draws(rng.random((*shape, 2)), rng.random(shape), trips)
@@ -302,10 +305,79 @@ def lossless() -> tuple[Intents, Draws]:
     intents = Intents(
         np.full((6, 3), 1 / 3), rng.dirichlet(np.ones(3), (6, 3)), np.ones((6, 3), bool),
         rng.uniform(1, 50, (6, 4)), rng.uniform(1, 90, (6, 3)), np.full((6, 3), 800.0), np.full((6, 4), 0.1),
-        replace(where, units={ABOVE: unit}),
+        replace(where, antennas={ABOVE: unit}),
     )  # fmt: skip
     trips = Trips(np.arange(6), np.arange(6), np.zeros(6, int), 1)
     return intents, Draws(rng.random((6, 3, 2)), rng.random((6, 3)), trips)
+
+
+# -- its settings ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"edge": "relays"}, "unknown edge 'relays'; did you mean 'relay'?"),
+        (
+            {"edge": "fusion"},
+            "edge is 'fusion'; it must be none or relay: links of channel profile 6g have no",
+        ),
+        (
+            {"edge": "relay", "edge_x_m": 3},
+            "edge_x_m is 3.0; it must be left out: links of channel profile 6g",
+        ),
+        (
+            {"profile": "mode4", "edge": "fusion", "consensus": "ego-prompt"},
+            "edge is 'fusion'; it must be none or relay where consensus is ego-prompt: a unit has",
+        ),
+        (
+            {"profile": "mode4", "edge": "fusion", "content": "objects"},
+            "edge is 'fusion'; it must be none or relay where content is objects, which holds no",
+        ),
+        ({"edge_delay_s": -1}, "edge_delay_s is -1; it must be seconds, 0 or more"),
+        ({"edge_antenna_m": 0.5}, "edge_antenna_m is 0.5; it must be metres from 1 to 100"),
+    ],
+)
+def test_a_setting_that_is_not_allowed_is_one_line_that_names_it(settings, says):
+    with pytest.raises(UserError) as error:
+        OperatingPoint.from_dict({"name": "mine", "profile": "6g", **settings})
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("setting", ["edge=relay", "edge_x_m=3"])
+def test_a_unit_is_refused_where_there_is_no_channel(setting: str) -> None:
+    with pytest.raises(UserError, match=r"single-local has no channel, so edge"):
+        named_point(f"single-local:{setting}")
+
+
+def test_settings_of_a_unit_change_nothing_where_there_is_none():
+    for name, setting in (("6g", "edge_delay_s"), ("mode4", "edge_x_m")):
+        assert named_point(name).idle(setting) == "it has no roadside unit (edge is none)"
+    for name, setting in (("6g:edge=relay", "tau_nats"), ("mode4:edge=relay", "edge_delay_s")):
+        assert named_point(name).idle(setting) is None
+    traced = named_point("traced:edge=relay,loss=0.1").idle("latency_s")
+    assert traced is not None
+    assert traced.endswith("has latencies of its own")
+
+
+def test_over_a_channel_without_places_a_relay_is_its_second_path():
+    v2x = OperatingPoint.of("x", "v2x", loss=0.0, edge="relay")
+    assert v2x.channel == replace(CHANNELS["v2x"], loss=0.0, roadside_edge=True)
+
+
+RELAYED = ["mode4:edge=relay,edge_delay_s=0.01", "its-g5:edge=relay", "mode2:edge=relay,loss=0.3"]
+
+
+@pytest.mark.parametrize("name", RELAYED)
+def test_a_relay_gives_each_link_a_fate_and_no_row_another_rows(name):
+    check_channel(named_point(name).channel)
+
+
+def test_the_setting_of_old_runs_is_a_relay() -> None:
+    point = {"name": "6g", "roadside_edge": True}
+    [read] = formats.upgraded({"conditions": [point]})["conditions"]
+    assert OperatingPoint.from_dict({**read, "profile": "6g"}).setting("edge") == "relay"
 
 
 # -- where it stands -------------------------------------------------------------------------------
@@ -320,17 +392,17 @@ def test_a_unit_above_the_crossing_sees_round_the_corner_and_past_no_truck():
     corner = Building("b1", -30, 5, -5, 30)
     ego, helper, truck = car("v1", -25, 0), car("v2", 0, 25), car("v9", 10, 0, "truck")
     state = WorldState("any", 0, 0, 0.0, 8.0, (ego, helper, truck), (corner,))
-    beside = Unit(30.0, 0.0, 5.0)
+    beside = Antenna(30.0, 0.0, 5.0)
     links = site([(state, ["v1", "v2"])], [ABOVE, beside], zone_m=(0.0, 0.0))
     assert links.sight.tolist() == [[BUILDING]]
-    assert links.units[ABOVE].sight.tolist() == [[CLEAR, CLEAR]]
-    assert links.units[beside].sight.tolist() == [[VEHICLE, CLEAR]]
-    assert links.units[beside].blocker_m.tolist() == [[3.6, 0.0]]
-    assert links.units[ABOVE].distance_m.tolist() == [[25, 25]]
-    assert site([(state, ["v1"])], [beside], zone_m=(-30.0, 0.0)).units[
+    assert links.antennas[ABOVE].sight.tolist() == [[CLEAR, CLEAR]]
+    assert links.antennas[beside].sight.tolist() == [[VEHICLE, CLEAR]]
+    assert links.antennas[beside].blocker_m.tolist() == [[3.6, 0.0]]
+    assert links.antennas[ABOVE].distance_m.tolist() == [[25, 25]]
+    assert site([(state, ["v1"])], [beside], zone_m=(-30.0, 0.0)).antennas[
         beside
     ].distance_m.tolist() == [[25]]
-    assert links.units[beside].first_m == 5.0
+    assert links.antennas[beside].first_m == 5.0
 
 
 @pytest.mark.parametrize(
