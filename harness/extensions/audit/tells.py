@@ -41,9 +41,15 @@ Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]
 
 @dataclass(frozen=True)
 class Audit:
-    """Hold how well the hidden danger of a scenario can be predicted from what the ego sees.
+    """Hold how well what the ego sees predicts the hidden danger of a scenario, and by what.
 
-    The danger is the vehicle that the ego would meet; a sector is where it can come from.
+    The danger is the vehicle that an ego which keeps its speed would meet; a sector is where it can
+    come from. It is of so many `layouts` (start situations), the first with layout seed `seed`, and
+    of the decisions numbered in `steps`, from 0. `auc` has for each question (`danger`: is there
+    one; a sector: does it come from there) the probability from 0 to 1 that a layout where it is
+    true gets a higher score than one where it is not; 0.5 is a guess. `told_by` has the AUC that is
+    lost without each number of the ego's scene graph that gives the danger away; it is empty unless
+    an AUC is too high.
     """
 
     scenario: str  # name of the scenario
@@ -71,9 +77,13 @@ class Audit:
 
 @dataclass(frozen=True)
 class HiddenPoints:
-    """Hold m decision points of some layouts at which the danger is out of the ego's sight.
+    """Hold m decision points, some for each layout, at which the danger is out of the ego's sight.
 
-    A scene graph, what the ego knows of the scene, gives k numbers at each.
+    `layout`, (m,), is the index of each point's layout (drawn start situation), and `step`, (m,),
+    the number of its decision in the episode, from 0. `danger`, (m,), is the sector that its
+    layout's danger comes from, `NONE` without a danger. `numbers`, (m, k), has the k numbers that
+    the ego's scene graph states (what it knows of the scene), NaN where it does not know one, and
+    `names` their names.
     """
 
     layout: Ints  # index of each point's layout (start situation), (m,)
@@ -90,10 +100,12 @@ def audit(
     progress: Callable[[int], None],
     workers: Workers = 1,
 ) -> Audit:
-    """Audit a scenario on the layout seeds `seed` to `seed + layouts - 1`.
+    """Test, in simulated layouts, whether what the ego sees gives a scenario's hidden danger away.
 
-    `progress` is called with the number of layouts just done. Raises UserError without
-    scikit-learn, or if too few layouts have a danger, or too few have none.
+    There are `layouts` of them, with layout seeds `seed` to `seed + layouts - 1`. `progress` is
+    called with the number of layouts just done; `workers` is the number of processes, or a cluster.
+    Raises UserError without scikit-learn, or if too few layouts have a danger, or too few have
+    none.
     """
     extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)
@@ -167,11 +179,13 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
 def judge(
     points: HiddenPoints, sectors: tuple[str, ...]
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
-    """Return the AUC of each question, and the numbers that give the danger away.
+    """Return how well numbers predict a danger, the AUC of each question by its name, and by which.
 
-    A question is whether there is a danger, or whether it comes from one of the `sectors`. Each
-    number is returned with the AUC lost without it, for the question with the highest AUC, if that
-    is too high. Cross-validated gradient-boosted trees answer.
+    A question is whether there is a danger (`danger`), or whether it comes from one of the
+    `sectors` (their names); its AUC is the probability that a layout where that is true scores
+    above one where it is not. Trees learn from the numbers of `points`, and score layouts from
+    which they have not learnt. If the highest AUC is above `MOST_AUC`, the second result has, by
+    name, the numbers without which it falls the most, and how much; else it is empty.
     """
     from sklearn.ensemble import HistGradientBoostingClassifier
     from sklearn.model_selection import StratifiedGroupKFold
@@ -237,10 +251,11 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 
 @dataclass(frozen=True)
 class Ranks:
-    """Hold pairwise comparisons of scores of layouts with the danger in question and without.
+    """Hold how often layouts with the danger in question score higher than layouts without it.
 
-    `pairs` counts the compared pairs of points by both layouts, and `above` those in which the
-    layout with the danger has the higher score; a tie counts half.
+    Both arrays are (with, without): a row for each layout with the danger and a column for each
+    without. `pairs` counts the pairs of decision points of both that were compared, and `above`
+    those in which the layout with the danger has the higher score; a tie counts half.
     """
 
     # number of pairs of points in which the layout with it ranks higher, (with, without); a tie
@@ -250,10 +265,11 @@ class Ranks:
 
     @classmethod
     def compare(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":
-        """Compare the scores (m,) of points of layouts with the danger (`there`, (m,)) and without.
+        """Compare scores of m decision points, of layouts with the danger in question and without.
 
-        `layout` (m,) has each point's layout. Only points with the same value of `alike` (m,) are
-        compared.
+        All arrays are (m,): the number of each point's layout (start situation); `alike`, the
+        number of its group, since only points of one group are compared; the score; and `there`,
+        whether the layout has the danger.
         """
         have, have_not = np.unique(layout[there]), np.unique(layout[~there])
         above, pairs = np.zeros((2, len(have), len(have_not)))
@@ -272,9 +288,10 @@ class Ranks:
         return float(self.above.sum() / self.pairs.sum())
 
     def estimate(self) -> Estimate:
-        """Return how well a feature alone tells layouts with a danger from those without, the AUC.
+        """Return the AUC: the probability that a layout with the danger scores above one without.
 
-        Its 95 % interval has the percentiles of a bootstrap over the n layouts that were ranked.
+        Its 95 % interval has the percentiles of a bootstrap over the layouts, whose number is its
+        `n`.
         """
         have, have_not = self.pairs.shape
         draws = noise.generator("audit", "bootstrap")
@@ -288,7 +305,11 @@ class Ranks:
 
 
 class OfDatasets:
-    """Audit a dataset while it is built: what `harness dataset build` calls."""
+    """Audit a scenario while `harness dataset build` makes a dataset of it.
+
+    `ready` raises UserError where scikit-learn is missing, and `found` returns the audit's result
+    as a sentence for the dataset's README.
+    """
 
     def ready(self) -> None:
         extras.need("an audit", "sklearn")
