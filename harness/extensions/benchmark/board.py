@@ -25,10 +25,13 @@ from harness.runs.suite import SuiteRun, plays
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one entry of a board, the ranking of an edition: its rank, its success, and its gain.
+    """Hold one entry of a board, the ranking of an edition (a release of the benchmark).
 
-    Success is the share of episodes in which the ego reaches its goal in time, averaged over
-    families (scenes of one scenario). Conditions are the edition's operating points, by name.
+    `entry` is its file of results, computed again here. `rank` is one more than the number of
+    entries that are clearly better, None of an entry that sees what no vehicle can. `success` has,
+    by condition (an operating point of the edition, by name), the share of episodes in which the
+    ego reaches its goal in time, as a mean over scenarios; `gain` is the first of these less that
+    without a radio. None is not known.
     """
 
     entry: Rescored  # the file of results, computed again
@@ -57,8 +60,9 @@ class Line:
 def lines(entries: Sequence[Rescored]) -> list[Line]:
     """Return the board's lines for the entries of one edition, the most successful first.
 
-    `entries` are files of results whose figures were computed again here. Raises UserError if they
-    are of several editions, or if there are none.
+    `entries` are files of results whose figures were computed again here. Each gets its rank, its
+    success in each of the edition's conditions, and its gain. Raises UserError if they are of
+    several editions, or if there are none.
     """
     names = dict.fromkeys(entry.edition.name for entry in entries)
     if len(names) != 1:
@@ -121,16 +125,21 @@ def _gain(suite: SuiteRun, edition: Edition, metric: str) -> Score | None:
 
 
 def write(ordered: Sequence[Line], left_out: Collection[str], out: Path) -> Path:
-    """Write the HTML page of a board's lines, in their order, to `out`, and return its path.
+    """Write the HTML page that ranks entries to the file `out`, and return its path.
 
-    `left_out` has a sentence for each file that is not on the board: which it is, and why.
+    `ordered` are the board's lines in the order of the page, as `lines` returns them. `left_out`
+    has a sentence for each file that is not on the board: which it is, and why.
     """
     save([render(ordered, left_out)], out, "--out")
     return out
 
 
 def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
-    """Return the HTML page of a board's lines, in their order; arguments are as of `write`."""
+    """Return the HTML page that ranks entries, as text; `write` saves it.
+
+    `ordered` are the board's lines in the order of the page. `left_out` has a sentence for each
+    file of results that is not on the board: which it is, and why.
+    """
     first = ordered[0].entry
     edition, suite = first.edition, first.suite
     by = edition.ranked_by

@@ -38,9 +38,10 @@ Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of d
 
 
 class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe `editions/NAME.golden.zip`, a results file that pins how figures are computed.
+    """Describe `editions/NAME.golden.zip`, a file of results that pins how figures are computed.
 
-    An installation is checked against it: it must compute the figures that the file states.
+    An installation must compute the very figures that this file states. `sha256` is the file's hex
+    digest, and `layouts` how many start situations of each dataset it has, counted from the first.
     """
 
     sha256: str  # hex digest of the file
@@ -50,10 +51,13 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Describe an edition: a release of the benchmark that never changes.
 
-    It has all that a score on it depends on, beside the model: datasets and prompts by digest,
-    operating points (everything else that a decision depends on, such as the radio and whom the ego
-    asks), the seeds of the channel's random draws, latency, ties and metrics. An entry is one
-    model's results on it. `golden` is None in a project's own edition that pins no figures.
+    It has all that a score depends on, beside the model: `datasets` and `prompts` by name with
+    their hex SHA-256; `condition`, the names of the operating points that are scored (settings of
+    the radio, of whom the ego asks and so on), one of them `ranked_by`; `seeds` of the channel's
+    draws, `latency` and `ties` as the options of `harness eval` of these names take them; and
+    `metrics`, the names of the figures that a file of results states. `gains` is how intervals of
+    gains are made: of all layouts together (`paired episodes`), or of those with a danger and
+    without apart. `golden` is None in a project's own edition that pins no figures.
     """
 
     name: str  # name of its file, without .toml
@@ -88,7 +92,11 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return self.golden.layouts if self.golden and self.golden.sha256 == file_sha256 else None
 
     def figures(self, run: Run) -> list[Score]:
-        """Return the scores of a run that a results file of this edition states."""
+        """Return the scores of a run that a file of results of this edition states.
+
+        A score is the estimate of one metric in one condition, with its interval. These are the
+        run's scores of the edition's `metrics`, whose gains have the edition's kind of interval.
+        """
         scores = [score for score in run.scores if score.metric in self.metrics]
         if self.gains == PAIRED:
             return scores
@@ -97,10 +105,11 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ]
 
     def difference(self, pairs: Pairs) -> Estimate:
-        """Return the mean difference in success a - b over families, with the edition's interval.
+        """Return the mean difference in success of a less b over families, with an interval.
 
-        `pairs` has, for each family of scenes, its success rule and both sides' success (S, E), by
-        S channel seeds and E episodes.
+        `pairs` has, for each family (the scenes of one scenario), how success counts there, and the
+        success of a and of b, 1 or 0, both (S, E) by S channel seeds and E episodes. The interval
+        is of the kind that `gains` names.
         """
         return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 
@@ -120,10 +129,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         )
 
     def source(self, dataset: str, limit: int | None = None) -> FrozenSource:
-        """Read the edition's dataset of a name, as scenes that a model is evaluated on.
+        """Read one of the edition's datasets by its name, as scenes on which a model is evaluated.
 
         A dataset has layouts, drawn start situations of a scenario, each with every scene that
-        actions can lead to. With `limit`, only that many are taken, from the first. Raises
+        actions can lead to. With `limit`, only that many layouts are taken, from the first. Raises
         UserError if the dataset here is missing, or has another digest than the edition states.
         """
         source = FrozenSource(load.load(load.find(dataset), limit), limit)
@@ -136,9 +145,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def entry(self, runs: Sequence[Run], limit: int | None = None) -> dict[str, Run]:
         """Return the runs of one entry by the name of their dataset, in the edition's order.
 
-        `limit` is how many layouts (start situations) of each dataset they must be of; None for
-        all, as an entry is. Raises UserError unless each run has this edition's settings, each
-        dataset has one run, and all are of one agent: one model, answer mode and so on.
+        An entry is one model's results on the edition. `limit` is how many layouts (start
+        situations) of each dataset they must be of; None for all. Raises UserError unless each run
+        has this edition's settings, each dataset has one run, and all are of one agent: one model,
+        answer mode and so on.
         """
         by_dataset: dict[str, Run] = {}
         for run in runs:
@@ -197,8 +207,9 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def spec(self, run: Run, source: FrozenSource) -> Spec:
         """Return the evaluation that computes a run again, on the scenes of `source`.
 
-        It has the edition's settings and the run's agent: its model, prompt and answer mode. Raises
-        UserError if the prompt of that name here has another digest than the edition states.
+        A `Spec` is what an evaluation needs: it has the edition's settings here, and the run's
+        agent (its model, prompt and answer mode). Raises UserError if the prompt of that name here
+        has another digest than the edition states.
         """
         m = run.manifest
         prompt = versions.load(str(m.prompt["version"]))
@@ -227,7 +238,7 @@ def _agent(m: Manifest) -> dict[str, Any]:
 
 
 def named(name: str) -> Edition:
-    """Return an edition by name, shipped or the project's.
+    """Return the edition of a name, such as `v2v-safety-1.1`: one that ships, or the project's own.
 
     Raises UserError if there is none, or its file is wrong.
     """
@@ -237,7 +248,11 @@ def named(name: str) -> Edition:
 
 
 def of_file(file: Path) -> Edition:
-    """Read an edition from its TOML file. Raises UserError if the file is wrong."""
+    """Read an edition, a release of the benchmark, from its TOML file.
+
+    Its name is the file's, and its digest that of the file's tables, however they are laid out.
+    Raises UserError if the file is wrong.
+    """
     where = f"edition {printable(file)}"
     tables = toml(file, where)
     try:

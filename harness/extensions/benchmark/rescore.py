@@ -24,10 +24,13 @@ from harness.runs.suite import SuiteRun
 
 @dataclass(frozen=True)
 class Rescored:
-    """Hold a results file whose figures were computed again here from its answers.
+    """Hold a file of results whose figures were computed again here from the answers in it.
 
     The file packs one entry of a benchmark: a run on each dataset of an edition (a release of the
-    benchmark), with the model's answers and the figures that its maker states.
+    benchmark), with the model's answers and the figures that its maker states. `contents` is its
+    `results.json`, and `suite` has the runs as computed here. `differences` names, by dataset, what
+    the file states otherwise, of the `compared` figures. `golden` is true of the file that pins how
+    the edition's figures are computed, which is no entry.
     """
 
     contents: Contents  # the file's own `results.json`
@@ -41,7 +44,7 @@ class Rescored:
 
 
 class Here:
-    """Represent this installation: its datasets, each read once, and how it computes figures.
+    """Represent this installation: it reads each dataset once, and checks how it computes figures.
 
     One object is shared by all files of results that are computed again.
     """
@@ -51,7 +54,7 @@ class Here:
         self._checked: set[str] = set()  # digests of editions
 
     def source(self, edition: Edition, name: str) -> FrozenSource:
-        """Return the dataset of an edition with a name, read once.
+        """Return the scenes of an edition's dataset by its name; each is read once and kept.
 
         Raises UserError if the dataset here has another digest than the edition states.
         """
@@ -63,7 +66,8 @@ class Here:
     def check(self, edition: Edition) -> None:
         """Raise UserError unless this installation computes an edition's figures as it pins them.
 
-        An edition pins them by a golden file of results; one without such a file passes.
+        An edition, a release of the benchmark, pins them by a file of results, whose figures are
+        computed again; an edition without such a file passes. Each edition is checked once.
         """
         if edition.golden is None or edition.digest in self._checked:
             return
@@ -100,7 +104,7 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
 
     Raises UserError if the file is broken, too large or of another edition than the one here, if it
     lacks the answer to a question, or has one to another question; or if this installation computes
-    the edition's golden figures otherwise.
+    the figures that the edition pins otherwise.
     """
     contents, stated_folder = contents_of(file), folder / "stated"
     with _about(file, stated_folder):
@@ -146,9 +150,10 @@ def _about(file: Path, folder: Path) -> Iterator[None]:
 def differing(stated_run: Run, computed_run: Run, edition: Edition) -> Iterator[str]:
     """Yield in words what differs between a run as a file states it and as it is computed here.
 
-    That is the name of each figure of the edition that differs, then each column of the table of
-    episodes, with the number of episodes. Numbers are compared to the last digit. A column that is
-    empty in the stated run, which an earlier release may have written, is not compared.
+    First come the condition and name of each of the edition's figures that differs; then each
+    column of the table of episodes, with the number of episodes that differ. Numbers are compared
+    to the last digit. A column that is empty in the stated run is not compared, since a release
+    that wrote the run may not have had it.
     """
     stated_scores = {score.key: score for score in edition.figures(stated_run)}
     computed_scores = {score.key: score for score in edition.figures(computed_run)}

@@ -52,6 +52,8 @@ CHUNK = 1 << 20
 class Contents(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Hold the content of `results.json`, which describes a file of a benchmark's results.
 
+    `edition` is the name of the benchmark's release, and `digest` its hex SHA-256; `made_by` says
+    in the maker's words who made the file; `runs` are the names of the datasets, each with a run.
     Raises ValueError for another format, bad names of runs, or a `made_by` that is too long.
     """
 
@@ -80,10 +82,11 @@ def pack(
     figures: Callable[[Run], Sequence[Score]],
     out: Path,
 ) -> None:
-    """Write a benchmark entry to the zip file `out`: `contents`, and `runs` by their datasets.
+    """Write a benchmark entry, one model's results, to the zip file `out`.
 
-    `figures` returns the scores of a run that are written. Paths of this machine are left out.
-    Equal runs give equal bytes.
+    `contents` describes it, and `runs` has the run on each dataset, by the dataset's name.
+    `figures` takes a run and returns its scores that are written. Paths of this machine are left
+    out. Equal runs give equal bytes.
     """
     with (
         replacing(out) as part,
@@ -122,7 +125,7 @@ def _files(
 
 
 def contents_of(file: Path) -> Contents:
-    """Read `results.json` in a file of results; nothing else is unpacked.
+    """Read `results.json` in a file of results, which describes it; nothing else is unpacked.
 
     Raises UserError if the file is not one of results.
     """
@@ -131,11 +134,11 @@ def contents_of(file: Path) -> Contents:
 
 
 def unpack(file: Path, contents: Contents, folder: Path) -> None:
-    """Write the runs in a file of results to a folder, each to one named after its dataset.
+    """Write the runs in a file of results to `folder`, each in a folder named after its dataset.
 
-    Only the files that `contents` call for are written, under names made here and no larger than
-    `FILES` allows. Raises UserError if the file is broken; or, before anything is unpacked, if it
-    holds others or larger ones.
+    `contents` is what `contents_of` read in the file. Only the files that it calls for are written,
+    under names made here and no larger than `FILES` allows. Raises UserError if the file is broken;
+    or, before anything is unpacked, if it holds others or larger ones.
     """
     with _archive(file) as archive:
         wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}
