@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 class Budget:
     """Hold the most money that a command may spend on answers, by the prices in model cards.
 
-    A card is a file that describes a model. All processes of the command add up amounts in a file.
+    A model card is a file that describes a model. `most` is an amount in `currency`, a currency's
+    name. Every process of the command adds what it spends as a line to `file`. Called with a card
+    and the backend that runs its model, it returns a backend that stops once all is spent.
     """
 
     most: float  # the most, in `currency`
@@ -41,7 +43,7 @@ class Budget:
             file.write(f"{amount!r}\n".encode())
 
     def check(self) -> None:
-        """Raise Unanswered if the budget is spent."""
+        """Raise Unanswered if what all processes of the command spent so far reaches `most`."""
         spent = math.fsum(map(float, text_of(self.file, "rows").split()))
         if spent >= self.most:
             raise Unanswered(
@@ -51,10 +53,10 @@ class Budget:
 
 
 class Limited:
-    """Wrap a backend, which runs a model, and spend the price of its completions (answers).
+    """Wrap a backend, the code that runs a model, and add the price of its answers to a budget.
 
-    `complete` raises Unanswered, before it asks, if the budget is spent, or if nobody said how many
-    tokens the last answers took, which a budget would never notice. All else is as in the backend.
+    `complete` raises Unanswered, before it asks, if the budget is spent, or if the last answers
+    came without their numbers of tokens, by which a price goes. All else is as in the backend.
     """
 
     def __init__(self, backend: Backend, model: str, price: Price, budget: Budget) -> None:
@@ -84,9 +86,10 @@ class Limited:
 def budget(most: float, specs: "Sequence[Spec]", workers: "Workers") -> Iterator[Budget]:
     """Enter a context with the budget that a command's evaluations share, of `most` money.
 
-    `specs` are the evaluations, and `workers` is how many processes play them. A line on stderr
-    names the servers' models that have no price and so do not count. Raises UserError if `most` is
-    not above 0, no card or cards in several currencies state a price, or the workers are a cluster.
+    `most` is in the currency of the models' prices. `specs` are the evaluations, and `workers` is
+    how many processes play them, or a cluster of them. A line on stderr names the servers' models
+    that have no price and so do not count. Raises UserError if `most` is not above 0, if no model
+    card states a price or several state it in different currencies, or for a cluster.
     """
     option = f"--max-cost {most:g}"
     if not isinstance(workers, int):

@@ -12,7 +12,11 @@ if TYPE_CHECKING:
 
 
 class MaxCost(CommandOption):
-    """Refuse to ask once an amount is spent."""
+    """Define the option `--max-cost AMOUNT`: a command asks no model once its answers cost so much.
+
+    `guard` returns the context in which evaluations share that budget; of None, one without a
+    limit.
+    """
 
     kind = float
     metavar = "AMOUNT"
