@@ -38,7 +38,10 @@ ONLY_TUNE = "calibration is fitted on tune seeds"
 class Correction:
     """Hold the correction of one role's answers: a prior to divide out, and a temperature.
 
-    Answers are probabilities of actions, and a role is who gives them: the ego, or a helper.
+    An answer is a probability for each of A actions, and a role is who gives it: the ego, or a
+    helper. `prior` has an action's mean probability each, (A,), and is empty where nothing is
+    divided out. Then probabilities are raised to 1 / `temperature` and scaled to sum to 1; a
+    temperature of 1 changes nothing. `answers` is the number of answers that it was fitted on.
     """
 
     answers: Count  # number of answers that it was fitted on
@@ -48,7 +51,10 @@ class Correction:
     prior: tuple[Annotated[float, Meta(ge=LEAST_PRIOR, le=1)], ...] = ()
 
     def of(self, p: Floats) -> Floats:
-        """Return intents `(..., A)` over A actions corrected; rows with NaN stay as they are."""
+        """Return corrected answers `(..., A)`, given probabilities of A actions, `(..., A)`.
+
+        A failed answer, a row of NaN, stays as it is.
+        """
         powers = (p / np.array(self.prior or 1.0)) ** (1.0 / self.temperature)
         total = powers.sum(axis=-1, keepdims=True)
         return np.where(total > 0, powers / np.where(total > 0, total, 1.0), p)
@@ -56,9 +62,14 @@ class Correction:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Hold the content of a file of `calibrations/`: corrections for one model and one question.
+    """Hold the content of a file of `calibrations/`: corrections of one model's answers.
 
-    They were fitted on layouts, start situations that are drawn from layout seeds.
+    They hold for one model, prompt and answer mode (`question`, with these settings by name) and
+    one `scenario`, and were fitted on layouts (start situations) with layout seeds from
+    `first_seed` to `last_seed`. `level` says what is corrected: L0 divides a prior out, L1 has a
+    temperature, L0+L1 both. `ego` corrects the ego's answers and `helper` those of helpers, None
+    where none answered. `command` made the file, `fitted_on` describes the run, and `actions` are
+    the names of the actions in the order of an answer's probabilities.
     """
 
     level: Level  # L0 divides a prior out, L1 has a temperature, L0+L1 both
@@ -73,9 +84,10 @@ class Calibration:
     helper: Correction | None = None  # of helpers' answers; None where no helper answered
 
     def obstacle(self, agent: Mapping[str, Any], scenario: Scenario) -> str | None:
-        """Return why it must not correct an agent's answers in a scenario; None if it may.
+        """Return in words why it must not correct an agent's answers in a scenario; None if it may.
 
-        `agent` has the agent's settings, as `question_of` takes them.
+        An agent is a model with its prompt and answer mode; `agent` has its settings by name, as
+        `run.json` states them.
         """
         of_scenario = {"scenario": scenario.name, "actions": " ".join(scenario.actions)}
         now = {**question_of(agent), **of_scenario}
@@ -88,18 +100,20 @@ class Calibration:
         return None
 
     def of(self, intents: Intents) -> Intents:
-        """Return a copy of vehicles' intents (probabilities of actions) with corrected answers.
+        """Return a copy of what vehicles intend, with the ego's and the helpers' answers corrected.
 
-        Those of helpers stay as they are if `helper` is None.
+        An intent is the probabilities that a vehicle gives to the ego's actions. Those of helpers
+        stay as they are if `helper` is None.
         """
         helpers = self.helper.of(intents.helpers) if self.helper else intents.helpers
         return replace(intents, own=self.ego.of(intents.own), helpers=helpers)
 
 
 def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
-    """Return the settings of an agent for which a calibration is valid, as texts by name.
+    """Return the settings of an agent for which a calibration is valid, as texts by dotted name.
 
-    `agent` has the agent's settings as `run.json` states them: model, prompt, answer mode and more.
+    An agent is a model with its prompt and answer mode. `agent` has its settings as `run.json`
+    states them: tables `model` and `prompt`, and values such as `answer`.
     """
     model, prompt = agent["model"], agent["prompt"]
     return {
@@ -110,19 +124,22 @@ def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
 
 
 def names() -> list[str]:
-    """Return the names of all calibrations, the project's included."""
+    """Return the names of all files of `calibrations/`, those that ship and the project's."""
     return resources.names(FOLDER)
 
 
 def file_of(name: str) -> Any:
-    """Return the path of a calibration's file. Raises UserError if it is unknown."""
+    """Return the path of a calibration's file, by its name. Raises UserError if it is unknown."""
     if name not in names():
         raise unknown("calibration", name, names(), "; `harness model calibrate` makes one")
     return resources.find(FOLDER, f"{name}.toml")
 
 
 def calibration(name: str) -> Calibration:
-    """Load a calibration by name. Raises UserError if it is unknown or its file is wrong."""
+    """Load the calibration of a name: what corrects one model's answers (`Calibration`).
+
+    Raises UserError if it is unknown or its file is wrong.
+    """
     return _read(file_of(name))
 
 
@@ -152,9 +169,10 @@ def _read(path: Any) -> Calibration:
 
 
 def check_seeds(what: str, first: int, last: int) -> None:
-    """Raise UserError unless layout seeds `first` to `last` are all for tuning.
+    """Raise UserError unless the layout seeds `first` to `last` are all for tuning.
 
-    `what` names their source in the message.
+    A layout seed draws a start situation, and its range says what for: tuning, training or reports.
+    `what` names in the message where the seeds stand, such as a file.
     """
     if not 0 <= first <= last or purposes(first, last - first + 1) != ["tune"]:
         raise UserError(

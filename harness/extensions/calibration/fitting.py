@@ -37,9 +37,11 @@ DIGITS = 6  # of a prior
 
 @dataclass(frozen=True)
 class Fitted:
-    """Hold the correction of one role's answers, and their likelihood without and with it.
+    """Hold the correction of one role's answers, and how likely the optimal actions are by them.
 
-    `before_nats` and `after_nats` are the mean negative log-likelihood of the optimal actions.
+    The role is who answered, `ego` or `helper`. `before_nats` and `after_nats` are the mean
+    negative log-likelihood of the optimal actions, in nats, without and with the correction: less
+    is better.
     """
 
     role: str  # `ego` or `helper`
@@ -50,11 +52,12 @@ class Fitted:
 
 
 def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
-    """Fit a correction on answers `p` (n, A) and a mask of the optimal actions there, (n, A).
+    """Fit a correction on n answers `p`, (n, A), and a mask of the optimal actions there, (n, A).
 
-    There are n answers over A actions. Level `L0` has a prior, the mean of all answers; `L1` the
-    temperature with the best likelihood, of equal ones that nearest to 1. Raises UserError for `L1`
-    if no action is optimal anywhere.
+    An answer is the probabilities of A actions; an action is optimal if success is still possible
+    after it. Level `L0` has a prior, the mean of all answers; `L1` the temperature with the best
+    likelihood of optimal actions, of equal ones that nearest to 1; `L0+L1` both. Raises UserError
+    for `L1` if no action is optimal anywhere.
     """
     prior: tuple[float, ...] = ()
     if "L0" in level:
@@ -77,8 +80,9 @@ def fit(p: Floats, optimal: Bools, level: Level) -> Correction:
 def nats_of(p: Floats, optimal: Bools) -> float:
     """Return the mean negative log-likelihood of the optimal actions, in nats.
 
-    `p` (n, A) has n answers over A actions and `optimal` (n, A) is a mask; answers without an
-    optimal action are left out. NaN if that leaves none.
+    `p`, (n, A), has n answers, each the probabilities of A actions, and `optimal`, (n, A), is true
+    of those after which success is still possible. Answers without an optimal action are left out.
+    NaN if that leaves none.
     """
     return float(np.nanmean(likelihood_nats(p, optimal))) if optimal.any() else float("nan")
 
@@ -86,11 +90,13 @@ def nats_of(p: Floats, optimal: Bools) -> float:
 def calibrate(
     folder: Path, level: Level, dataset: Path | None, command: str
 ) -> tuple[Calibration, list[Fitted]]:
-    """Fit a calibration on the answers of a finished run on tune layouts.
+    """Fit a calibration on the answers of a finished run on layouts that are for tuning.
 
-    Returns it with the fitted correction of each role and what it gained. `command` is stated in
-    its file. Raises UserError for layouts of another purpose, several models, sampled answers, or
-    if no answer of the ego could be parsed.
+    `folder` is the run's, and `dataset` its dataset's, None for where the run says it is; `level`
+    says what is fitted (`Calibration`), and `command`, as typed, is stated in the result. Also
+    returned is, for each role (ego, helper), the correction and how much it gained. Raises
+    UserError for layouts of another purpose, several models, sampled answers, or if no answer of
+    the ego could be parsed.
     """
     run, name = read(folder), printable(folder)
     manifest = run.manifest
@@ -145,7 +151,7 @@ def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None
 
 
 def write(calibration: Calibration, out: Path) -> None:
-    """Write a calibration's file: TOML, whose strings and lists are JSON's."""
+    """Write a calibration to the TOML file `out`, where `calibrations.calibration` can read it."""
     fields = asdict(calibration)
     tables = {name: fields.pop(name) for name in ("question", "ego", "helper")}
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]

@@ -16,7 +16,12 @@ if TYPE_CHECKING:
 
 
 class Calibrated(Part, frozen=True, kw_only=True):
-    """Hold a condition's setting of the calibration that corrects all answers."""
+    """Hold the setting `calibration` of an operating point: what corrects all answers before use.
+
+    It is the name of a file of `calibrations/`, fitted for the run's model, prompt and scenario;
+    empty corrects nothing. Methods are the hooks of `Part`, a group of settings of an operating
+    point, which is all that a decision depends on besides scene and model.
+    """
 
     behind: ClassVar[str] = "content"
     of_ego: ClassVar[bool] = True
