@@ -17,9 +17,11 @@ Pictured = tuple[Request, Request, Request]
 
 @dataclass(frozen=True)
 class Looks:
-    """Hold a model's answers to an image prompt: with a camera picture, a blank one, and none.
+    """Hold a model's answers to a prompt with a camera picture, with a blank one, and with none.
 
-    Answer modes are the ways to answer, such as free text or one letter.
+    `answers` (camera picture) and `blank` have an answer in each answer mode (way to answer, such
+    as free text, `json`, or one letter, `readout`). `text` is the answer without a picture, in the
+    last mode that worked; None if none did.
     """
 
     # answers to the camera picture, one in each answer mode, asked alone after a warm-up
@@ -32,8 +34,8 @@ class Looks:
     def fault(self) -> str | None:
         """Return in words why the model takes no pictures; None if it does.
 
-        A model that answers all pictures alike still reads them if its prompt has more tokens with
-        one.
+        It does if an answer to the camera picture differs from that to a blank one, or if its
+        prompt has more tokens with a picture than without.
         """
         if self.text is None:
             [error, *_] = (
@@ -57,7 +59,15 @@ class Looks:
 
 @dataclass(frozen=True)
 class Checkup:
-    """Hold the result of checking a language model: its prompt, its tokens and its answers."""
+    """Hold what asking a language model a few questions showed: its prompt, tokens and answers.
+
+    `prompt` is the first question as the model reads it, `tokens` its token ids, each with its
+    text, and `bos_tokens` how many start tokens it begins with, more than one of which harms most
+    models; both are None for a server's model. `turn_end` is the text of the token that ends an
+    answer; `thinking` what the model's chat template says about thinking first. `answers` has an
+    answer in each answer mode, asked alone after a warm-up; `identity` tells the model apart, such
+    as by its weights' digest; `looks` is None if the model takes no pictures.
+    """
 
     prompt: str  # the first question as the model reads it, or as a server is sent it
     # its ids, each with its text; None if only a server knows them
@@ -79,10 +89,11 @@ def check(
     pictured: Sequence[Pictured] = (),
     progress: Callable[[int], None] = lambda done: None,
 ) -> Checkup:
-    """Check a model with some questions, one in each answer mode.
+    """Check a language model: ask it some questions, one in each answer mode, and show its prompt.
 
-    For a model with vision, `pictured` has questions of an image prompt, each with a camera
-    picture, a blank one and none. `progress` is called with 1 after each.
+    `backend` runs the model. For one that takes pictures, `pictured` has in each answer mode the
+    same question three times: with a camera picture, with a blank one, and with none. `progress` is
+    called with 1 after each answer.
     """
 
     def answer(request: Request, warm: bool = False) -> Completion:

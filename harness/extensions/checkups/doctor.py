@@ -96,13 +96,12 @@ def _lacking(remedies: list[tuple[str, str]]) -> None:
 
 
 def look(gpu: bool) -> dict[str, Any]:
-    """Return the facts that `harness model doctor --json` prints, as plain values.
+    """Return the facts that `harness model doctor --json` prints, as plain values by name.
 
-    They are versions, cores, memory (GiB), GPUs, energy meters, engines and models with what they
-    lack, and the completion cache.
-
-    Args:
-        gpu: ask torch for GPUs too, which takes seconds to load.
+    They are `versions` of packages, `cores`, `memory_gib`, `gpu` (a text for each), names of energy
+    `meters`, `engines` with what to do about one that cannot run (else None), `models` with what
+    each is `missing`, and the `cache` of answers: its file and bytes. With `gpu`, torch is asked
+    for GPUs, which takes seconds to load; without, the program nvidia-smi.
     """
     from harness.backends import cards, registry
     from harness.backends.cache import default_file

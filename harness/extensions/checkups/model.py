@@ -27,7 +27,13 @@ PROMPT, IMAGE_PROMPT = "v2", "v7"
 
 @dataclass(frozen=True)
 class Check:
-    """Hold the result of `harness model check`: a model's answers, and what they showed."""
+    """Hold the result of `harness model check`: a model's answers, and what they showed.
+
+    `spec` has the model, prompt and settings with which it was asked, and `seen` its prompt and
+    answers. `findings` say whether its read-outs, the probabilities of one letter an action, follow
+    the letter or the scene; None where that was not examined. `unanswered` says why the questions
+    for that got no answer.
+    """
 
     spec: Spec  # how the model was asked: model, prompt and settings
     seen: Checkup  # its prompt and answers
@@ -38,7 +44,11 @@ class Check:
 
     @property
     def completions(self) -> list[Completion]:
-        """Return every answer that the model must give, those to pictures included."""
+        """Return every answer that the model must be able to give.
+
+        That is one in each answer mode to a prompt in words, and to one with a camera picture if it
+        takes pictures; not those to blank pictures.
+        """
         return [
             *self.seen.answers.values(),
             *(self.seen.looks.answers.values() if self.seen.looks else ()),
@@ -46,7 +56,7 @@ class Check:
 
     @property
     def usable(self) -> bool:
-        """Return whether an answer in any answer mode can be parsed to an intent."""
+        """Return whether an answer in some mode can be parsed to probabilities of actions."""
         request = self.spec.ego.blank("ego", self.spec.actions)
         answers = self.seen.answers.items()
         return any(answer_of(request.alike(answer=mode), reply).intent for mode, reply in answers)
@@ -57,9 +67,15 @@ def check(
 ) -> Check:
     """Check a language model in every answer mode, with and without pictures.
 
-    If it answers by letters, fixed questions also show what its read-outs follow, and the findings
-    are kept in the user's cache. Without `device` the engine chooses; without `dtype`, a number
-    format, the card's holds. `progress` counts answers.
+    If it answers by letters, fixed questions also show what its read-outs follow (`Findings`),
+    which is then kept in the user's cache.
+
+    Args:
+        card: the file that describes the model, with the engine that runs it.
+        thinking: whether the model is asked to think first.
+        device: where it is loaded, such as `cuda`; None lets the engine choose.
+        dtype: number format of the weights, such as `float32`; None takes the card's.
+        progress: told how many answers there will be, and called with 1 after each.
     """
     data = load.load(load.find(DATASET), 1)
     can = capabilities(card.engine).answer_modes

@@ -22,7 +22,11 @@ CLEAR = 1.2  # times as fast as another, which chance on a shared machine does n
 
 @dataclass(frozen=True)
 class Pace:
-    """Hold an engine's wall time for one answer, asked alone after a warm-up."""
+    """Hold the wall times of an engine (code that runs a model) for an answer of two kinds, in s.
+
+    Each was asked alone after a warm-up: `readout_s` is for an answer by letters in one order, and
+    `text_s` for the first `TOKENS` tokens of a free answer.
+    """
 
     engine: str  # its name
     readout_s: float  # seconds of a read-out (letters in one order)
@@ -30,10 +34,10 @@ class Pace:
 
 
 def paces(stem: str) -> list[Pace]:
-    """Time the engines that can run a model here: one entry for each.
+    """Time the engines (kinds of code that run models) which can run a model here, one entry each.
 
-    `stem` is the name, without its ending, of the model's card, a file that describes it and names
-    the engines. The list is empty unless there are several and the weights are small. Raises
+    `stem` is the name, without that of an engine, of the model's card, a file that describes it and
+    names its engines. The list is empty unless there are several and the weights are small. Raises
     UserError if weights do not load or the model cannot answer, and Unanswered if an answer fails.
     """
     able = [card for card in each_engine(stem) if missing(card) is None] if stem in names() else []
@@ -43,10 +47,10 @@ def paces(stem: str) -> list[Pace]:
 
 
 def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, list[Pace]]:
-    """Time the engines of several models, by the names of their cards, which describe them.
+    """Return the times of each model's engines, by the name of its card, a file that describes it.
 
-    `stems` are these names, without the ending; cards without times are left out. `progress` is
-    called with 1 after each.
+    `stems` are such names, without that of an engine. A model is left out that has fewer than two
+    engines here or large weights, or that cannot be asked. `progress` is called with 1 after each.
     """
     measured = {}
     for stem in stems:
@@ -58,7 +62,11 @@ def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, 
 
 
 def advice(measured: Sequence[Pace]) -> str:
-    """Return a line that says which of several engines is faster here, and how to choose it."""
+    """Return a line that says which engine of a model is faster here, and how to choose it.
+
+    `measured` has the times of two engines or more. One is faster for an answer of a kind (by
+    letters, or in text) if it is so by a clear margin (`CLEAR`).
+    """
     engines = " and ".join(pace.engine for pace in measured)
     by_letters = _fastest(measured, [pace.readout_s for pace in measured])
     by_text = _fastest(measured, [pace.text_s for pace in measured])

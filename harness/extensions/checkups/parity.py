@@ -38,7 +38,13 @@ PASSES = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """Hold one comparison of an engine, which runs a model, with another as the reference."""
+    """Hold one comparison of what an engine (code that runs a model) makes of n prompts.
+
+    It is compared with another engine, or with itself in batches. `what` says in words what was
+    compared; `measured` is the share of equal outputs or the largest difference, `allowed` its
+    limit, None where there is none, and `holds` whether it is within that. `differences` are the
+    first prompts that differ, in words.
+    """
 
     what: str  # what was compared
     measured: float  # the figure
@@ -50,7 +56,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold all findings on one model on two engines, and what could not be compared."""
+    """Hold how far one model on the engine llama.cpp differs from itself on transformers.
+
+    `findings` are the comparisons. `left_out` says why llama.cpp was not also compared with the
+    very same float32 weights; None if it was.
+    """
 
     findings: tuple[Finding, ...]  # everything compared
     left_out: str | None  # why llama.cpp was not held to the same float32 weights; None if it was
@@ -58,10 +68,12 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Hold the outputs of one engine for n prompts: tokens, log-probabilities, texts and read-outs.
+    """Hold the outputs of one engine, code that runs a model, for prompts of two kinds.
 
-    The vocabulary has V tokens, and the scenario A actions. A read-out takes the probabilities of
-    actions from those of one letter each.
+    `tokens` has each prompt's token ids, of n prompts that ask for JSON and then of r that ask for
+    a letter. `logits`, (n, V), are the log-probabilities of all V tokens of the vocabulary after
+    each of the n, and `texts` the likeliest answers to these. `readouts`, (r, A), are the
+    probabilities of A actions that follow from those of one letter each.
     """
 
     tokens: list[list[int]]  # token ids of the text of each prompt, of those for JSON first
@@ -79,10 +91,17 @@ def compare(
 ) -> Comparison:
     """Compare a model on llama.cpp with the same model on transformers, token by token.
 
-    `reference` is its card on transformers: of a checkpoint, or of a GGUF file, which is unpacked;
-    `gguf` is its card on llama.cpp. `json_requests` ask for JSON, perhaps none; `letters` ask for a
-    read-out. `progress` is called with 1 after each of `PASSES` passes over the prompts, or with
-    the number left out. Raises UserError if weights are missing or do not load.
+    Args:
+        reference: the card (description) of the model on transformers: of a checkpoint, or of a
+            GGUF file, which is unpacked.
+        gguf: its card on llama.cpp.
+        json_requests: questions that ask for JSON, perhaps none.
+        letters: questions that ask for one letter.
+        progress: called with 1 after each of `PASSES` passes over the prompts, or with the number
+            of those that are left out.
+
+    Raises UserError if weights are missing or do not load, and Unanswered if a question gets no
+    answer.
     """
     most_logit = SEEN if reference.vision else MOST_LOGIT
     plain = partial(transformers_engine.open, reference, device="cpu", dtype="float32")

@@ -28,11 +28,14 @@ CHUNK = 8  # requests that are asked together
 
 
 class Answers(Struct, frozen=True):
-    """Count qualities and faults of one role's answers (ego or helper) to the fixed questions.
+    """Count qualities and faults of one role's answers to the twelve fixed questions.
 
-    Of `n` questions, `readable` answers say what to do, and `strict` ones need no repair. `action`
-    is the commonest likeliest action, None without a readable answer; `faults` counts why others
-    cannot be read.
+    The role is the ego or a helper. Of `n` questions, `readable` answers say what to do, `strict`
+    ones need no repair, and `distinct` ones differ in their text. `action` is the commonest
+    likeliest action, None without a readable answer, in `action_count` of them. Then come numbers
+    of answers with a fault: copies of an example or a placeholder of the prompt, numbers that do
+    not sum to 1, an end at the limit of tokens. `faults` counts, by the parser's status, why
+    answers cannot be read. `sample` is the commonest text.
     """
 
     role: Role  # the role
@@ -52,7 +55,10 @@ class Answers(Struct, frozen=True):
     sample: str  # the first text of the commonest kind
 
     def sentences(self) -> Iterator[str]:
-        """Yield sentences on the faults of the answers, the most frequent first."""
+        """Yield sentences on the faults of the answers, the most frequent first.
+
+        The last one says which action is the likeliest in how many, or that all texts are the same.
+        """
         causes = {
             "copy a placeholder of the prompt": self.placeholder_copies,
             "are word for word the answer of an example": self.example_copies,
@@ -73,9 +79,11 @@ class Answers(Struct, frozen=True):
 
 
 class Trial(Struct, frozen=True):
-    """Hold what a model does with a prompt: its answers to the fixed questions, by role.
+    """Hold what a model does with a prompt: what is in its answers to the fixed questions.
 
-    `pairs` says how the ego's answers moved in pairs of scenes that differ in one fact.
+    These are twelve scenes that ship with the program. `model` is its name, `prompt` the prompt
+    version's, and `roles` counts the answers of the ego and of helpers. `pairs` says, by kind of
+    fact, how the ego's answers moved between scenes that differ in that one fact.
     """
 
     model: str  # name of the model
@@ -86,9 +94,10 @@ class Trial(Struct, frozen=True):
 
 
 def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
-    """Return the card of the model on which a prompt is to be tried.
+    """Return the card (description) of the model on which a prompt is to be tried.
 
-    Raises UserError if it is no language model, or the prompt cannot ask the fixed questions.
+    `model` is its name, and `engine` which of its engines runs it, None for the first. Raises
+    UserError if it is no language model, or the prompt cannot ask the fixed questions.
     """
     card = resolve(model, engine)
     if not capabilities(card.engine).language_model:
@@ -125,9 +134,12 @@ def try_on(
 def try_out(
     backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
 ) -> Trial:
-    """Ask a model the fixed questions in both roles, and the ego pairs of scenes: `COUNT` requests.
+    """Ask a model the fixed questions of both roles, and the ego's pairs of scenes; sum them up.
 
-    The scenes of a pair differ in one fact. Raises Unanswered if a question got no answer.
+    There are `COUNT` questions: twelve scenes to the ego and to a helper, and pairs of scenes that
+    differ in one fact. `backend` runs the model, and `agent` is the model with its prompt and
+    answer mode. `progress` is called with the number of answers that have just come. Raises
+    Unanswered if a question got no answer.
     """
     pairs = questions.scene_pairs(agent)
     by_role = {role: questions.requests(agent, role) for role in ROLES}
@@ -154,7 +166,11 @@ def try_out(
 def described(
     prompt: Prompt, role: Role, actions: Sequence[str], answers: Sequence[Answer]
 ) -> Answers:
-    """Return a summary of one role's answers, with how many copy an example of the prompt."""
+    """Return a summary of one role's answers: how many have which quality or fault.
+
+    `actions` are the names of the actions, in the order of an answer's probabilities. `prompt` is
+    what was asked with: answers that copy one of its examples are counted.
+    """
     examples = []
     if prompt.examples:
         examples = [_value(example.answer) for example in prompt.examples.of(role)]

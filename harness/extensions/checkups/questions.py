@@ -37,7 +37,12 @@ _NUMBERS = ((5, 3), (9, 2), (8, 1), (7, 4))
 
 
 class Question(msgspec.Struct, frozen=True):
-    """Hold one fixed question to try a model: what the ego and a helper see in one scene."""
+    """Hold one fixed question to try a model: what the ego and a helper see in one scene.
+
+    `layout_seed` is the seed of the scene's start situation, and `step` the number of the decision
+    in its episode, from 0. `graphs` has by role, `ego` and `helper`, the scene graph that is shown:
+    what that vehicle knows of the scene.
+    """
 
     layout_seed: int  # seed of the layout
     step: int  # number of the decision point in its episode
@@ -47,8 +52,9 @@ class Question(msgspec.Struct, frozen=True):
 class Pair(NamedTuple):
     """Hold two requests that differ in one fact, to test whether the answer follows it.
 
-    `present` has the fact and `absent` has not; `expected` is the action that the fact should make
-    likelier.
+    `present` has the fact and `absent` has not; `expected` is the option that the fact should make
+    likelier. The `fact` is of the kind `conflict` (a conflict of paths) or `gap` (little time
+    between the vehicles) in a scene, or `danger` or `number` in a simple question.
     """
 
     fact: Fact  # the kind of fact
@@ -59,18 +65,21 @@ class Pair(NamedTuple):
 
 @cache
 def questions() -> tuple[Question, ...]:
-    """Return the twelve fixed questions, which ship with the program."""
+    """Return the twelve fixed questions that try a model out, which ship with the program."""
     text = text_of(Path(__file__).with_name("questions.json"), "settings")
     return msgspec.json.decode(text, type=tuple[Question, ...])
 
 
 def scenario() -> Scenario:
-    """Return the scenario of the fixed questions."""
+    """Return the scenario, the kind of traffic situation, of the fixed questions."""
     return scenarios.get(SCENARIO)
 
 
 def requests(agent: Agent, role: Role = "ego") -> list[Request]:
-    """Return the twelve fixed questions as requests to an agent in a role, at temperature 0."""
+    """Return the twelve fixed questions as requests to an agent in a role, at temperature 0.
+
+    An agent is a model with its prompt and answer mode; the role is `ego` or `helper`.
+    """
     return [
         _request(agent, question.graphs[role], f"question-{n}/{role}")
         for n, question in enumerate(questions())
@@ -78,10 +87,11 @@ def requests(agent: Agent, role: Role = "ego") -> list[Request]:
 
 
 def scene_pairs(agent: Agent) -> list[Pair]:
-    """Return pairs of scenes as requests to an agent as the ego: four of each kind of fact.
+    """Return pairs of scenes that differ in one fact, as requests to an agent, four of each kind.
 
-    A conflict is listed or not, or the other vehicle arrives `SOON_S` or `LATE_S` after the ego:
-    SLOWER should be likelier with the conflict, and with the small gap.
+    An agent is a model with its prompt and answer mode, here as the ego. Of the kind `conflict`, a
+    conflict of paths is listed or not; of `gap`, the other vehicle arrives `SOON_S` or `LATE_S`
+    seconds after the ego. SLOWER should be likelier with the conflict, and with the small gap.
     """
 
     def pair(fact: Fact, number: int, present: SceneGraph, absent: SceneGraph) -> Pair:
@@ -101,10 +111,11 @@ def scene_pairs(agent: Agent) -> list[Pair]:
 
 
 def plain_pairs(agent: Agent) -> list[Pair]:
-    """Return pairs of simple questions, without a scene, to an agent that reads out.
+    """Return pairs of simple questions without a scene that differ in one fact, four of each kind.
 
-    Four of each kind are answered YES or NO: whether to brake, in danger or without, and whether
-    the first of two numbers is greater.
+    They are answered by YES or NO. Of the kind `danger`, the question is whether to brake, in
+    danger or without; of `number`, whether the first of two numbers is greater. `agent` is the
+    model with a prompt, and with an answer mode that reads letters.
     """
     every = []
     for n, (present_text, absent_text) in enumerate(_DANGER):

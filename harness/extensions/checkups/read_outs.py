@@ -33,8 +33,9 @@ COUNT = 12 + 2 * 16  # requests that an examination asks, but for those of scene
 class Moved(Struct, frozen=True):
     """Hold how answers to pairs of questions followed the one fact in which both differ.
 
-    In `moved` of `n` pairs the expected action became clearly likelier with the fact; `mean` is the
-    mean change of its probability.
+    `fact` is its kind, such as `conflict` (`questions.Pair`). In `moved` of `n` pairs the expected
+    action became clearly likelier with the fact; `mean` is the mean change of its probability, from
+    -1 to 1.
     """
 
     fact: str  # the kind of fact
@@ -44,7 +45,10 @@ class Moved(Struct, frozen=True):
 
     @property
     def change(self) -> str:
-        """Return the mean change with its sign, such as `+0.123`; a rounded zero is `+0.000`."""
+        """Return the mean change of the probability with its sign, such as `+0.123`.
+
+        A rounded zero is `+0.000`.
+        """
         return f"{round(self.mean, 3) + 0.0:+.3f}"
 
     @property
@@ -55,10 +59,13 @@ class Moved(Struct, frozen=True):
 class Findings(Struct, frozen=True):
     """Hold what fixed questions showed of a model's read-outs, for one prompt and answer mode.
 
-    A read-out takes the probabilities of actions from those of one letter each. `letter_share` and
-    `follows_letter` say how far it follows the letter in place of the action, in `n` questions;
-    `pairs` whether facts in the scene move it, and `others` the same with the other way to read
-    letters.
+    A read-out takes the probabilities of actions from those of one letter each. `letters` is how
+    these are read: `raw`, in one order, or `cyclic`, averaged over orders in which each action has
+    each letter once. In `n` questions asked in all these orders, `letter_share` is the mean share,
+    from 0 to 1, of the variance that goes by the letter, `follows_letter` in how many one letter
+    was always the likeliest, and `label_mass` the mean total probability of the letters. `pairs`
+    says whether facts in the scene move answers, and `others` the same with letters read the other
+    way.
     """
 
     prompt: str  # the prompt version that they were asked with
@@ -75,16 +82,26 @@ class Findings(Struct, frozen=True):
 
     @property
     def reads_scene(self) -> bool:
-        """Return whether a conflict in the scene, or its time gap, moves most answers."""
+        """Return whether answers follow the scene: in most pairs of scenes that differ in one fact.
+
+        The fact is a conflict of paths, or the time gap to the other vehicle; one of both is
+        enough.
+        """
         return any(pair.read for pair in _of_scene(self.pairs))
 
     @property
     def other_letters(self) -> str:
-        """Return the other way to read letters: `raw` or `cyclic`."""
+        """Return the way to read letters that `letters` does not name: `raw` or `cyclic`.
+
+        `raw` reads them in one order, and `cyclic` averages over several.
+        """
         return "raw" if self.letters == "cyclic" else "cyclic"
 
     def sentences(self) -> Iterator[str]:
-        """Yield the sentences that a page of runs with this model and prompt must show."""
+        """Yield the sentences that a page of runs with this model and prompt must show.
+
+        There is one if the answers do not follow the scene, and one if they follow the letter.
+        """
         if not self.reads_scene:
             others = _of_scene(self.others)
             otherwise = (
@@ -118,12 +135,13 @@ def _moved_of(pairs: Sequence[Moved]) -> str:
 def examine(
     backend: Backend, agent: Agent, progress: Callable[[int], None] = lambda done: None
 ) -> Findings | str:
-    """Ask a model the fixed questions by read-outs, and return the findings.
+    """Ask a model the fixed questions by read-outs, and return what its answers follow.
 
-    If a question gets no answer, the error's text is returned. Letters are read over cyclic orders
-    to see what follows them, and in the pairs as the agent reads them. If no scene moved the
-    answers, the pairs are asked with the other way to read letters: weights may have learnt one
-    order alone.
+    A read-out takes the probabilities of actions from those of one letter each. Letters are read in
+    several orders to see what follows them, and in pairs of questions as the agent (model, prompt
+    and answer mode) reads them. If no scene moved the answers, the pairs are asked with the other
+    way to read letters. `progress` is called with 1 after each answer. If a question gets no
+    answer, the error's text is returned.
     """
     letters = agent.letters if agent.answer in BARE else None
     reader = replace(agent, answer="readout", letters=letters)
@@ -176,9 +194,10 @@ def _answers(
 
 
 def moved(pairs: Sequence[Pair], completions: Iterator[Completion]) -> tuple[Moved, ...]:
-    """Return, by kind of fact, how the answers to pairs moved; unparsed pairs do not count.
+    """Return how answers to pairs of questions moved with their one fact, by kind of fact.
 
-    `completions` has two for each pair: with the fact, and without.
+    `completions` has two answers for each pair: with the fact, and without. A pair does not count
+    if one of them cannot be parsed.
     """
     changes_by_fact: dict[Fact, list[float]] = {}
     for pair in pairs:
@@ -206,7 +225,7 @@ def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | No
 def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
     """Store findings in the user's cache, by the model's identity, prompt and answer mode.
 
-    `identity` is what tells the model apart, as its backend states it.
+    `identity` has values that tell the model apart, by name, as its backend states them.
     """
     name = _name(identity, findings.prompt_sha256, findings.answer)
     kept.keep(name, msgspec.json.encode(findings))
@@ -215,10 +234,10 @@ def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
 def recall_findings(
     identity: Mapping[str, Any], prompt_sha256: str, answer: str
 ) -> Findings | None:
-    """Return the stored findings on a model, for a prompt and an answer mode.
+    """Return the findings on a model that this machine has stored; None if there are none.
 
-    `identity` is what tells the model apart, as its backend states it, and `prompt_sha256` the hex
-    digest of the prompt's files. None if there are none on this machine.
+    `identity` has values that tell the model apart, by name, as its backend states them;
+    `prompt_sha256` is the hex digest of the prompt's files, and `answer` the answer mode.
     """
     data = kept.recall(_name(identity, prompt_sha256, answer))
     try:
@@ -235,7 +254,11 @@ def _name(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> str:
 
 
 def caveats(manifest: Manifest) -> Iterator[str]:
-    """Yield sentences of stored findings on a run's models, if they were asked as in the run."""
+    """Yield what stored findings say against a run's models, in sentences for its page.
+
+    Findings count for a model, the ego's or a helper's, if it was asked with the same prompt and
+    answer mode. `manifest` is what the run's `run.json` has.
+    """
     helpers = manifest.identity.get("helpers")
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
     agents = [manifest.agent(0), *manifest.helpers]
