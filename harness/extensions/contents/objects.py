@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 class ListsObjects(Call):
     """Ask the ego's model again, with a scene graph that also has the helpers' lists of objects.
 
-    A scene graph is what a vehicle knows of the scene; objects are vehicles and the like.
+    A scene graph is what a vehicle knows of the scene; objects are the vehicles that a helper's
+    sensors see. It is a `Call`, a second question that shows the ego's model what it has heard.
     """
 
     name = "objects"
@@ -40,7 +41,9 @@ class ListsObjects(Call):
 class ShowsTruth(Call):
     """Ask the ego's model again with the true scene graph, in which every region is in sight.
 
-    It is a bound: no message can hold that.
+    A scene graph is what a vehicle knows of the scene. No message can hold the whole truth, so what
+    the ego then does bounds what messages can bring. It is a `Call`, a second question to the ego's
+    model.
     """
 
     name = "truth"
@@ -61,8 +64,10 @@ class ShowsTruth(Call):
 class OfLists(Content):
     """Describe a message that lists the objects which a helper's sensors see.
 
-    The helper's model is not asked, so the message leaves at once. The ego's model is asked again,
-    with a scene graph that has these objects as well, and the ego acts on that answer.
+    The helper's model is not asked, so the message leaves at once. The ego's model is asked again
+    (`call`) with a scene graph (what the ego knows) that has these objects as well, and the ego
+    acts on that answer. `kind` is the kind of what the message holds, of
+    `coordination.contents.KINDS`.
     """
 
     needs = (kinds.OBJECTS,)
@@ -81,8 +86,9 @@ class OfLists(Content):
 class OfBoth(Content):
     """Describe two messages of a helper: its intent, and the list of objects that it sees.
 
-    The intent is probabilities of the ego's actions. The ego's model answers again to its scene
-    graph with the helpers' objects added, and that answer is fused with the intents.
+    An intent is probabilities of the ego's actions. The ego's model is asked again with a scene
+    graph (what the ego knows) that has these objects as well, and that answer is fused with the
+    intents to the policy that the ego acts on.
     """
 
     holds = frozenset((INTENTS, WORDS, kinds.OBJECTS))

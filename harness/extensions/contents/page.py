@@ -49,9 +49,10 @@ PAPER = {"loss": ("loss", 0.0), "tau_nats": ("tau", 0.0), "max_helpers": ("size"
 
 
 def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
-    """Return the study (tables, pictures, sentences) of what messages should hold.
+    """Return the study of what messages should hold, whose tables and pictures make its page.
 
-    `results` has one item for each model, and `seeds` are the channel's seeds.
+    `results` has the outcomes of one model an item, and `seeds` are the keys of the channel's
+    random draws.
     """
     manifest = manifest_of([result.model for result in results], results[0].panels, seeds)
     points, by_group = points_table(results), groups_table(results)
@@ -104,9 +105,10 @@ def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
 
 
 def headline(result: Result) -> list[str]:
-    """Return sentences on each content of messages (what they hold): its gain over intents.
+    """Return sentences on what messages gain, by what they hold: intents, words, objects or both.
 
-    They also give its cost: bits sent, and latency.
+    They state success over that with intents, the bits that messages take, and the time until the
+    ego acts.
     """
     base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
     gains, costs = list[str](), list[str]()
@@ -397,8 +399,11 @@ def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
 def points_table(results: Sequence[Result]) -> "pd.DataFrame":
     """Return the outcomes as a table: a row for each model, grid point, content and family.
 
-    A grid point is an operating point with one value changed, a content what messages hold, and a
-    family the scenes of one scenario.
+    A content is what messages hold, and a family the scenes of one scenario, or `mean` of several.
+    A grid point is a `condition` (operating point) with one setting (`variable`) at a `value`.
+    Columns of figures, such as `success` (a share) and `bits_per_episode`, have the ends of their
+    95 % interval beside them, in `_low` and `_high`; `over_intent` is success less that with
+    intents.
     """
     import pandas as pd
 
@@ -439,7 +444,10 @@ def _points_row(
 def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
     """Return success by who sees the danger: a row for each model, group of episodes and content.
 
-    It is of the first condition as it is; `study.groups` makes the groups.
+    A group has the episodes in which so many helpers see the danger (`study.groups`), a content is
+    what messages hold, and the condition is the first one as it is. `success` is a share, and
+    `over_intent` that less the share with intents, with 95 % intervals in `_low` and `_high`; `n`
+    counts episodes.
     """
     import pandas as pd
 

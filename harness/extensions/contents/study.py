@@ -57,10 +57,10 @@ Place = tuple[OperatingPoint, int]  # of an outcome: the operating point, and th
 
 
 class Panel(NamedTuple):
-    """Describe what is varied in one condition (operating point): one setting, over grid points.
+    """Describe what a study varies in one condition (operating point): one setting, its axis.
 
-    The setting is the panel's axis, such as `loss`, and a grid point is one value of it. Without an
-    axis, it is the condition as it is, one grid point.
+    `name` is for people, and `axis` the setting's name, such as `loss`; without one, the condition
+    is played as it is. `settings` are the grid points to play, one for each value of the axis.
     """
 
     name: str  # such as `6g:encoding=etsi over loss`
@@ -70,9 +70,10 @@ class Panel(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """Hold the runs of one model by family of scenes (scenario), and contents it cannot play.
+    """Hold the runs of one model, by family (the scenario's name), that a study plays again.
 
-    A content says what messages hold, such as `intent`, `objects` or `both`.
+    `name` says which model, prompts and answer mode. `left_out` has the contents of messages
+    (`intent`, `objects`, `both` and so on) that it cannot play, each with the reason in words.
     """
 
     name: str  # model, prompts and answer mode
@@ -81,15 +82,20 @@ class Model:
 
     @property
     def contents(self) -> list[str]:
-        """Return the contents of messages that its agents can play."""
+        """Return what messages may hold in this model's runs, such as `intent` or `objects`.
+
+        `nothing` stands for an ego that asks nobody, and `oracle` for the whole truth.
+        """
         return [content for content in PLAYED if content not in self.left_out]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Hold the metrics of a model's runs with one content of messages at one grid point.
+    """Hold what a model's runs come to with one content of messages at one grid point.
 
-    The axes are S channel seeds and E episodes; a family is the scenes of one scenario.
+    A grid point is an operating point with one value changed. `families` has by family (scenario)
+    and metric, such as `success_rate`, the values by S channel seeds and E episodes, (S, E).
+    `success_rules` says by family how success counts, plain or balanced.
     """
 
     # values by family and metric, such as `success_rate`, (S, E) each
@@ -98,12 +104,18 @@ class Outcome:
 
     @property
     def headline_metric(self) -> str:
-        """Return the name of the metric of success that is shown first, plain or balanced."""
+        """Return the name of the metric of success that is shown first, plain or balanced.
+
+        Balanced success is the mean of success with a danger and without.
+        """
         return next(iter(self.success_rules.values())).metric
 
     @property
     def success(self) -> Estimate:
-        """Return the headline metric, as a mean over families of scenes."""
+        """Return the metric of success that is shown first, a share, as a mean over families.
+
+        A family is the scenes of one scenario.
+        """
         return self.estimate(self.headline_metric)
 
     def estimate(self, metric: str, family: str = MEAN) -> Estimate:
@@ -123,17 +135,18 @@ class Outcome:
     def over(
         self, other: "Outcome", family: str = MEAN, level: float = 0.95, metric: str = ""
     ) -> Estimate:
-        """Return this outcome's success less another's, paired by episode.
+        """Return this outcome's success less another's, paired by episode, from -1 to 1.
 
-        It is of a family (scenario), or the mean over families, and `level` is the confidence of
-        its interval. The metric is the headline's, or plain success if `metric` names it.
+        `family` is a scenario's name, or that of the mean over families; `level` is the confidence
+        of the interval. `metric` is empty for the metric that is shown first, or names plain
+        success.
         """
         return mean_difference([*self._pairs(other, family, metric)], level)
 
     def p_over(self, other: "Outcome") -> float | None:
-        """Return the p-value of no difference in success to another outcome.
+        """Return the p-value of success being the same in this outcome and in another.
 
-        It is of the mean over families, and None without an interval.
+        It is of the mean over families (scenarios); None if no interval is known.
         """
         return p_of_mean([*self._pairs(other, MEAN)])
 
@@ -164,7 +177,12 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Result:
-    """Hold the outcomes of one model with every content of messages at every grid point."""
+    """Hold the outcomes of one model with every content of messages at every grid point.
+
+    A grid point is an operating point (settings of radio, asking and fusion) with one value
+    changed, as `panels` list them. The key of an outcome is the operating point, of which the
+    content is a setting, and the number of vehicles.
+    """
 
     model: Model  # the model and its runs
     panels: Sequence[Panel]  # the axes and conditions that were played
@@ -172,27 +190,43 @@ class Result:
     outcomes: Mapping[Place, Outcome]
 
     def at(self, setting: Setting, content: str) -> Outcome:
-        """Return the outcome with a content of messages, such as `objects`, at a grid point."""
+        """Return the outcome with a content of messages, such as `objects`, at a grid point.
+
+        `setting` is the grid point: an operating point, and a number of vehicles.
+        """
         return self.outcomes[place(setting, content)]
 
     @property
     def base(self) -> Setting:
-        """Return the grid point of the first condition as it is."""
+        """Return the grid point at which the first condition is as it is, with no value changed.
+
+        A grid point is an operating point to play and a number of vehicles; a condition is the
+        operating point that it changes.
+        """
         return self.panels[0].settings[0]
 
     @property
     def points(self) -> list[Setting]:
-        """Return every grid point once, though panels may share it."""
+        """Return every grid point once, in order, though panels may share it.
+
+        A grid point is an operating point to play and a number of vehicles.
+        """
         return distinct(self.panels)
 
     @property
     def others(self) -> list[str]:
-        """Return the contents of messages that are compared with `intent`: all others."""
+        """Return the contents that are compared with `intent`: all others that were played.
+
+        A content is what messages hold, such as `objects`; `nothing` is an ego that asks nobody.
+        """
         return [content for content in self.model.contents if content != INTENT]
 
     @property
     def sent(self) -> list[str]:
-        """Return the contents beside intents that messages can hold: not `nothing` or `oracle`."""
+        """Return the contents beside intents that messages can hold, such as `text` or `objects`.
+
+        So `nothing`, an ego that asks nobody, and `oracle`, the whole truth, are left out.
+        """
         return [
             content
             for content in self.others
@@ -212,37 +246,44 @@ class Result:
     def p(self, setting: Setting, content: str) -> float | None:
         """Return the p-value of no difference in success between a content of messages and intents.
 
-        It is corrected by Holm's method over all contents and grid points of the model; None for
-        intents.
+        `setting` is the grid point, and `content` what messages hold, such as `objects`. It is
+        corrected by Holm's method over all contents and grid points of the model; None for intents.
         """
         return self._p.get(place(setting, content))
 
     @property
     def headline_metric(self) -> str:
-        """Return the name of the metric of success that is shown first, plain or balanced."""
+        """Return the name of the metric of success that is shown first, plain or balanced.
+
+        Balanced success is the mean of success with a danger and without.
+        """
         return self.at(self.base, INTENT).headline_metric
 
     @property
     def words(self) -> str:
-        """Return the headline metric's name for people, such as `balanced success`."""
+        """Return the name of the metric that is shown first, such as `balanced success`."""
         return IN_WORDS[self.headline_metric]
 
     @property
     def successes(self) -> tuple[str, ...]:
-        """Return the headline metric; if it is balanced, also the two that it is the mean of."""
+        """Return the name of the metric that is shown first, and those of its halves if it has any.
+
+        Balanced success is the mean of success with a danger and without.
+        """
         return self.headline_metric, *entry(self.headline_metric).halves
 
     @property
     def families(self) -> list[str]:
-        """Return the families of scenes, and `mean` where there are several."""
+        """Return the names of the families (scenarios), and `mean` where there are several."""
         names = list(self.model.runs)
         return [*names, MEAN] if len(names) > 1 else names
 
 
 def holding(point: OperatingPoint, content: str) -> OperatingPoint:
-    """Return an operating point with this content of messages, such as `objects`.
+    """Return an operating point at which messages hold this content, such as `objects`.
 
-    With `nothing`, it is one at which the ego never asks.
+    An operating point is the settings of radio, asking and fusion. With `nothing`, it is one at
+    which the ego never asks.
     """
     if content == NOTHING:
         return point.changed(content=INTENT, schedule=NEVER, threshold=None)
@@ -250,33 +291,44 @@ def holding(point: OperatingPoint, content: str) -> OperatingPoint:
 
 
 def place(setting: Setting, content: str) -> Place:
-    """Return the key of an outcome: operating point with this content, and number of vehicles."""
+    """Return the key of an outcome in `Result.outcomes`, at a grid point with a content.
+
+    It is the operating point in which messages hold that content, such as `objects`, and the number
+    of vehicles.
+    """
     return holding(setting.point, content), setting.vehicles
 
 
 def distinct(panels: Sequence[Panel]) -> list[Setting]:
-    """Return the grid points (settings to play) of all panels in order, each once."""
+    """Return the grid points of all panels in order, each once, though panels may share it.
+
+    A grid point is an operating point to play and a number of vehicles.
+    """
     every = [setting for panel in panels for setting in panel.settings]
     last_first = {place(setting, INTENT): setting for setting in reversed(every)}
     return list(last_first.values())[::-1]
 
 
 def folders(path: Path) -> list[Path]:
-    """Return the folders of the runs in a suite's folder; of a run's folder, itself."""
+    """Return the folders of the runs in a suite's folder, or the folder itself if it is a run's.
+
+    A suite is a run of one model on each of several datasets.
+    """
     if (path / SUITE).is_file():
         return [path / name for name in contents_of(path).families.values()]
     return [path]
 
 
 def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> list[Model]:
-    """Group runs by model, each with the contents that it can play in these panels.
+    """Group runs by model, each with what messages may hold when its runs are played again.
 
     Args:
         given: the runs of a suite together, which are of one model, or a run alone.
-        panels: the conditions and axes that are to be played.
+        panels: the conditions, and the settings varied in them, that are to be played.
 
     Raises:
-        UserError: two runs of a model are on the same family, or a model cannot play intents.
+        UserError: two runs of a model are on the same family (scenario), or a model cannot play
+            messages that hold intents.
     """
     by_model: dict[str, dict[str, ReplayedRun]] = {}
     for runs in given:
@@ -323,11 +375,13 @@ def panels_of(
     over: Sequence[str],
     grids: Sequence[str],
 ) -> list[Panel]:
-    """Return a panel for each condition as it is, and for each axis in each of them.
+    """Return what to vary: a panel for each condition as it is, and for each axis in each of them.
 
-    An axis is a setting that is varied. `over` names the axes, such as `loss`, and `grids` has the
-    text of each one's values, such as `0,0.1,0.2`; without conditions and axes, the usual ones are
-    taken. Raises UserError as `sweep.settings` does, or if there are more grids than axes.
+    `conditions` are texts such as `6g:encoding=etsi`. `over` names the axes, settings such as
+    `loss`, and `grids` has the text of each one's values, such as `0,0.1,0.2`, in the same order;
+    without conditions and axes, the usual ones (`USUAL`) are taken. Raises UserError for a
+    condition, axis or value that does not exist or that the runs cannot play, or if there are more
+    grids than axes.
     """
     if len(grids) > len(over):
         raise UserError(
@@ -353,7 +407,7 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
     """Return how many answers each run may lack at most, by family (scenario) and role.
 
     The roles are `ego`, `helper`, and `fusion` for an ego that is asked again with messages. The
-    questions are about the decision points that the run or a reference driver visits.
+    questions are about the decision points that the run or a reference driver, a rule, visits.
     """
     points = set[OperatingPoint]()
     for setting in distinct(panels):
@@ -369,9 +423,10 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
 def manifest_of(
     swarms: Sequence[Model], panels: Sequence[Panel], seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Return what identifies a study, as plain values: runs, contents, seeds and panels.
+    """Return what identifies a study, as plain values by name, for its `contents.json`.
 
-    `swarms` are the models with their runs, and `seeds` the channel's seeds.
+    They are the models' runs (`sources`), the contents of messages, the channel's `seeds`, and the
+    operating points of each panel.
     """
     return {
         "sources": [run.manifest() for model in swarms for run in model.runs.values()],
@@ -392,10 +447,12 @@ def run_contents(
 
     Args:
         swarms: the models with their runs.
-        panels: the conditions, and the axes varied in them.
-        seeds: the channel's seeds.
+        panels: the conditions, and the settings varied in them.
+        seeds: the keys of the channel's random draws, the same for every content.
         out: the folder of the study, which may hold the same one only.
-        progress: told how much there is to do, and called with what is done.
+        progress: told how many points there are to play, and called with 1 after each.
+
+    Returns one result a model, in their order.
 
     Raises:
         UserError: the folder `out` holds another study.
@@ -455,8 +512,9 @@ def _columns(parameters: Parameters, part: Decided[Any]) -> dict[str, Floats]:
 def witnesses(run: ReplayedRun) -> Ints:
     """Return how many helpers see the danger at the first decision of each of E episodes, (E,).
 
-    The danger is the vehicle that the ego would meet if it drove on. The number is `SAFE` (-1)
-    without a danger, and `HEARD` (-2) if the danger has a radio, whose beacons tell of it.
+    The danger is the vehicle that the ego would meet if it drove on. In place of a number there is
+    `SAFE` (-1) without a danger, and `HEARD` (-2) if the danger has a radio, whose beacons tell of
+    it.
     """
     forest, scenario = run.dataset.forest, run.dataset.scenario
     roots = [forest.ids[n] for n in forest.root.tolist()]
@@ -477,9 +535,10 @@ def witnesses(run: ReplayedRun) -> Ints:
 
 
 def groups(model: Model) -> dict[str, dict[str, Bools]]:
-    """Return groups of episodes by how many helpers see the danger, by the group's name.
+    """Return groups of episodes by how many helpers see the danger, by the group's name in words.
 
-    A group has, by the name of a family (scenario), a mask (E,): which of its E episodes are in it.
+    A group has by family (scenario) a mask, (E,): which of its E episodes are in it. The danger is
+    the vehicle that the ego would meet if it drove on.
     """
     counts = {family: witnesses(run) for family, run in model.runs.items()}
     most = max(int(of_family.max()) for of_family in counts.values())

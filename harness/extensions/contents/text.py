@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 class SaysWords(Call):
     """Ask the ego's model again, with each helper's words in a line of the prompt.
 
-    The helpers' intents, their probabilities of actions, are left out.
+    The helpers' intents, their probabilities of actions, are left out. It is a `Call`, a second
+    question that shows the ego's model what it has heard.
     """
 
     name = "text"
@@ -24,7 +25,8 @@ class SaysWords(Call):
 class OfText(Content):
     """Describe a message that holds a helper's words without its probabilities of actions.
 
-    The ego's model is asked again with these words, and the ego acts on that answer.
+    A helper that has no words sends nothing. The ego's model is asked again (`call`) with these
+    words, and the ego acts on that answer.
     """
 
     holds = frozenset((WORDS,))
