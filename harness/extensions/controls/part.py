@@ -23,9 +23,11 @@ NO_MESSAGES = {"no-messages": "loss=1"}
 
 @dataclass(frozen=True)
 class Blinded(Question):
-    """Ask helpers the usual question with nothing in sight, in scene graphs and in pictures.
+    """Ask a helper's model the usual question, with a scene graph and a picture that show nothing.
 
-    Its fields are explained at `Question`.
+    A scene graph is what a vehicle knows of the scene. `name` ends the key of answers to this
+    question, `words` says in messages how helpers are asked, and `pictured` whether a camera's
+    picture is shown.
     """
 
     name: str = BLIND
@@ -45,10 +47,12 @@ def _others(holds: frozenset[str]) -> list[str]:
 
 
 class Controlled(Part, frozen=True, kw_only=True):
-    """Hold the setting `messages`: what the ego hears in place of its helpers' messages.
+    """Hold the setting `messages` of an operating point: whose messages the ego hears.
 
-    A condition with another value than `own` is a control: a gain that remains under it does not
-    come from what helpers see.
+    An operating point is the settings of radio, asking and fusion. `own` takes those of its
+    helpers. `shuffled`, messages of helpers in another start situation, and `blind`, those of
+    helpers that are shown nothing, are controls: a gain that remains under them does not come from
+    what helpers see. Methods are the hooks of `Part`, a group of such settings.
     """
 
     behind: ClassVar[str] = "on_demand"
@@ -91,8 +95,9 @@ class Controlled(Part, frozen=True, kw_only=True):
     def sources(self, episodes: Ints, seeds: Ints) -> Ints:
         """Return, for n decisions, the index of the one whose helpers each hears if shuffled, (n,).
 
-        `episodes`, (n,), and `seeds`, (n,), have each decision's episode number and channel seed.
-        It is that of the next layout (start situation) which has a decision under the same seed.
+        `episodes`, (n,), and `seeds`, (n,), have the number of each decision's episode and the seed
+        of its channel's draws. It is the decision of the next episode under the same seed; the last
+        one's is that of the first.
         """
         order = np.lexsort((episodes, seeds))
         following = np.roll(order, -1)
@@ -104,9 +109,10 @@ class Controlled(Part, frozen=True, kw_only=True):
 
 
 def setting_of(control: str) -> str:
-    """Return the setting of a condition that is a control, such as `messages=blind`, by its name.
+    """Return the setting of an operating point that is a control, by the control's name.
 
-    Raises UserError if there is no such control.
+    `shuffled-messages` is `messages=shuffled`, for example. Raises UserError if there is no such
+    control.
     """
     settings = {**NO_MESSAGES, **control_settings()}
     if control not in settings:
