@@ -42,10 +42,11 @@ _OVERFLOW = "context overflow"
 
 @dataclass(frozen=True)
 class Shape:
-    """Describe one HTTP API for decisions: its path, and how its JSON is read and written.
+    """Describe one HTTP API for decisions: the path of its POST request, and its JSON.
 
-    `body` is the type of a request's JSON; `read` makes questions of it, and `write` makes JSON of
-    the model's name and the answers.
+    `body` is the msgspec type that a request's JSON is decoded to. `read` makes the questions of a
+    decoded body, and may raise Refusal; `write` makes the response, as values for JSON, of the
+    served model's name and the answers in the order of these questions.
     """
 
     path: str  # path of the POST request
@@ -62,7 +63,10 @@ SHAPES = (
 
 
 class Service:
-    """Answer HTTP requests for decisions of one model; `app` returns its web application."""
+    """Answer HTTP requests for decisions of one model; `app` returns its web application.
+
+    A decision is a question with listed options, of which the model gives each a probability.
+    """
 
     def __init__(
         self,
@@ -87,7 +91,7 @@ class Service:
         self._desk = Desk(model.backend, batch_size, places)
 
     def app(self) -> Starlette:
-        """Return the Starlette application, with the paths of `SHAPES` and `/v1/models`."""
+        """Return the Starlette application: POST at each path of `SHAPES`, and GET `/v1/models`."""
         routes = [Route("/v1/models", self._models, methods=["GET"])]
         routes += [Route(shape.path, self._answerer(shape), methods=["POST"]) for shape in SHAPES]
         handlers: Any = {HTTPException: self._missing, Exception: self._bug}

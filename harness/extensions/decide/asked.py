@@ -16,7 +16,10 @@ MOST_DEPTH = 32
 
 
 class Refusal(Exception):
-    """Signal that a request gets no answer, with HTTP status, one line of text and a code."""
+    """Signal that a request gets no answer: `words`, one line for the client, and what HTTP needs.
+
+    That is `status`, the HTTP status, and `code`, a short name of the reason for programs.
+    """
 
     def __init__(self, words: str, status: int = 400, code: str = "invalid_request") -> None:
         super().__init__(words)
@@ -27,7 +30,9 @@ class Refusal(Exception):
 class Asked:
     """Hold one question of a client's request, with its options as the client writes them.
 
-    `values` has the options in their order; `name` is None if the client gives the question none.
+    `question` has the state (what all is about), the instructions, and each option's meaning, as
+    texts for the model. `values` has the options in their order, as the response is to name them;
+    `name` is that of the question in the request, None if it has none.
     """
 
     name: str | None  # name of the question in the client's request, if it has one
@@ -40,7 +45,7 @@ class Asked:
 
     @property
     def length(self) -> int:
-        """Return the number of characters of all its texts."""
+        """Return the number of characters of its state, instructions, options and meanings."""
         meanings = self.question.meanings
         texts = (self.question.state, self.question.instructions, *meanings, *meanings.values())
         return sum(len(text or "") for text in texts)
@@ -48,9 +53,10 @@ class Asked:
 
 @dataclass(frozen=True)
 class Enquiry:
-    """Hold a client's request: questions about one state, and URLs of pictures of it.
+    """Hold a client's request, whatever its JSON looks like: questions about one state.
 
-    `model` is the name of the model that it asks for; None takes the one that is served.
+    `model` is the name of the model that it asks for; None takes the one that is served. `images`
+    has the data URLs of pictures that the model is shown before the state.
     """
 
     model: str | None  # name of the model that it asks for; None takes the served one
@@ -60,9 +66,10 @@ class Enquiry:
 
 @dataclass(frozen=True)
 class Answered:
-    """Hold the answer to one question: a probability for each option, None if the model refused.
+    """Hold the answer to one question: a probability for each of its K options.
 
-    `tokens` is the number of prompt tokens, None if nobody counts them.
+    `shares`, (K,), are in the order of the question's options, as the model states them, and None
+    if it refused. `tokens` is the number of prompt tokens, None if nobody counts them.
     """
 
     asked: Asked
@@ -77,7 +84,7 @@ class Answered:
 
     @property
     def confidence(self) -> float:
-        """Return the confidence (K max p - 1) / (K - 1) of K options.
+        """Return how sure the answer is: (K p - 1) / (K - 1), p the greatest of K probabilities.
 
         It is 0 where all options are equally likely, and 1 where one is certain.
         """
@@ -92,9 +99,10 @@ class Answered:
 
 
 def text_of(content: Any) -> str:
-    """Return content as text for the model: text as it is, anything else as JSON.
+    """Return content of a client's request as text for the model.
 
-    Raises Refusal if it is nested too deep.
+    A text stays as it is; anything else, which comes from JSON, is written as JSON. Raises Refusal
+    if it is nested too deep.
     """
     _check_depth(content, MOST_DEPTH)
     return (
@@ -115,10 +123,11 @@ def _check_depth(content: Any, left: int) -> None:
 def with_options(
     name: str | None, question: Question, options: Sequence[tuple[Any, str | None]]
 ) -> Asked:
-    """Return a question with its options, each of which has a value and a meaning or None.
+    """Return a client's question with its options, as an `Asked`.
 
-    `name` is the question's, in messages. Raises Refusal if there are too few options, too many, or
-    two with the same text.
+    `question` has the state and instructions. Each item of `options` is an option as the client
+    writes it, and its meaning or None. `name` is the question's in the request, for messages.
+    Raises Refusal if there are too few options, too many, or two with the same text.
     """
     who = "a question" if name is None else f"question {printable(name, 40)!r}"
     if not 2 <= len(options) <= MOST_OPTIONS:
@@ -131,9 +140,10 @@ def with_options(
 
 
 def answered(question: Asked, completion: Completion) -> Answered:
-    """Return the answer in a model's completion.
+    """Return the answer to a question, read from what the model completed.
 
-    Raises Refusal if it does not state a probability for each option.
+    Raises Refusal if it does not state a probability for each option; one that the model itself
+    refused to answer has none and raises nothing.
     """
     if completion.finish_reason == "refusal":
         return Answered(question, None, completion.prompt_tokens)

@@ -20,19 +20,22 @@ from harness.prompts.decision import Question
 
 
 class Text(Struct, tag_field="type", tag="input_text"):
-    """Hold a part of a message or of instructions that is text."""
+    """Hold a part of a message or of instructions that is text, of type `input_text`."""
 
     text: str  # the text
 
 
 class Json(Struct, tag_field="type", tag="input_json"):
-    """Hold a part of a message or of instructions that is JSON data."""
+    """Hold a part of a message or of instructions that is JSON data, of type `input_json`.
+
+    `data` is what the JSON states; the model reads it written out as JSON.
+    """
 
     data: dict[str, Any] | list[Any]  # what JSON states; the model reads it as JSON
 
 
 class Picture(Struct, tag_field="type", tag="input_image"):
-    """Hold a part of a message that is a picture, by its URL."""
+    """Hold a part of a message that is a picture, of type `input_image`, in a data URL."""
 
     image_url: str  # a data URL, which holds the picture
 
@@ -41,21 +44,29 @@ Part = Text | Json | Picture
 
 
 class Message(Struct):
-    """Hold a message of the request's input; other roles than `user` are refused."""
+    """Hold a message of a request's input: some of the state that its questions are about.
+
+    `content` is a text, or parts of text, JSON and pictures. `role` is who says it; others than
+    `user` are refused.
+    """
 
     content: str | list[Part]  # a part of the state that the questions are about
     role: str  # who says it
 
 
 class Option(Struct):
-    """Hold one option of a `Choice`."""
+    """Hold one option of a `Choice`: its `value`, as the answer names it, and what it means."""
 
     value: str | bool  # the option, as the answer names it
     description: str | None = None  # its meaning
 
 
 class Choice(Struct, tag_field="type", tag="choice"):
-    """Ask which of several options is right."""
+    """Ask which of several options is right; the answer names one, with all probabilities.
+
+    `instructions` say what is asked, in text or JSON, and `choices` are the options in their order.
+    The answer repeats `name`.
+    """
 
     instructions: str | list[Part]  # what is asked; no pictures
     choices: list[Option]  # the options, in their order
@@ -63,14 +74,18 @@ class Choice(Struct, tag_field="type", tag="choice"):
 
 
 class Level(Struct):
-    """Hold one level of a `Score`."""
+    """Hold one level of a `Score`: its `label`, as the answer names it, and what it means."""
 
     label: str  # the level's name, as the answer states it
     description: str | None = None  # its meaning
 
 
 class Score(Struct, tag_field="type", tag="score"):
-    """Ask for a level on a scale, whose levels are listed from the lowest."""
+    """Ask for a level on a scale; the answer is the mean of the levels, numbered from 0.
+
+    `instructions` say what is asked, in text or JSON, and `levels` are listed from the lowest. The
+    answer repeats `name`.
+    """
 
     instructions: str | list[Part]  # what is asked; no pictures
     levels: list[Level]  # the levels, the lowest first
@@ -78,14 +93,21 @@ class Score(Struct, tag_field="type", tag="score"):
 
 
 class Predicate(Struct, tag_field="type", tag="predicate"):
-    """Ask whether a statement is true."""
+    """Ask whether a statement is true; the answer is the probability that it is.
+
+    `instructions` state it, in text or JSON. The answer repeats `name`.
+    """
 
     instructions: str | list[Part]  # the statement; no pictures
     name: str | None = None  # the question's name, which the answer repeats
 
 
 class Body(Struct):
-    """Hold the JSON of a request; fields that are not listed are ignored."""
+    """Hold the JSON of a request to `/v1/decisions`; fields that are not listed are ignored.
+
+    `input` is the state that all `questions` are about, a text or messages; each question is asked
+    by itself. `model` is the name of the model that is asked; None takes the one that is served.
+    """
 
     input: str | list[Message]  # the state that all questions are about
     # what is asked, each by itself
@@ -96,7 +118,10 @@ class Body(Struct):
 
 
 def read(body: Body) -> Enquiry:
-    """Return the questions of a request. Raises Refusal if it holds what is not supported."""
+    """Return the questions of a request to `/v1/decisions`, as texts for the model.
+
+    Raises Refusal if it holds what is not supported, such as a message of another role than `user`.
+    """
     messages = body.input
     contents = [messages] if isinstance(messages, str) else [_user(each) for each in messages]
     texts, images = list[str](), list[str]()
@@ -153,9 +178,10 @@ def _question_of(question: Choice | Score | Predicate, state: str) -> Asked:
 
 
 def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
-    """Return the JSON of the response, with the answers in the order of the questions.
+    """Return the JSON of the response of `/v1/decisions`, as plain values.
 
-    `model` is the served model's name. Token counts are 0 where nobody counts them.
+    The answers are in the order of the questions; `model` is the served model's name. Token counts
+    are 0 where nobody counts them.
     """
     read = sum(each.tokens or 0 for each in answers)
     usage = {

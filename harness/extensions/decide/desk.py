@@ -20,7 +20,8 @@ AGAIN_S = 1  # after which a client that found no place may ask again
 class Desk:
     """Queue requests to a served model; a thread answers them in batches, in their order.
 
-    Clients of one asyncio event loop wait for their answers with `ask`.
+    Clients of one asyncio event loop wait for their answers with `ask`. `places` requests may wait,
+    and at most `batch_size` are answered together.
     """
 
     def __init__(self, backend: Backend, batch_size: int, places: int = PLACES) -> None:
@@ -29,10 +30,10 @@ class Desk:
         Thread(target=self._work, daemon=True).start()  # no pool: Ctrl-C would wait for its threads
 
     async def ask(self, requests: Sequence[Request]) -> list[Completion]:
-        """Wait for the completions of some requests, and return them.
+        """Wait until the model has answered some requests, and return the answers in their order.
 
         If the caller is cancelled, requests that still wait are dropped. Raises Refusal (status
-        429) if the queue has too few places, and what the backend raises.
+        429) if the queue has too few places, and what the backend, which runs the model, raises.
         """
         futures: list[Future[Completion]] = [Future() for _ in requests]
         if self._waiting.qsize() + len(requests) > self._waiting.maxsize:

@@ -25,9 +25,12 @@ _PROMPT = "v9"  # no text of it is asked
 
 
 def served(card: Card, letters: Any = None) -> Agent:
-    """Return the agent that answers questions with a card's model; `letters` is its option.
+    """Return a card's model as it is served: an agent, the model with how it answers decisions.
 
-    Raises UserError if the model cannot be asked such questions.
+    A decision is a question with listed options, of which the model gives each a probability;
+    `card` describes the model. `letters` says how letters that stand for options are read, as
+    `--letters` takes it: `raw`, in one order, or `cyclic`, averaged over several; None takes the
+    default. Raises UserError if the model cannot be asked such questions.
     """
     can = capabilities(card.engine)
     if not ("decision" in can.answer_modes and can.closed_loop):
@@ -39,7 +42,10 @@ def served(card: Card, letters: Any = None) -> Agent:
 
 
 class ServedModel:
-    """Hold a model that is served, and turn clients' questions into its requests."""
+    """Hold a model that is served, and turn clients' questions into requests to it.
+
+    `name` is the model's, `backend` runs it, and `sees` says whether it takes pictures.
+    """
 
     def __init__(self, agent: Agent, backend: Backend) -> None:
         self._agent, self.backend = agent, backend
@@ -51,7 +57,7 @@ class ServedModel:
         self._digest = digest({**backend.identity(), "letters": agent.letters})
 
     def listed(self) -> dict[str, Any]:
-        """Return the model's entry in the JSON of `GET /v1/models`."""
+        """Return the model's entry in the response of `GET /v1/models`, as values for JSON."""
         reads = ["text", *(["image"] if self.sees else [])]
         return {
             "id": self.name,

@@ -17,7 +17,7 @@ _URL = re.compile(r"data:image/(png|jpeg);base64,", re.IGNORECASE)
 
 
 def picture(url: str) -> Image:
-    """Return the picture in a data URL of a PNG or JPEG.
+    """Return the picture in a data URL of a PNG or JPEG, which holds the file itself.
 
     Raises Refusal if it is none, cannot be read, or is too large.
     """

@@ -21,14 +21,22 @@ Content = str | dict[str, Any] | list[Any]
 
 
 class Choice(Struct, tag_field="type", tag="choice"):
-    """Ask which of several options is right."""
+    """Ask which of several options is right; the answer names one, with all probabilities.
+
+    `criteria` has the meaning of each option, by the option's text, None where nothing is said;
+    `instructions` say what is asked. Both may be texts or JSON.
+    """
 
     criteria: dict[str, Content | None]  # the meaning of each option, by the option
     instructions: Content | None = None  # what is asked
 
 
 class Score(Struct, tag_field="type", tag="score"):
-    """Ask for a level on a scale; the answer counts levels from 0."""
+    """Ask for a level on a scale; the answer is the mean of the levels, numbered from 0.
+
+    `criteria` has the meaning of each level, the lowest first; `instructions` say what is asked.
+    Both may be texts or JSON.
+    """
 
     # the meaning of each level, the lowest first
     criteria: Annotated[list[Content], Meta(min_length=2, max_length=10)]
@@ -36,14 +44,23 @@ class Score(Struct, tag_field="type", tag="score"):
 
 
 class Noul(Struct, tag_field="type", tag="noul"):
-    """Ask whether something is true."""
+    """Ask whether something is true; the answer is the probability that it is.
+
+    `instructions` say what; `criteria` has what `true` and `false` mean, by these names. Both may
+    be texts or JSON.
+    """
 
     instructions: Content | None = None  # what is to be true
     criteria: dict[str, Content | None] | None = None  # what `true` and `false` mean
 
 
 class Body(Struct):
-    """Hold the JSON of a request; fields that are not listed are ignored."""
+    """Hold the JSON of a request to `/v1/systemone`; fields that are not listed are ignored.
+
+    All `questions`, by their names, are about `state`, a text or JSON; each is asked by itself.
+    `model` is the name of the model that is asked, None for the one that is served. `files`, then
+    `images`, have data URLs of pictures that the model is shown before the state.
+    """
 
     state: Content  # what all questions are about, a text or JSON
     # what is asked, each by itself, by the question's name
@@ -56,7 +73,10 @@ class Body(Struct):
 
 
 def read(body: Body) -> Enquiry:
-    """Return the questions of a request. Raises Refusal if it holds what is not supported."""
+    """Return the questions of a request to `/v1/systemone`, as texts for the model.
+
+    Raises Refusal if it holds what is not supported, such as a question with one option.
+    """
     state = text_of(body.state)
     questions = tuple(_question_of(name, each, state) for name, each in body.questions.items())
     return Enquiry(body.model, questions, (*body.files, *body.images))
@@ -83,9 +103,10 @@ def _meaning(content: Content | None) -> str | None:
 
 
 def write(model: str, answers: Sequence[Answered]) -> dict[str, Any]:
-    """Return the JSON of the response, with each answer under its question's name.
+    """Return the JSON of the response of `/v1/systemone`, as plain values.
 
-    `model` is the served model's name. `input_tokens` is 0 where nobody counts them.
+    Each answer stands under its question's name; `model` is the served model's name. `input_tokens`
+    is 0 where nobody counts them.
     """
     written = {each.asked.name: _answer(each) for each in answers}
     usage = {"input_tokens": sum(each.tokens or 0 for each in answers), "output_tokens": 0}
