@@ -22,9 +22,12 @@ READOUT, WRITTEN, DECISION = "readout", "written", "decision"
 
 @dataclass(frozen=True)
 class Fit:
-    """Hold the time and energy of a model's answer on a device at batch size 1; NaN if unknown.
+    """Hold the time and energy of a model's answers, one by one, on a device; NaN if unknown.
 
-    It is one assumed answer, or the answers of a run.
+    They are one assumed answer, or the answers of a run: then tokens read and written and `seconds`
+    are medians, and `joules` of an answer a mean. `row` has the device's speed with the model.
+    `answer` says how it answers: `readout` (one token), `decision` (no token), or in writing.
+    `in_time` is the share of answers that are there within the decision window, from 0 to 1.
     """
 
     row: DeviceRow  # the device's speed, energy and memory with the model
@@ -40,10 +43,11 @@ class Fit:
 def fits(
     device: Device, rows: Sequence[DeviceRow], answers: "Answers", window_s: float
 ) -> list[Fit]:
-    """Return the time and energy of each kind of answer with each row (model) of a device profile.
+    """Return the time and energy of answers on a device, for each row and each kind of answer.
 
-    `answers` has their token counts. `window_s` is the longest time from seeing to the answer that
-    counts as in time.
+    A row of a device profile has a computer's speed with one model. `answers` has the token counts,
+    by kind of answer. `window_s` is the longest time, s, from seeing to the answer that counts as
+    in time.
     """
     results = []
     for row in rows:
@@ -54,7 +58,12 @@ def fits(
 
 @dataclass(frozen=True)
 class Answers:
-    """Hold the token counts of n answers whose time and energy on a device are asked for."""
+    """Hold the token counts of n answers whose time and energy on a device are asked for.
+
+    `prompt`, (n,), is the number of tokens read, and `output` that written, (n,) by kind of answer
+    (`readout`, one token, or in writing). `episodes`, (n,), has the number of each answer's
+    episode; None for one assumed answer. `who` is the model that wrote them.
+    """
 
     prompt: Floats  # number of tokens read for each answer, (n,)
     output: dict[str, Floats]  # number of tokens written, by kind of answer, (n,) each
@@ -64,18 +73,19 @@ class Answers:
 
 
 def declared(prompt_tokens: int, answer_tokens: int) -> Answers:
-    """Return the token counts of one assumed answer: as a read-out of one token, and written."""
+    """Return the token counts of one assumed answer: as a read-out of one token, and in writing.
+
+    `prompt_tokens` are read, and `answer_tokens` written where it writes.
+    """
     output = {READOUT: np.array([1.0]), WRITTEN: np.array([float(answer_tokens)])}
     return Answers(np.array([float(prompt_tokens)]), output)
 
 
 def answers_of(run: Run) -> Answers:
-    """Return the token counts of a run's answers of the ego: as given, and as read-outs.
+    """Return the token counts of the ego's answers in a run: as they are, and as read-outs.
 
-    A read-out takes one output token.
-
-    Raises:
-        UserError: the run's ego has no answer with counted tokens.
+    A read-out, the probabilities of one letter an action, takes one output token. Raises UserError
+    if the run's ego has no answer with counted tokens.
     """
     egos = [answer for answer in run.answers if answer.role == "ego" and answer.error is None]
     counts = np.array([tokens(answer) for answer in egos], dtype=float).reshape(-1, 2)
@@ -113,7 +123,13 @@ def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Hold a measured time or token rate of a run beside what a device profile states for it."""
+    """Hold a time or token rate that a run measured beside what a device profile states for it.
+
+    `what` is `seconds` of an answer, or the name of a rate in tokens a second, and `role` whose
+    answers they are, `ego` or `helper`. `measured` is a median of `n` answers with its 95 %
+    interval over episodes; `stated` is the profile's figure, of seconds its median over the same
+    answers, NaN if it has none.
+    """
 
     # `seconds` of an answer, or a rate in tokens a second, by its name in a profile
     what: str
@@ -123,9 +139,11 @@ class Comparison:
 
 
 def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
-    """Return comparisons of a device profile's row with the times that a run measured, by role.
+    """Return what a run measured beside what a device profile states, for each role and figure.
 
-    Only answers that were asked one at a time count. Raises UserError if there are none.
+    `row` is the profile's speed with one model. The figures are seconds of an answer, and tokens a
+    second read and written. Only answers that were asked one at a time count. Raises UserError if
+    there are none.
     """
     alone: dict[str, list[Answer]] = {}  # by role
     for answer in run.answers:

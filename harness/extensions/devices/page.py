@@ -22,7 +22,10 @@ PARTS = {
 
 
 def caveats(manifest: Manifest) -> Iterator[str]:
-    """Yield each agent whose times and joules are those of another model."""
+    """Yield a sentence for each of a run's models whose times and joules are another model's.
+
+    There is none for a run without a device profile. `manifest` is what the run's `run.json` has.
+    """
     if (device := manifest.beside.get(PROFILE)) is None:
         return
     agents = (manifest.agent(0), *manifest.helpers)
@@ -37,9 +40,9 @@ def caveats(manifest: Manifest) -> Iterator[str]:
 
 
 def notes(run: Shown) -> Iterator[str]:
-    """Yield a sentence for each condition on the joules of a decision, and their parts.
+    """Yield a sentence for each condition on the joules of a decision, and on who takes them.
 
-    Yields nothing for a run without a device profile.
+    Yields nothing for a run whose energy is not known, as without a device profile.
     """
     for name in run.conditions:
         total, helpers = run.score(name, "energy_j"), run.score(name, "helpers_j")
@@ -53,10 +56,12 @@ def notes(run: Shown) -> Iterator[str]:
 
 
 def energies(run: Run) -> Table:
-    """Return the joules of a decision as rows: one for each condition and who takes them.
+    """Return the mean joules of a decision as rows, one for each condition and who takes them.
 
-    A row has `condition`, `part`, `joules`, and the total with its interval. A condition of which
-    one of these is not known is left out.
+    A row has the name of the `condition` (operating point); who takes them as `part`, the ego's
+    inference, the helpers' or the radios; its `joules`; and of the whole decision `total_j` with
+    `low` and `high`, the ends of the 95 % interval, `n` and `interval`, what the units of n are. A
+    condition without energy is left out.
     """
     rows = []
     for condition in run.conditions:
@@ -80,7 +85,10 @@ def energies(run: Run) -> Table:
 
 
 def chart(rows: Table) -> dict[str, Any]:
-    """Return the Vega-Lite chart of rows as `energies` returns them: the joules of a decision."""
+    """Return the Vega-Lite specification of a chart of the joules of a decision, stacked by part.
+
+    `rows` are those that `energies` returns, of one or several runs.
+    """
     return charts.stacked(rows, "condition", "part", PARTS, "J per decision", amount="joules")
 
 

@@ -24,7 +24,13 @@ WINDOWS = 5  # of asking; the intervals are over them
 
 @dataclass(frozen=True)
 class Power:
-    """Hold the power and energy that one energy meter measured while a model answered."""
+    """Hold the power and energy that one meter of this machine counted while a model answered.
+
+    Power is in watts: `idle_watts` while nothing was asked, `watts` while it answered one question
+    after the other. `answer_j` is the joules of an answer, of all that the meter counts, and
+    `more_j` what of it is above idle power. Estimates are means with 95 % intervals over windows of
+    time.
+    """
 
     meter: str  # the meter's name
     idle_watts: float  # power before, while nothing is asked
@@ -41,18 +47,18 @@ def measure(
     progress: Callable[[int], None],
     sleep: Callable[[float], None] = time.sleep,
 ) -> tuple[list[Power], int]:
-    """Measure the energy of a model's answers, asked one at a time for several windows of time.
+    """Measure the energy of a model's answers, asked one at a time, in `WINDOWS` windows of time.
 
     Args:
-        backend: the model; its first answer, which includes warming up, is not counted.
-        requests: the requests, asked in turn.
+        backend: runs the model; its first answer, which includes warming up, is not counted.
+        requests: the questions, asked in turn and from the first again.
         meters: one energy meter or more.
         window_s: least seconds of a window; meters are coarse, so 2 or more.
         progress: called with 1 after each window.
         sleep: waits so many seconds, to measure idle power.
 
     Returns:
-        What each meter measured, and the number of answers.
+        What each meter counted, and the number of answers.
 
     Raises:
         Unanswered: a request got no answer.
@@ -92,10 +98,11 @@ def measure_agent(
     device: str | None,
     progress: Callable[[int], None],
 ) -> tuple[list[Power], int]:
-    """Load an agent's model on a device and `measure` it with scenes of the default dataset.
+    """Load a model and measure the energy of its answers to scenes of the default dataset.
 
-    `agent` is a model with a prompt and an answer mode, and `device` where it is loaded, such as
-    `cuda`; None lets the engine choose. The other arguments and the result are those of `measure`.
+    `agent` is the model with a prompt and an answer mode, and `device` where it is loaded, such as
+    `cuda`; None lets the engine choose. The other arguments, what is returned (each meter's figures
+    and the number of answers) and errors are those of `measure`.
     """
     data = load.load(load.find(DATASET), 10)
     spec = Spec(agent, FrozenSource(data), (), (0,), settings=Settings(batch_size=1, device=device))

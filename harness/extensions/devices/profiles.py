@@ -30,8 +30,9 @@ _SIZE = re.compile(r"(\d{1,7}(?:\.\d{1,9})?)b", re.ASCII)
 class Speed(Struct, frozen=True):
     """Hold how fast a computer answers one request with a model, and the energy for each token.
 
-    Rates are tokens a second, energies joules a token. `answer_s` is the seconds of an answer of
-    any length, in place of rates. None where unknown.
+    `prefill_tokens_per_s` is for tokens read and `decode_tokens_per_s` for tokens written. In place
+    of both, `answer_s` is the seconds of an answer of any length, as makers of decision models
+    state it. None is unknown.
     """
 
     model: str  # the model of the row in the device profile
@@ -44,7 +45,11 @@ class Speed(Struct, frozen=True):
 
 
 class Constant(Struct, frozen=True):
-    """Hold a number of a device profile, how it was come by, and its source."""
+    """Hold a number of a device profile, in the unit that the name of its field says.
+
+    `status` is how it was come by (`measured` here, `cited`, `modelled` from others, or `assumed`),
+    and `source` a text that says where it comes from.
+    """
 
     value: Annotated[float, between(1e-9, 1e9)]  # in the unit that the field which holds it says
     status: Status  # whether it was measured here, cited, modelled from others, or assumed
@@ -53,7 +58,14 @@ class Constant(Struct, frozen=True):
 
 
 class DeviceRow(Struct, frozen=True, kw_only=True):
-    """Hold the speed, energy and memory of a device with one model; None where unknown."""
+    """Hold the speed, energy and memory of a device with one model; None where unknown.
+
+    `billions` is the number of weights in 10^9, `precision` their number format, and `batch_size`
+    how many requests went through the device together when it was timed. Rates are for tokens read
+    (`prefill`) and written (`decode`); joules include the device's idle draw. `answer_ms` is the
+    time of a decision model's answer, in place of rates. `memory_gb` is what the model takes, in
+    10^9 bytes.
+    """
 
     model: str  # the model's name; that of a card, if there is one
     # billions of weights
@@ -82,10 +94,13 @@ class DeviceRow(Struct, frozen=True, kw_only=True):
 
 
 class Device(Struct, frozen=True, kw_only=True):
-    """Hold a device profile, a file of `devices/`: an on-board computer, a row for each model.
+    """Hold a device profile, a file of `devices/`: an on-board computer, with a row for each model.
 
-    The others are power in watts, radiated power in dBm, least time on air in ms and memory in 10^9
-    bytes; None where unknown. `scaling` says how a model without a row is timed; None refuses it.
+    `scaling` says how a model without a row is timed: `weights` scales the nearest row by the
+    number of weights; None refuses it. `load_watts` is drawn while it infers, `idle_watts` while it
+    waits. Of the radio, `transmit_dbm` is the power radiated, `amplifier_efficiency` its share of
+    what is drawn, and `frame_ms` the least time on air of a message. `memory_gb` is the computer's,
+    in 10^9 bytes. None is unknown.
     """
 
     name: str  # the file's name
@@ -123,12 +138,18 @@ class Device(Struct, frozen=True, kw_only=True):
 
 
 def names() -> list[str]:
-    """Return the sorted names of all device profiles."""
+    """Return the sorted names of all device profiles, those that ship and the project's.
+
+    Each is the name of a file of `devices/`, such as `agx-orin`.
+    """
     return resources.names("devices")
 
 
 def load(name: str) -> Device:
-    """Return a device profile by name. Raises UserError if there is none, or its file is wrong."""
+    """Return the device profile of a name: an on-board computer's speeds with several models.
+
+    Raises UserError if there is none, or its file is wrong.
+    """
     if name not in names():
         raise unknown("device profile", name, names())
     path = resources.find("devices", f"{name}.toml")
@@ -151,10 +172,11 @@ def _with_sources(value: Any, sources: dict[str, str]) -> Any:
 
 
 def find_row(device: Device, model: str) -> DeviceRow:
-    """Return a device profile's row for a model, scaled from the nearest one if there is none.
+    """Return a device profile's row for a model: its speed, energy and memory there.
 
-    `model` is the name of a row or card, or a size such as `3b`, in billions of weights, which is
-    scaled if the profile allows it. Raises UserError if the profile has no row for it.
+    `model` is the name of a row, or a size such as `3b`, in billions of weights; if the profile
+    allows scaling, the nearest row is then scaled by the number of weights. Raises UserError if the
+    profile has no row for it.
     """
     by_name = {row.model: row for row in device.rows}
     if model in by_name:
@@ -188,9 +210,10 @@ def _scaled(device: Device, billions: float) -> DeviceRow:
 
 
 def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | None]]:
-    """Yield name and value of a row's tokens a second and joules a token; None if unknown.
+    """Yield the names and values of a row's tokens a second and joules a token; None if unknown.
 
-    Joules that the row lacks are `load_watts` divided by the rate.
+    They are for tokens read and written. Joules that the row lacks are the power that the device
+    draws while it infers (`load_watts`), divided by the rate.
     """
     for name in RATES:
         yield name, getattr(row, name)
@@ -204,7 +227,10 @@ def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | 
 
 
 def speed(device: Device, row: DeviceRow) -> Speed:
-    """Return a row's tokens a second and joules a token as plain numbers."""
+    """Return a row's tokens a second and joules a token as plain numbers, without their sources.
+
+    Joules that the row lacks follow from the device's power (`constants`).
+    """
     answer_s = row.answer_ms.value / 1000 if row.answer_ms else None
     rates = {name: c.value if c else None for name, c in constants(device, row)}
     return Speed(row.model, **rates, answer_s=answer_s)
@@ -223,7 +249,10 @@ def seconds(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
 
 
 def joules(speed: Speed, prompt_tokens: float, output_tokens: float) -> float:
-    """Return the joules of one answer by its tokens, with idle power included; NaN if unknown."""
+    """Return the joules of one answer: tokens read and written, each times the joules of one.
+
+    Idle power is included. `speed` has the device's joules with the model; NaN if unknown.
+    """
     per_token = _or_nan(speed.joules_per_prompt_token), _or_nan(speed.joules_per_output_token)
     return prompt_tokens * per_token[0] + output_tokens * per_token[1]
 

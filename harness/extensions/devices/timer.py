@@ -41,8 +41,10 @@ PROFILE, MODEL = "device_profile", "device_model"  # settings of a run
 class Computer(Timer):
     """Time each answer by its tokens, as a computer in every vehicle would take for it.
 
-    A device profile states how many tokens a second the computer reads and writes with a model, and
-    how many joules a token takes. It is a `Timer`, chosen by `--device-profile`.
+    It is the timer that the option `--device-profile` chooses. `device` states how many tokens a
+    second the computer reads and writes with a model, and how many joules a token takes; it is None
+    where none is chosen. `model` names the one whose speed holds for all answers; if empty, that of
+    the model which gave the answer does.
     """
 
     option: ClassVar[str] = "--device-profile"
@@ -133,10 +135,10 @@ class Computer(Timer):
         return Latency(SOURCE, "; ".join(dict.fromkeys(descriptions)), speeds=speeds)
 
     def rows_of(self, agents: "Sequence[Agent]") -> list[DeviceRow]:
-        """Return for each agent the row of the profile that times its answers.
+        """Return for each agent, a model with its prompt, the device's row that times its answers.
 
         That is the row of `model`, or if empty that of the agent's own model. Raises UserError if
-        an agent counts no tokens, or the profile has no such row or no rates in it.
+        an agent's model counts no tokens, or the profile has no such row or no rates in it.
         """
         rows = []
         for agent in agents:
@@ -179,11 +181,17 @@ class Computer(Timer):
     def columns(
         self, latency: Latency, decided: "Sequence[Decided[Scene]]", answers: Answers
     ) -> dict[str, Floats]:
-        """Return the energy of each decision; NaN where a part of it is unknown.
+        """Return the energy of each of n decisions, (n,), by column of the table of decisions.
 
-        `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call, and
-        `helpers_j` the helpers' alone; `radio_mj` millijoules to send the request and the replies;
-        `waiting_j` joules of the ego's computer while it waits for messages and does not infer.
+        `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call (a
+        second question to the ego's model), and `helpers_j` the helpers' alone; `radio_mj`
+        millijoules to send the request and the replies; `waiting_j` joules of the ego's computer
+        while it waits for messages and does not infer. NaN where a part is unknown.
+
+        Args:
+            latency: how long answers take, with each agent's speed on the device.
+            decided: the decisions of each step and condition.
+            answers: the answers by request id.
         """
         parts = [self._columns_of(latency, part, answers) for part in decided]
         columns = {}
@@ -220,10 +228,11 @@ class Computer(Timer):
         scenes: "Sequence[Scene]",
         answers: Answers,
     ) -> Floats:
-        """Return the joules of each vehicle's answer in n scenes, `(n, 1+H)`, the ego first.
+        """Return the joules of each vehicle's answer in n scenes, (n, 1+H), the ego first.
 
-        The H helpers follow. `answers` are by request id. NaN for an answer that is missing, has no
-        known tokens, or came from a cloud; 0 where there is no vehicle.
+        The H helpers follow. `latency` has each agent's speed on the device, `point` is the
+        condition, and `answers` are by request id. NaN for an answer that is missing, has no known
+        tokens, or came from a cloud; 0 where there is no vehicle.
         """
         joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
         for n, scene in enumerate(scenes):
@@ -255,9 +264,11 @@ TIMER = Computer()
 
 
 def answer_s(speed: Speed, answer: Answer) -> float:
-    """Return the seconds of one answer by its tokens, with its repair turn; NaN if it failed.
+    """Return the seconds that an answer takes at a speed; NaN if it failed.
 
-    Raises UserError if the answer has no token counts and `speed` needs them.
+    They go by its tokens, or are the same for all answers if `speed` says so. A repair turn, a
+    second question after an answer that cannot be parsed, is included. Raises UserError if the
+    answer has no token counts and `speed` needs them.
     """
     if speed.answer_s is not None:
         if answer.error is not None:
@@ -267,18 +278,20 @@ def answer_s(speed: Speed, answer: Answer) -> float:
 
 
 def answer_j(speed: Speed, answer: Answer) -> float:
-    """Return the joules of one answer; NaN if it failed, or its time does not go by tokens.
+    """Return the joules that an answer takes, by its tokens.
 
+    NaN if it failed, or if `speed` has seconds for an answer of any length and no energy a token.
     Raises UserError if the answer has no token counts and `speed` needs them.
     """
     return math.nan if speed.answer_s is not None else profiles.joules(speed, *tokens(answer))
 
 
 def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
-    """Return the joules of all H helpers that infer for each of n decisions, `(n,)`.
+    """Return the joules of all helpers that infer for each of n decisions, `(n,)`.
 
-    `infers`, `(n, H)`, says who does; columns beyond the vehicles (an attacker's further voices)
-    run no model. `vehicles`, `(n, 1+H)`, has the joules of each vehicle's answer, the ego first.
+    `infers`, `(n, H)`, says which of H helpers do; columns beyond the vehicles, further names under
+    which an attacker sends, run no model. `vehicles`, `(n, 1+H)`, has the joules of each vehicle's
+    answer, the ego first.
     """
     count = min(infers.shape[1], vehicles.shape[1] - 1)
     joules = vehicles[:, 1 : 1 + count]
@@ -286,9 +299,10 @@ def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
 
 
 def tokens(answer: Answer) -> tuple[float, float]:
-    """Return an answer's prompt and completion tokens, of both turns if it has a repair turn.
+    """Return how many tokens an answer reads and writes, of both turns if it was asked again.
 
-    NaN if the engine failed. Raises UserError if the answer has no token counts otherwise.
+    It is asked again, once, if it cannot be parsed and the run has repair turns. NaN if the engine
+    failed. Raises UserError if the answer has no token counts otherwise.
     """
     if answer.prompt_tokens is not None and answer.completion_tokens is not None:
         return answer.prompt_tokens, answer.completion_tokens
@@ -301,10 +315,10 @@ def tokens(answer: Answer) -> tuple[float, float]:
 
 
 def transmit_watts(device: Device, point: "OperatingPoint") -> float:
-    """Return the electric watts of a sending radio; NaN if the device profile states no power.
+    """Return the electric power of a radio while it sends, in W; NaN if the profile does not say.
 
-    From the channel's transmit power in dBm if it has one, else the profile's, and the amplifier's
-    efficiency.
+    It is the transmit power of the channel of `point`, the condition, if it has one, else the
+    device profile's, over the amplifier's efficiency.
     """
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan
