@@ -35,8 +35,11 @@ WIDTH, DECIDED = "until_width", "until_decided"  # settings of a run
 class LooksRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Hold the rule of a run that may stop early and its interim looks, as `run.json` has them.
 
-    The rule is a width of intervals, or another run from which success is to differ. At a look the
-    run checks, between layouts (start situations), whether it knows enough.
+    A layout is a start situation with one episode, and an interim look a test, after the first so
+    many of `layouts`, whether these are enough. They are if the interval of success is as narrow as
+    `width` (a share), or success differs from that of another run (`against`, its name, and
+    `against_sha256`, the hex digest of its episodes.csv), in every condition. `at` has the numbers
+    of layouts at which it looked; `enough` is the result of the last look.
     """
 
     layouts: int  # how many layouts there were in all
@@ -49,11 +52,12 @@ class LooksRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 @dataclass(frozen=True)
 class Until(StoppingRule):
-    """Describe when a run may stop early: every condition's success is known well enough.
+    """Describe when a run may stop early: once every condition's success is known well enough.
 
-    That is a confidence interval no wider than `width`, or a difference to another run's success
-    whose interval excludes 0. Layouts come in a fixed order, and intervals hold at every look
-    (`sequences`).
+    That is a 95 % interval no wider than `width`, a share, or a difference to the success of the
+    run `against`, in `folder`, whose interval excludes 0; one of both is None. Layouts (start
+    situations with one episode each) come in a fixed order, and the intervals are valid though one
+    looks at them several times. Methods are those of `StoppingRule`.
     """
 
     chosen_by: ClassVar[tuple[str, ...]] = (WIDTH, DECIDED)
@@ -205,16 +209,20 @@ RULE = Until()
 
 
 def any_time_mean(success: Success, values: Floats) -> Estimate:
-    """Return mean success of values (S, E) with an interval over episodes that holds at every look.
+    """Return mean success with an interval that stays valid though one looks after every episode.
 
-    The axes are S channel seeds and E episodes.
+    `values`, (S, E), are 1 or 0 by S channel seeds and E episodes, and `success` says how they are
+    averaged: plainly, or balanced over episodes with a danger and without.
     """
     means = known_mean(values, 0)
     return any_time([means[part] for part in success.parts])
 
 
 def interim_looks(layouts: int) -> list[int]:
-    """Return after how many layouts a run checks whether it may stop; the last is `layouts`."""
+    """Return after how many layouts a run looks whether it may stop, ascending up to `layouts`.
+
+    A layout is a start situation with one episode.
+    """
     at = [min(FIRST, layouts)]
     while at[-1] < layouts:
         at.append(min(math.ceil(at[-1] * MORE), layouts))

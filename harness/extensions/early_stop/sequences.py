@@ -30,12 +30,12 @@ MEANS = np.linspace(0.0, 1.0, 1001)  # the means that are tried; ends are the ne
 
 
 def any_time(parts: Sequence[Floats]) -> Estimate:
-    """Return a mean of shares with a 95 % confidence sequence, valid at every number of episodes.
+    """Return a mean of shares with a 95 % interval that stays valid at every look.
 
-    A confidence sequence may be looked at after each episode, and the run stopped by it. `parts`
-    are one or two strata (groups that are averaged apart) of E independent values from 0 to 1, (E,)
-    each, NaN left out; the result is the unweighted mean of their means. By betting: Waudby-Smith
-    and Ramdas 2024.
+    Such an interval, a confidence sequence, may be computed after each episode, and the run stopped
+    by it. `parts` are one or two strata (groups that are averaged apart) of E independent values
+    from 0 to 1, (E,) each, NaN left out; the result is the unweighted mean of their means. By
+    betting: Waudby-Smith and Ramdas 2024.
     """
     values = [part[~np.isnan(part)] for part in parts]
     n, n_excluded = sum(map(len, values)), sum(map(len, parts)) - sum(map(len, values))
@@ -48,11 +48,11 @@ def any_time(parts: Sequence[Floats]) -> Estimate:
 
 
 def any_time_difference(parts: Sequence[Floats]) -> Estimate:
-    """Return a mean paired difference of shares, with a 95 % confidence sequence.
+    """Return a mean paired difference of shares, with an interval that stays valid at every look.
 
-    `parts` are its strata and the value is as in `statistics.paired_difference`: differences from
-    -1 to 1 of E episodes, (E,) each, NaN left out. The interval is valid at every number of
-    episodes (asymptotically), so a run may stop by it.
+    `parts` are its strata, groups that are averaged apart: differences from -1 to 1 of E episodes,
+    (E,) each, NaN left out. The result is the unweighted mean of their means. The 95 % interval may
+    be computed after any number of episodes (asymptotically), and the run stopped by it.
     """
     return paired_reach(parts, _mixture(sum(int((~np.isnan(part)).sum()) for part in parts)))
 
