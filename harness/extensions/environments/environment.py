@@ -30,45 +30,51 @@ OF_EGO = ("target_speeds", "target_speed", "speed_index", "route")
 
 
 def named(env: str, config: Any = None) -> str:
-    """Return the scenario name of an environment, such as `env:merge-v0`.
+    """Return the scenario name of an environment of highway-env, such as `env:merge-v0`.
 
-    `env` is its gymnasium id, and `config` the changed keys of its configuration with their values,
-    plain values of JSON, which become part of the name; None for none.
+    `env` is its gymnasium id, such as `merge-v0`, and `config` the changed keys of its
+    configuration with their values, plain values of JSON, which become part of the name; None for
+    none.
     """
     return f"{PREFIX}{env}" + (f"{CHANGES}{canonical_json(config)}" if config else "")
 
 
 def split(text: str) -> tuple[str, str | None]:
-    """Split a scenario text into the name and its settings such as `decisions=5`, or None."""
+    """Split a text such as `env:merge-v0:decisions=5` into the scenario's name and its settings.
+
+    The settings are one text, such as `decisions=5,helpers=2`; None without any.
+    """
     head, config, changes = text.partition(CHANGES)
     name, _, settings = head.rpartition(":")
     return (name + config + changes, settings) if "=" in settings else (text, None)
 
 
 def joined(name: str, settings: Sequence[str]) -> str:
-    """Add settings such as `decisions=5` to a scenario's name; the inverse of `split`."""
+    """Return a scenario's name with settings such as `decisions=5` added: `split` undone."""
     head, config, changes = name.partition(CHANGES)
     return ":".join([head, *([",".join(settings)] if settings else [])]) + config + changes
 
 
 def label(name: str) -> str:
-    """Return a scenario's name, shortened and made printable, for messages."""
+    """Return the name of a scenario as error messages show it: printable, and not too long."""
     return printable(name, 80)
 
 
 def allow(name: str) -> None:
-    """Allow importing the module that an environment's name refers to, here and in subprocesses.
+    """Allow importing the Python module that an environment's name refers to, such as `my_envs`.
 
-    Only for names that the user typed: a name from a file such as a manifest must not be given.
+    It holds here and in subprocesses, by an environment variable (`IMPORTS`). Only for names that
+    the user typed: a name from a file, such as a manifest, must not be given.
     """
     if module := module_of(name):
         os.environ[IMPORTS] = ",".join([*_allowed(), module])
 
 
 def module_of(name: str) -> str:
-    """Return the module that gymnasium imports for this environment, such as `my_envs`.
+    """Return the Python module that gymnasium imports for an environment, such as `my_envs`.
 
-    Empty for an environment of highway-env itself.
+    `name` is its scenario name, such as `env:my_envs:MyEnv-v0`. Empty for an environment of
+    highway-env itself.
     """
     return _id_and_changes(name)[0].rpartition(":")[0]
 
@@ -205,7 +211,7 @@ def _create(name: str) -> Any:
 
 
 def raised(error: Exception) -> str:
-    """Return the type and message of an error that a user's code raised, for a message."""
+    """Return the type and text of an error that a user's code raised, to be put into a message."""
     return f"{type(error).__name__}: {printable(error)}"
 
 
@@ -232,9 +238,10 @@ def _merged(default: Any, value: Any) -> Any:
 
 
 def config(name: str) -> dict[str, Any]:
-    """Return the whole configuration of an environment, by its scenario name, with changes.
+    """Return the whole configuration of an environment, with the changes that its name states.
 
-    Keys are highway-env's, and values are plain values of JSON.
+    `name` is its scenario name, such as `env:merge-v0`. Keys are highway-env's, and values are
+    plain values of JSON.
     """
     text = json.dumps(_create(name).config, default=str)
     whole: dict[str, Any] = json.loads(text, parse_constant=str)
@@ -267,10 +274,11 @@ def meta_actions(name: str, env: Any) -> Any:
 
 
 def numbered(env: Any, kind: Any, action: str) -> Any:
-    """Return the number, or tuple of numbers, that stands for an action of the ego in `env.step`.
+    """Return what `env.step` must be given so that the ego takes an action and others stay idle.
 
-    `env` is highway-env's environment; other agents that it controls take IDLE. `kind` is the ego's
-    action type, as `meta_actions` returns it, and `action` a name such as `FASTER`.
+    That is the action's number, or a tuple of one for each agent that the environment controls.
+    `env` is highway-env's environment, `kind` the ego's action type, as `meta_actions` returns it,
+    and `action` a name such as `FASTER`.
     """
     if kind is env.action_type:
         return kind.actions_indexes[action]
@@ -300,14 +308,15 @@ def lane_of(v: Any) -> Lane:
 class Constants:
     """Hold the class constants of highway-env's vehicles, which some environments overwrite.
 
-    They are kept apart so that environments in one process do not change each other's.
+    They are kept apart so that environments in one process do not change each other's. `values` are
+    by class and name of the constant.
     """
 
     values: Mapping[tuple[type, str], Any]  # by class and name of the constant
 
     @classmethod
     def now(cls) -> "Constants":
-        """Return the constants as they are now in this process."""
+        """Return the constants of highway-env's vehicles as they are now in this process."""
         from highway_env.vehicle import behavior, controller, kinematics
 
         values: dict[tuple[type, str], Any] = {}
@@ -320,7 +329,7 @@ class Constants:
         return cls(values)
 
     def restore(self) -> None:
-        """Set all class constants back to the held values."""
+        """Set the class constants of highway-env's vehicles back to the values that are held."""
         for (kind, key), value in self.values.items():
             if vars(kind)[key] is not value:
                 setattr(kind, key, value)

@@ -14,12 +14,11 @@ Places = list[tuple[float, ...]]  # x, y, heading and speed of each vehicle
 
 
 def examine(scenario: Scenario, seed: int) -> None:
-    """Raise UserError unless a highway-env environment simulates a seed reproducibly.
+    """Raise UserError unless an environment of highway-env simulates an episode reproducibly.
 
-    `scenario` is one that is made of such an environment, and `seed` its layout seed.
-
-    Drives IDLE, FASTER and SLOWER twice by the environment's own `step`, and once frame by frame in
-    deep copies; the poses and speeds of all vehicles must agree at every decision.
+    `scenario` is one that is made of such an environment, and `seed` that of the start situation.
+    The environment's own `step` takes IDLE, FASTER and SLOWER twice, and deep copies take them
+    frame by frame; positions, headings and speeds of all vehicles must agree at every decision.
     """
     name = label(scenario.name)
     once, again = (_stepped(scenario, seed, TRIED) for _ in range(2))

@@ -15,7 +15,12 @@ ENV, CONFIG = "env", "env_config"  # the options of commands that take a scenari
 
 
 class Environments:
-    """Read names of environments of highway-env, such as `env:merge-v0:config={...}`."""
+    """Make scenarios of environments of highway-env, by names such as `env:merge-v0:config={...}`.
+
+    `options` are those of commands that take a scenario, by name, with their help. Methods are
+    those of `Family`: they make a name of what is typed, split settings off it, allow the module
+    that it needs, and return the scenario.
+    """
 
     heading = "Environments"
     options: ClassVar[Mapping[str, str]] = {

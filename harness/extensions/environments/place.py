@@ -28,9 +28,10 @@ HALFWAY = 0.4  # share of the way to the goal at which the origin lies, the midd
 
 @dataclass(frozen=True)
 class Parameters(Common):
-    """Hold the parameters of a highway-env environment as a scenario.
+    """Hold the parameters of an environment of highway-env as a scenario.
 
-    Raises UserError if `decisions` or `helpers` is not from 1 to 9.
+    Raises UserError if `decisions` (of an episode) or `helpers` (the vehicles that the ego can ask)
+    is not from 1 to 9.
     """
 
     braking_mps2: float = 20.0  # hardest braking, m/s^2; highway-env's own controller has no limit
@@ -49,16 +50,22 @@ class Parameters(Common):
 
     @property
     def goal_s(self) -> float:
-        """Return the time, s, that the ego needs to its goal at its first target speed.
+        """Return the seconds that the ego needs to its goal if it keeps its first target speed.
 
-        It says how far away the goal is.
+        So the goal is this time, times that speed, away from its start.
         """
         return (self.decisions + AFTER) * self.decision_period_s
 
 
 @dataclass(frozen=True)
 class Place:
-    """Hold what is the same for every seed of a highway-env environment: paths, road, actions."""
+    """Hold what is the same for every seed of an environment of highway-env.
+
+    `routes` are the paths through its road network, and `road` has these with the ego's goal.
+    `ends` has where each lane, by highway-env's index of it, begins and ends: x, y, x, y in m of
+    highway-env's own frame. `actions` are the names of what the ego can do, such as `SLOWER`;
+    `kind` is the name of the environment's class.
+    """
 
     routes: Routes  # the paths of its network
     # where each of the network's lanes begins and ends: x, y, x, y in m
@@ -70,7 +77,7 @@ class Place:
 
 
 def first_target_mps(ego: Any) -> float:
-    """Return the initial target speed of an ego, m/s, or its highest target speed if that is 0.
+    """Return the speed, m/s, that an ego aims for at first; the highest it can, if that is 0.
 
     `ego` is a vehicle of highway-env that is driven by meta-actions (`MDPVehicle`).
     """
@@ -78,9 +85,10 @@ def first_target_mps(ego: Any) -> float:
 
 
 def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
-    """Return where each lane of a highway-env `RoadNetwork` begins and ends, by its index.
+    """Return where each lane of a highway-env `RoadNetwork` begins and ends: x, y, x, y in m.
 
-    Values are x, y, x, y in m of highway-env's frame.
+    The key is the lane's index: the two nodes of its road, and its number from the left, from 0.
+    Coordinates are those of highway-env's own frame.
     """
     ends = {}
     for index, lane in lanes_of(network).items():
@@ -91,10 +99,11 @@ def ends_of(network: Any) -> dict[Lane, tuple[float, ...]]:
 
 @lru_cache(maxsize=16)
 def place(name: str) -> Place:
-    """Return what is the same for every seed of an environment, found by resetting it to seed 0.
+    """Return what is the same for every seed of an environment: paths, road, actions, parameters.
 
-    `name` is its scenario name, such as `env:merge-v0`. Raises UserError if there is no such
-    environment, or its frequencies of frames and decisions do not fit.
+    It is found by resetting it to seed 0. `name` is its scenario name, such as `env:merge-v0`.
+    Raises UserError if there is no such environment, or its frequencies of frames and decisions do
+    not fit.
     """
     env = reset(name, 0)
     ego, network = env.vehicle, env.road.network

@@ -27,12 +27,12 @@ TURNS = ("straight", "right", "back", "left")  # in quarters of a turn to the ri
 
 @dataclass(frozen=True)
 class Routes:
-    """Hold all paths through a highway-env network: the lines that vehicles can follow.
+    """Hold all paths through a road network of highway-env: the lines that vehicles can follow.
 
-    A road joins two nodes of the network and has one or more lanes. A route is the roads that a
-    path takes, one after another; a route has several parallel paths where its roads have several
-    lanes. A path's key is the node where it begins, and a name that says where it goes and, of
-    parallel ones, on which lane.
+    A road joins two nodes of the `network` and has one or more lanes. A route is the roads that a
+    path takes, one after another; it has several parallel paths where its roads have several lanes
+    (`ways`, from left to right). The key of a path is the node where it begins, and a name that
+    says where it goes and, of parallel ones, on which lane.
     """
 
     network: Any  # highway-env's `RoadNetwork`
@@ -40,10 +40,11 @@ class Routes:
     ways: dict[Route, tuple[PathKey, ...]]  # the paths of each route from left to right
 
     def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
-        """Return the roads that a vehicle in `lane` will take, from its present one on.
+        """Return the roads that a vehicle will take, from its present one on, as two nodes each.
 
-        A lane is two nodes and a number from the left. It follows highway-env's rule for the next
-        lane; `plan` has the lanes that highway-env planned for the vehicle, or is None.
+        `lane` is where it is: two nodes and a number from the left. At each node it follows
+        highway-env's rule for the next lane; `plan` has the lanes that highway-env planned for the
+        vehicle, or is None.
         """
         streets, plan = [lane[:2]], list(plan or ())
         while lane[1] in self.network.graph:

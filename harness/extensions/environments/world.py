@@ -43,7 +43,14 @@ MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
 
 @dataclass
 class EnvironmentWorld(OwnWorld):
-    """Simulate one episode in an environment of highway-env, frame by frame."""
+    """Simulate one episode in an environment of highway-env (`env`), frame by frame.
+
+    `here` is the `Place` where it happens, and `constants` highway-env's, as this environment wants
+    them. `everybody` has highway-env's vehicles that can be hit, the ego first, of which `born`
+    have entered so far. `action` was taken last; `taken` has each action with the number of its
+    frame, counted from the episode's start. `failed` says whether the environment has ended the
+    episode without success.
+    """
 
     env: Any = None  # highway-env's environment, an `AbstractEnv`
     # highway-env's class constants as this environment wants them
@@ -59,7 +66,7 @@ class EnvironmentWorld(OwnWorld):
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
-        """Start the episode of a layout seed, in the environment that `scenario` is made of.
+        """Start the episode of a seed, in the environment that `scenario` is made of.
 
         Raises UserError if its road, or the path on which the ego starts, differs from seed 0's.
         """
@@ -98,9 +105,9 @@ class EnvironmentWorld(OwnWorld):
 
     @classmethod
     def configuration(cls, scenario: Scenario) -> dict[str, Any]:
-        """Return the environment's whole configuration, by key, for a dataset's manifest.
+        """Return the environment's whole configuration, by key, to be kept in a dataset's manifest.
 
-        Its name and package decide what that is.
+        The scenario's name and the version of the environment's package decide what that is.
         """
         return config(scenario.name)
 
@@ -142,7 +149,7 @@ class EnvironmentWorld(OwnWorld):
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> ActionsTaken:
-        """Return the actions so far: replayed from the start, they lead to the same world."""
+        """Return the actions so far, with their frames; replayed, they lead to the same world."""
         return ActionsTaken(self.frame, tuple(self.taken))
 
     def take(self, action: str, agent: int = 0) -> None:
@@ -152,7 +159,11 @@ class EnvironmentWorld(OwnWorld):
         self._place(self.everybody[0])
 
     def target(self, agent: int = 0) -> Target:
-        """Return the ego's target lane, as text with its target speed, and the speed's index."""
+        """Return what the ego aims for: its lane and speed as one text, and that speed's index.
+
+        The text has the lane's two nodes, its number from the left and the target speed in m/s; the
+        index is that of the speed among those that the ego can choose. `agent` is 0, the ego.
+        """
         ego = self.everybody[0]
         aim = *lane_of(ego), round(float(ego.target_speed), DECIMALS)
         return " ".join(map(str, aim)), int(ego.speed_index)
@@ -300,10 +311,11 @@ def _apart_m(first: Any, second: Any) -> float:
 
 @lru_cache(maxsize=16)
 def scenario(name: str) -> Scenario:
-    """Return an environment of highway-env as a scenario, by its name `env:ID`.
+    """Return an environment of highway-env as a scenario, by its name, such as `env:merge-v0`.
 
-    It has no layout and no danger, and the environment decides when the goal is reached. Raises
-    UserError if there is no such environment, or it lacks something needed.
+    The environment itself decides where vehicles start and when the goal is reached, so the
+    scenario knows no start situations and no danger. Raises UserError if there is no such
+    environment, or it lacks something needed.
     """
     here = place(name)
     where = here.road.ego[1].partition(" lane ")[0]
