@@ -6,7 +6,11 @@ from harness.runs.folder import Run
 
 
 class InspectLog:
-    """Export a run as a log of Inspect AI (`harness run export --inspect`)."""
+    """Export a run as a log of Inspect AI, for `harness run export --inspect`.
+
+    `write` takes the run, the file to write and the folder of the run's dataset (None: where the
+    run says), and returns the file's path.
+    """
 
     help = "Write an Inspect AI log, NAME.eval: one sample per answer."
     doing = "writing a log"

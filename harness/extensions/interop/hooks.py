@@ -36,23 +36,32 @@ SAID_S = 3.0  # after which it is said that a hook is waited for
 class Hook(Protocol):
     """Describe a plug-in that follows a command's runs, such as an experiment tracker.
 
-    It gets one run after the other and may raise anything. One that needs modules of an optional
-    extra (`harness.core.extras.OPTIONAL`) states these as its `needs`.
+    For each run, one after the other, `begin` is called, then `answered` several times, then `end`;
+    all may raise anything. One that needs modules of an optional extra
+    (`harness.core.extras.OPTIONAL`) states these as its `needs`.
     """
 
     def begin(self, folder: Path, settings: Mapping[str, Any]) -> None:
         """Take note that a run begins, before its first answer is counted.
 
-        `folder` is the run's; `settings` are plain values, as in its `run.json`.
+        `folder` is the run's, and `settings` are its settings by name, plain values as in its
+        `run.json`.
         """
         ...
 
     def answered(self, total: int) -> None:
-        """Take note of how many answers there are now (episodes in closed loop), kept ones too."""
+        """Take note of how many answers the run has now, those kept from before included.
+
+        In closed loop, where the model drives, they are episodes.
+        """
         ...
 
     def end(self, done: "Evaluated | None") -> None:
-        """Take note that the run is finished, with its page; `done` is None if it stopped."""
+        """Take note that the run is over.
+
+        `done` has the finished run: its folder (`out`), manifest and scores; it is None if the run
+        was stopped.
+        """
         ...
 
 
@@ -60,9 +69,10 @@ HOOKS: Plugins[Hook] = Plugins("swarmdrive.hooks", Hook, {})
 
 
 def chosen(names: Iterable[str]) -> dict[str, Hook]:
-    """Return hooks by name: `names`, or if empty those in the variable `SWARMDRIVE_TRACKERS`.
+    """Return the hooks that are to follow a command's runs, such as trackers, by name.
 
-    Raises UserError if there is no such hook, or its package is not installed.
+    `names` are those typed; if empty, those in the variable `SWARMDRIVE_TRACKERS` are taken. Raises
+    UserError if there is no such hook, or its package is not installed.
     """
     typed, where, hint = tuple(names), "--tracker ", ""
     if not typed:
@@ -131,9 +141,10 @@ class _Caller:
 
 
 class Followers:
-    """Call hooks during one run; a hook that fails is reported on stderr and called no more.
+    """Call hooks (plug-ins such as trackers) during one run, from its first new answer to its end.
 
-    The run begins for them with its first new answer, or when it ends without any.
+    One that fails or hangs is reported on stderr and called no more. If there is no new answer, the
+    run begins for them when it ends.
     """
 
     def __init__(
@@ -144,7 +155,10 @@ class Followers:
         self._folder, self._settings = folder, settings
 
     def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
-        """Return a function of a number of new answers that calls `progress` and the hooks."""
+        """Return a function to call with the number of answers that are new.
+
+        It calls `progress` with that number, and the hooks with the total so far.
+        """
 
         def count(new: int) -> None:
             progress(new)
@@ -181,7 +195,11 @@ class Followers:
 def following(
     hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]
 ) -> Iterator[Followers]:
-    """Enter a context in which hooks follow a run; if it raises, they are told that it stopped."""
+    """Enter a context in which hooks, by name, follow a run; if it raises, they are told so.
+
+    `folder` is the run's, and `settings` are its settings by name, as in its `run.json`. Call `end`
+    of the object that is entered with the finished run.
+    """
     followers = Followers(hooks, folder, settings)
     try:
         yield followers

@@ -57,10 +57,10 @@ def write(run: Run, path: Path, dataset: Path | None = None) -> Path:
 
 
 def log_of(run: Run, dataset: Dataset | None, scenes: Mapping[str, Scene]) -> log.EvalLog:
-    """Return a run as an Inspect AI log, with a sample for each answer and the run's summary.
+    """Return a run as an Inspect AI log, with a sample for each answer and the run's scores.
 
     `dataset` is the run's, and `scenes` has its decision points by id; without them, samples have
-    no prompts. The task is named by dataset and prompt version.
+    no prompts. The log's task is named by dataset and prompt version.
     """
     manifest, variant = run.manifest, run.manifest.variant
     whole = manifest.as_file()

@@ -9,7 +9,10 @@ from harness.extensions.interop import hooks
 
 
 class Tracker(CommandOption):
-    """Choose hooks by name."""
+    """Define the option `--tracker NAME`, repeatable: hooks, by name, that follow a command's runs.
+
+    `follow` returns what makes the hooks follow a run; None where none are chosen.
+    """
 
     kind = list[str]
     metavar = "NAME"

@@ -14,9 +14,10 @@ _TABLES = ("channels", "networks", "schedules", "kept")  # of which a condition 
 
 
 def params(settings: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
-    """Return a run's settings as flat values by dotted name; those without a value are left out.
+    """Return a run's settings as flat values by dotted name, such as `world.limit`, for a tracker.
 
-    Lists are JSON texts; of conditions only the names are kept.
+    `settings` are nested, as in `run.json`. Those without a value are left out, lists become JSON
+    texts, and of conditions only the names are kept.
     """
     conditions = [point["name"] for point in settings["conditions"]]
     some = {name: value for name, value in settings.items() if name not in _TABLES}
@@ -34,10 +35,10 @@ def _leaves(table: Mapping[str, Any], above: str) -> Iterator[tuple[str, str | i
 
 
 def figures(done: "Evaluated") -> dict[str, float]:
-    """Return a run's scores by `CONDITION/METRIC`, and model costs by `cost/MODEL/CURRENCY`.
+    """Return a finished run's figures by name, for a tracker, as far as they are known.
 
-    The names with `.low` and `.high` have the ends of a score's 95 % interval, `.n` its sample
-    size.
+    `CONDITION/METRIC` is a score, with the ends of its 95 % interval in `.low` and `.high` and the
+    number of its units in `.n`; `cost/MODEL/CURRENCY` is what a model's answers cost.
     """
     named: dict[str, float | None] = {}
     for score in (score for score in done.scores if score.interval != "seed means"):
@@ -54,5 +55,8 @@ def figures(done: "Evaluated") -> dict[str, float]:
 
 
 def files(done: "Evaluated") -> list[Path]:
-    """Return the files of a run that a tracker keeps: settings, figures and the page."""
+    """Return the paths of a finished run's files that a tracker keeps, as far as they are there.
+
+    They have its settings (`run.json`), its figures (`summary.csv`) and its page.
+    """
     return [file for file in map(done.out.joinpath, _FILES) if file.is_file()]

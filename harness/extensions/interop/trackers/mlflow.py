@@ -16,7 +16,10 @@ AT_ONCE = 100  # parameters, by MLflow's limit
 
 
 class Mlflow:
-    """Record evaluations in MLflow while they run: a hook for `--tracker`."""
+    """Record runs in MLflow while they go: a hook, chosen by `--tracker mlflow`.
+
+    It logs settings as parameters, the number of answers, and at the end figures and files.
+    """
 
     needs = ("mlflow",)  # without which it cannot begin
 

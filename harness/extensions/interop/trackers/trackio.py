@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 
 class Trackio:
-    """Record evaluations in Trackio while they run: a hook for `--tracker`."""
+    """Record runs in Trackio while they go: a hook, chosen by `--tracker trackio`.
+
+    It logs settings, the number of answers, and at the end figures.
+    """
 
     needs = ("trackio",)  # without which it cannot begin
 

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 class Wandb:
-    """Record evaluations in Weights & Biases while they run: a hook for `--tracker`."""
+    """Record runs in Weights & Biases while they go: a hook, chosen by `--tracker wandb`.
+
+    It logs settings, the number of answers, and at the end figures and files.
+    """
 
     needs = ("wandb",)  # without which it cannot begin
 
