@@ -13,10 +13,10 @@ Row = Sequence[str]  # of a table
 
 
 def show(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
-    """Print how agents fare under each policy, and what it costs against the plan for all.
+    """Print tables of how agents fare under each policy, and what it costs against a plan for all.
 
-    `outcomes` is what `policies.check` returns for `episodes` layouts, start situations, with
-    layout seeds from `seed` on.
+    Agents are vehicles that decide for themselves. `outcomes` is what `policies.check` returns for
+    `episodes` layouts, start situations, with layout seeds from `seed` on.
     """
     seconds, ratio, driver = Unit("s", 2), Unit(decimals=3), "driver of all agents"
     outcome_rows, time_rows, decision_rows = list[Row](), list[Row](), list[Row]()

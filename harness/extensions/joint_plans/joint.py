@@ -25,7 +25,7 @@ from harness.world.state import SIZES_M, separation_m
 from harness.world.swarm import by_scenario, on_seat
 from harness.world.world import Journey, World
 
-Scripts = Mapping[int, Sequence[str]]  # actions of each agent, by its place
+Scripts = Mapping[int, Sequence[str]]  # actions of each agent, by its index among vehicles
 
 HORIZON = 5  # decisions of an agent that are planned; after them it takes FASTER
 MARGIN_M = 0.1  # least gap between two agents of a plan
@@ -36,12 +36,16 @@ MOST_PLANS = 8  # that are driven for a layout until one keeps its promise
 
 @dataclass
 class Rehearsal(World):
-    """Simulate one agent alone with the other traffic, and record where all vehicles were.
+    """Simulate one agent of a layout with the traffic, without other agents, and record them.
 
-    An agent is a vehicle that decides for itself.
+    An agent is a vehicle that decides for itself, and `agent` its index among the layout's
+    vehicles, 0 the ego. `script` has the meta-actions that it is to take, None for all possible
+    ones in copies, and `taken` those that it took. `record` has arrays of x, y (m), heading (rad)
+    and speed (m/s) of V vehicles after each frame, (frames, V, 4). `arrives_s` is when it reached
+    its goal; inf before.
     """
 
-    agent: int = 0  # the agent's index among the agents of the layout (start situation)
+    agent: int = 0  # the agent's index among the vehicles of the layout (start situation)
     # the meta-actions that it is to take; None for all that are possible
     script: Sequence[str] | None = None
     # x, y (m), heading (rad) and speed (m/s) of V vehicles after each frame, (frames, V, 4) each
@@ -58,10 +62,11 @@ class Rehearsal(World):
         self.taken = (*self.taken, action)
 
     def parts(self, step: int) -> list["Rehearsal"]:
-        """Return copies of this world, each with one of the actions that are possible at a step.
+        """Return copies of this world, each with one of the actions that the agent can take now.
 
-        Of actions that set the same target only one is tried. This world is the first of the
-        copies.
+        `step` is the number of its decision, from 0; after `HORIZON` of them it takes FASTER. Of
+        actions that set the same target speed and route only one is tried. This world is the first
+        of the copies.
         """
         calm_last = sorted(self.actions, key=lambda action: action == "IDLE")
         action_to = {self.target_after(action): action for action in calm_last}
@@ -82,9 +87,12 @@ class Rehearsal(World):
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Hold the n action sequences by which an agent touches no other traffic, soonest first.
+    """Hold n sequences of actions by which an agent touches no other traffic, the soonest first.
 
-    Each was simulated for F frames with V vehicles: the agent, then the other traffic.
+    `arrives_s`, (n,), is when the agent reaches its goal by each, inf for never. Each was simulated
+    for F frames, `hz` a second, with V vehicles, the agent and then the other traffic: `poses`, (n,
+    F, V, 3), has their x (m), y (m) and heading (rad), and `sizes_m`, (V, 2), their lengths and
+    widths.
     """
 
     actions: Sequence[tuple[str, ...]]  # the meta-actions of each of the n sequences
@@ -101,9 +109,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """Hold an action sequence for every agent of a layout, a drawn start situation.
+    """Hold a sequence of actions for every agent of a layout, a drawn start situation.
 
-    Agents are numbered by their index in the layout.
+    An agent is known by its index among the layout's vehicles, 0 the ego. `actions` and
+    `arrives_s`, when it reaches its goal (inf for never), are by that. No plan has a smaller sum of
+    these times than `bound_s`, with `NEVER_S` for never; `nodes` is how many partial choices the
+    search tried.
     """
 
     actions: Mapping[int, tuple[str, ...]]  # each agent's meta-actions, by its index
@@ -116,19 +127,27 @@ class Plan:
         return sum(min(time_s, NEVER_S) for time_s in self.arrives_s.values())
 
     def turn(self, step: int) -> dict[int, str]:
-        """Return each agent's action at a step, by agent index; agents without one are left out."""
+        """Return each agent's action at a step, the number of a decision from 0, by agent index.
+
+        Agents that decide no more are left out.
+        """
         return {agent: taken[step] for agent, taken in self.actions.items() if step < len(taken)}
 
     @property
     def exact(self) -> bool:
-        """Return whether it is proven that no plan has a smaller sum of arrival times."""
+        """Return whether it is proven that no plan has a smaller sum of arrival times.
+
+        An agent that never arrives counts as `NEVER_S`.
+        """
         return self.bound_s >= self.sum_s - 1e-9
 
 
 def options(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, Options]]:
     """Return what each agent can do without touching traffic, by layout seed, then agent index.
 
-    A layout seed draws a start situation of `scenario`.
+    A layout seed draws a start situation of `scenario`. An agent is a vehicle that decides for
+    itself, and its index is that among the layout's vehicles, 0 the ego. It is simulated with the
+    traffic, without other agents, through all sequences of `HORIZON` actions.
     """
     starts = [world for seed in seeds for world in rehearsals(scenario, seed)]
     unharmed: list[Rehearsal] = []
@@ -157,11 +176,12 @@ def courses(
     able: Mapping[int, Mapping[int, Options]],
     taken: Sequence[tuple[int, Scripts]],
 ) -> list[dict[int, Options]]:
-    """Return what agents did under given actions, one dict per item of `taken`, by agent index.
+    """Return where agents were under given actions, one dict per item of `taken`, by agent index.
 
-    An item of `taken` is a layout seed and the actions of each agent by index. A result is an
-    `Options` that holds this one sequence, even if it touches traffic. `able` are the `options` of
-    the layouts.
+    An item of `taken` is a layout seed and the actions of each agent, by its index among the
+    layout's vehicles. A result is an `Options` that holds this one sequence, simulated with the
+    traffic, without other agents, even if it touches traffic. `able` has what `options` returned
+    for these seeds; frames are as many as there.
     """
     layouts: list[list[Rehearsal]] = []
     for seed, scripts in taken:
@@ -187,7 +207,10 @@ def courses(
 
 
 def rehearsals(scenario: Scenario, seed: int) -> list[Rehearsal]:
-    """Return a world for each agent of a layout, in which it is alone with the other traffic."""
+    """Return a world at its start for each agent of a layout, with only that agent and the traffic.
+
+    `seed` draws the layout, a start situation of `scenario`.
+    """
     layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
     traffic = [n for n, spawn in enumerate(layout.spawns) if spawn.part == "other"]
     worlds = []
@@ -246,14 +269,14 @@ def _never(xy_m: Floats, approaches: object, parameters: object) -> Bools:
 class Search:
     """Search, by branch and bound, for compatible options of all agents with the least total cost.
 
-    Two options are compatible if the agents and the traffic do not touch (`together`).
-
-    `able` has each agent's options, and `unfit` the choices, as one option index for each agent,
-    that are left out. `best` is the best choice found, of cost `cost_s` (inf for none). What was
-    not searched may cost `open_s` at least.
+    An option is a sequence of actions, and its cost, s, when the agent arrives by it. Two are
+    compatible if the agents and the traffic do not touch (`together`). `able` has each agent's
+    options, and `unfit` choices (an option's index for each agent) that are left out. `run` finds
+    `best`, the best choice, of cost `cost_s` (inf for none), after `nodes` partial choices; what it
+    did not search may cost `open_s` at least. `rows` keeps which options are compatible.
     """
 
-    able: Sequence[Options]  # of each agent
+    able: Sequence[Options]  # of each agent: the sequences of actions that it can take
     # choices whose plan did not work in the simulator
     unfit: set[tuple[int, ...]] = field(default_factory=set)
     # by agent, its option and another agent: which options of the other are compatible
@@ -264,9 +287,9 @@ class Search:
     open_s: float = np.inf  # the least cost that a part which was not searched may have
 
     def run(self) -> None:
-        """Find the best choice of one option per agent, except those in `unfit`, into `best`.
+        """Find the best choice of an option for each agent, outside `unfit`, into `best`.
 
-        Afterwards `bound_s` is a lower bound of the cost of any choice.
+        Afterwards `bound_s` is a lower bound, s, of the cost of any choice.
         """
         self.nodes, self.best, self.cost_s, self.open_s = 0, None, np.inf, np.inf
         if all(len(each.actions) for each in self.able):
@@ -278,7 +301,7 @@ class Search:
 
     @property
     def ended(self) -> bool:
-        """Return whether the search was completed, so that `best` is optimal."""
+        """Return whether all that could be better was searched, so that `best` is optimal."""
         return self.open_s >= self.cost_s
 
     def _choose(self, chosen: tuple[int, ...], cost_s: float, left: Sequence[Bools]) -> None:
@@ -316,9 +339,11 @@ class Search:
 
 
 def together(options: Options, n: int, other: Options) -> Bools:
-    """Return which of another agent's n options are compatible with option `n` of an agent, (n,).
+    """Return which of another agent's n options are compatible with one of an agent's, (n,).
 
-    They are if neither agent touches the other or traffic, in the frames before both have arrived.
+    `options` has the agent's sequences of actions, of which `n` is the index of one, and `other`
+    the other agent's. They are compatible if neither agent touches the other or traffic, in the
+    frames before both have arrived.
     """
     poses, other_poses, frames = options.poses[n : n + 1], other.poses, options.poses.shape[1]
     ends = np.minimum(np.maximum(options.arrives_s[n], other.arrives_s) * options.hz, frames)
@@ -340,9 +365,10 @@ def near(
 ) -> Bools:
     """Return in which of n cases any of A vehicles comes near any of B others, (n,).
 
-    Near means within `margin_m` metres. `some`, (1, F, A, 3), and `others`, (n, F, B, 3), are x
-    (m), y (m) and heading (rad) in F frames; `sizes_m`, (A, 2), and `their_sizes_m`, (B, 2), are
-    lengths and widths. Only frames where `counts`, (n, F), is true are compared.
+    Near means within `margin_m` metres. `some`, (1, F, A, 3), the same in all cases, and `others`,
+    (n, F, B, 3), are x (m), y (m) and heading (rad) in F frames; `sizes_m`, (A, 2), and
+    `their_sizes_m`, (B, 2), are lengths and widths. Only frames where `counts`, (n, F), is true are
+    compared.
     """
     reach_m = (np.hypot(*sizes_m.T)[:, None] + np.hypot(*their_sizes_m.T)) / 2 + margin_m
     dx, dy = np.moveaxis(some[:, :, :, None, :2] - others[:, :, None, :, :2], -1, 0)
@@ -357,11 +383,12 @@ def near(
 def plans(
     scenario: Scenario, able: Mapping[int, Mapping[int, Options]]
 ) -> tuple[dict[int, tuple[Plan, World]], set[int]]:
-    """Return the best plan of each layout seed that works in the simulator, and its world.
+    """Return, by layout seed, the best plan that works in the simulator, and the world it ended in.
 
-    `able` are the `options`. A plan works if, with all agents together, each arrives when its
-    option says. Seeds without such a plan are left out. Returned second are the seeds whose search
-    was cut off, so that a plan may exist.
+    `able` is what `options` returned: each agent's possible sequences of actions, by layout seed
+    and agent index. A plan, one sequence for each agent, works if, with all together, each arrives
+    when its option says. Seeds without such a plan are left out. Returned second are the seeds
+    whose search was cut off, so that a plan may exist.
     """
     solved, unended = dict[int, tuple[Plan, World]](), set[int]()
     searches = {seed: Search(list(by_agent.values())) for seed, by_agent in able.items()}
@@ -395,7 +422,7 @@ def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
 
 
 def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
-    """Return each layout's world, by seed, after all of its agents took their planned actions."""
+    """Return each layout's finished world, by seed, after all agents took their planned actions."""
     worlds = {seed: World.start(scenario, seed) for seed in plans_by_seed}
     while live_worlds := [world for world in worlds.values() if not world.ended]:
         turns = [plans_by_seed[world.seed].turn(world.step) for world in live_worlds]
@@ -404,7 +431,10 @@ def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, W
 
 
 def kept(plan: Plan, world: World) -> bool:
-    """Return whether all agents of a finished world arrived exactly when the plan says."""
+    """Return whether all agents of a finished world arrived exactly when the plan says.
+
+    One that never arrives by the plan must have run out of time, unharmed.
+    """
     for agent, journey in world.journeys.items():
         outcome, arrives_s = journey.outcome, plan.arrives_s[agent]
         as_planned = (

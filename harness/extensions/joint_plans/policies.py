@@ -42,8 +42,13 @@ UNKNOWN = Regret(np.nan, np.nan, np.nan)
 class Fate:
     """Describe how the agents of one layout fared under one policy that all of them follow.
 
-    Agents are vehicles that decide for themselves, a layout is a drawn start situation, and a
-    policy is a rule driver or a plan for all agents together. Times are in s.
+    Agents are vehicles that decide for themselves, a layout is a start situation, and a policy is a
+    rule driver or a plan for all agents together. `arrived` is the share that reached their goals;
+    `met` whether agents collided with each other; `stuck` whether nobody came to harm, but somebody
+    never arrived. `sum_s` is the sum of their times, with `joint.NEVER_S` for never; `lost_s` how
+    much later than alone on the road, in sum, and `most_lost_s` of the one who lost most, both s,
+    NaN unless all arrived. `exact` says of a plan that no better one exists; `cost` is that of the
+    agents' decisions.
     """
 
     arrived: float  # share of agents that reached their goals
@@ -75,8 +80,9 @@ UNSOLVED = Fate(0.0, False, False, np.inf, np.nan, np.nan)
 def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> Fate:
     """Return how the agents of a finished world fared.
 
-    `alone_s` has the time (s) at which each would arrive on an empty road, by its index. `exact`
-    (see `Fate`) and `cost`, that of the agents' decisions, are stored as they are.
+    `alone_s` has the time (s) at which each would arrive on an empty road, by its index among the
+    world's vehicles. `exact` (whether no better plan exists) and `cost`, that of the agents'
+    decisions, are stored as they are.
     """
     agent_ends, worst = ends(world, alone_s), gravest(world.journeys)
     lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in agent_ends])
@@ -95,7 +101,11 @@ def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> 
 
 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]:
-    """Drive each layout under every policy; return each seed's `Fate` by policy."""
+    """Drive each layout (start situation, drawn by a seed) under every policy of `POLICIES`.
+
+    A policy is a rule driver that every agent follows, or a plan for all of them. Returns how the
+    agents fared, one dict a seed, in their order, by policy.
+    """
     drivers = POLICIES[:-1]
     policies = [(seed, driver) for seed in seeds for driver in drivers]
     worlds = [World.start(scenario, seed) for seed, _ in policies]
@@ -121,11 +131,11 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]
 
 
 def best_of(fates: Mapping[str, Fate]) -> Fate:
-    """Return the fate under the joint plan, or under a driver whose summed arrival time is smaller.
+    """Return how agents fared under the plan for all of them, or under a driver that was faster.
 
-    `fates` is keyed by policy. A driver can beat the plan because the search leaves out action
-    sequences that differ after `joint.HORIZON` decisions, and gaps below `joint.MARGIN_M`; then
-    `exact` is False.
+    `fates` is by policy (rule drivers, and the joint plan), of one layout. A driver's summed
+    arrival time can be smaller because the search for plans leaves out sequences of actions that
+    differ after `joint.HORIZON` decisions, and gaps below `joint.MARGIN_M`; then `exact` is False.
     """
     plan = fates[JOINT]
     best = min(fates.values(), key=lambda fate: fate.sum_s)
@@ -135,12 +145,13 @@ def best_of(fates: Mapping[str, Fate]) -> Fate:
 def check(
     scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Drive every policy through the same layouts, and return a dict that compares the policies.
+    """Drive every policy of all agents through the same layouts, and compare how agents fare.
 
-    `policies` has the `summary` of each policy by name. `unsolved` lists the seeds without a joint
-    plan in which all agents arrive; `inexact` lists the seeds whose plan may not be optimal, since
-    its search was cut off or a driver did better. Raises UserError if agents do not decide at the
-    same times.
+    The layouts, start situations, have the seeds from `seed` on. In the dict that is returned,
+    `policies` has the estimates of `summary` by policy; `unsolved` lists the seeds without a plan
+    for all agents by which all arrive, and `inexact` those whose plan may not be optimal, since its
+    search was cut off or a driver did better. `progress` is called with the number of layouts just
+    done. Raises UserError if agents do not decide at the same times.
     """
     if len(offsets(scenario)) > 1:
         raise UserError(
@@ -165,10 +176,11 @@ def check(
 def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[str, Estimate]:
     """Return estimates of a policy's figures over layouts, by name, with 95 % intervals.
 
-    `best` are the fates of the joint plan on the same layouts. `anarchy` is the price of anarchy
-    (Koutsoupias and Papadimitriou 1999) of the mean: the summed arrival times over those of the
-    plan, where all arrive under both, with a bootstrap over layouts. `less_than_joint` is the
-    difference in success. The fields of `Regret` are means over layouts.
+    `fates` says how agents fared under the policy in each layout, and `best` under the joint plan
+    on the same ones. Figures are `success` (share of layouts where all arrive) and the fields of
+    `Fate` and `Regret` of their names. `less_than_joint` is success less the plan's. `anarchy` is
+    the price of anarchy (Koutsoupias and Papadimitriou 1999): the summed arrival times over those
+    of the plan, where all arrive under both, with a bootstrap over layouts.
     """
 
     def column(rows: Sequence[object], name: str) -> Any:

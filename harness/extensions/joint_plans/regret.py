@@ -21,10 +21,10 @@ from harness.world.outcome import ROUNDING_S
 class Regret:
     """Hold what the first decisions of a layout's agents cost; NaN where none could arrive.
 
-    A cost is how much later (s) an agent can arrive at the soonest after its decisions than before,
-    if all others do what they did. `best_decisions` is the share of decisions that cost nothing,
-    `gave_away` the share of agents that by one of theirs lost every way to arrive, and `regret_s`
-    the mean cost of the other agents.
+    Agents are vehicles that decide for themselves. A cost is how much later (s) an agent can arrive
+    at the soonest after its decisions than before, if all others do what they did. `best_decisions`
+    is the share of decisions that cost nothing, `gave_away` the share of agents that by one of
+    theirs lost every way to arrive, and `regret_s` the mean cost of all other agents, s.
     """
 
     best_decisions: float  # share of decisions after which an agent can arrive as soon as before
@@ -34,11 +34,11 @@ class Regret:
 
 
 def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regret:
-    """Return how far the decisions of a layout's agents fell short of each one's best response.
+    """Return what agents' decisions in a layout cost, against each one's best response to others.
 
-    Both arguments are keyed by the agent's index among the vehicles: `able` has all action
-    sequences that it could have taken, `courses` the single one that it took. The others are held
-    to what they did. A decision counts only while its agent can still reach its goal.
+    Both arguments are by the agent's index among the layout's vehicles: `able` has all sequences of
+    actions that it could have taken, `courses` the single one that it took. The others are held to
+    what they did. A decision counts only while its agent can still reach its goal.
     """
     delays, spent_s = list[Floats](), list[float]()
     for agent, options in able.items():
@@ -57,11 +57,11 @@ def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regre
 
 
 def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floats:
-    """Return when an agent can arrive at the soonest, before and after each of k decisions.
+    """Return when an agent can arrive at the soonest, s, before and after each of k decisions.
 
-    The result has shape (k + 1,), in s. Entry i assumes the agent's first i actual decisions; inf
-    means never. `able` are its possible action sequences, `course` the one that it took, and
-    `others` the courses of the other agents, which are held fixed. k is at most `HORIZON`.
+    The result has shape (k + 1,). Entry i assumes the agent's first i actual decisions; inf means
+    never. `able` has its possible sequences of actions, `course` the one that it took, and `others`
+    those that the other agents took, which are held fixed. k is at most `HORIZON`.
     """
     arrives_s = np.where(passes(able, others), able.arrives_s, np.inf)
     course_s = np.where(passes(course, others), course.arrives_s, np.inf)
@@ -77,7 +77,8 @@ def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floa
 def passes(able: Options, others: Sequence[Options]) -> Bools:
     """Return which of an agent's n options touch no other agent before it reaches its goal, (n,).
 
-    Each of `others` holds one option: the course that this other agent took.
+    An option is a sequence of actions. Each of `others` holds one: that which this other agent
+    took.
     """
     frame = np.arange(1, able.poses.shape[1] + 1)
     under_way = frame <= np.minimum(able.arrives_s * able.hz, len(frame))[:, None] + 0.5
