@@ -51,10 +51,11 @@ def count_of(flags: Bools) -> Ints:
 
 
 def read_only(value: T) -> T:
-    """Return an array, or a dataclass or mapping of arrays, as views that cannot be written to.
+    """Return arrays as views that cannot be written to.
 
-    Code of another package that writes to its arguments then raises ValueError, and changes
-    nothing.
+    `value` is an array, or a frozen dataclass or a mapping whose values are arrays; the result is
+    of the same type. Give it to code of another package: code that writes to its arguments then
+    raises ValueError, and changes nothing.
     """
     given: Any = value
     if isinstance(given, np.ndarray):
@@ -108,7 +109,7 @@ def check_distributions(name: str, values: Floats, where: Bools) -> None:
 def check_shares(name: str, values: Floats, where: Bools) -> None:
     """Raise ValueError unless all values where `where` is true are from 0 to 1, or NaN.
 
-    Both arrays have the same shape; `name` names the values in the message.
+    Both arrays have the same shape, of any axes; `name` names the values in the message.
     """
     wrong = values[where & ((values < 0.0) | (values > 1.0 + ROUNDING))]
     if wrong.size:

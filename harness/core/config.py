@@ -55,7 +55,11 @@ Seconds = Annotated[
 
 
 def between(least: float, most: float) -> msgspec.Meta:
-    """Return bounds for an annotated number of a record, with their description for messages."""
+    """Return the bounds `least` to `most`, both allowed, with which to annotate a field.
+
+    It is used as `Annotated[float, between(0, 1)]` in a dataclass that `convert` fills from a file;
+    its description is what messages say is allowed.
+    """
     return msgspec.Meta(ge=least, le=most, description=f"a number from {least:g} to {most:g}")
 
 
@@ -109,7 +113,10 @@ def loads(text: str, where: str) -> dict[str, Any]:
 
 
 def json_loads(text: str, where: str) -> Any:
-    """Parse a JSON text; `where` names it in messages. Raises UserError if it is not JSON."""
+    """Parse a JSON text into dicts, lists, texts, numbers, booleans and None.
+
+    `where` names the text in messages. Raises UserError if it is not JSON.
+    """
     try:
         return msgspec.json.decode(text)
     except (ValueError, RecursionError) as error:
@@ -117,10 +124,17 @@ def json_loads(text: str, where: str) -> Any:
 
 
 def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: Any) -> Record:
-    """Convert a TOML or JSON table to a record of type `kind`; `where` names it in messages.
+    """Convert a table, as read from TOML or JSON, to a typed record, and check its values.
 
-    The fields `given` are set by the program and may not be in the table. Raises UserError for an
-    unknown or missing key, or a value that is not allowed.
+    Args:
+        table: keys and values, nested as in the file.
+        kind: the record's type: a frozen dataclass or a msgspec.Struct, whose annotations say what
+            is allowed.
+        where: names the table in messages, such as `channel file channels/v2x.toml`.
+        given: values of fields that the program sets itself; the table may not have them.
+
+    Raises:
+        UserError: a key is unknown or missing, or a value is not allowed.
     """
     for path, key, known_keys in _unknown_keys(table, kind, (), given):
         raise unknown(f"key in {_place(where, path)}", key, known_keys)
@@ -174,7 +188,10 @@ def check(record: Any) -> None:
 
 
 def settable(record: Any) -> list[str]:
-    """Return the names of a dataclass's fields that hold a single number, boolean or text."""
+    """Return the names of a dataclass's fields that `changed` can set from text.
+
+    These are the fields that hold a single number, boolean or text.
+    """
     values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
 
@@ -355,7 +372,10 @@ def _choices(hint: Any) -> list[str]:
 
 
 def description(hint: Any) -> str | None:
-    """Return the `description` of the first `Meta` in a type annotation; None if it has none."""
+    """Return the `description` of the first `msgspec.Meta` in a type annotation; None if none.
+
+    It says what is allowed in words for messages, such as `seconds, 0 or more`.
+    """
     texts = (
         meta.description
         for meta in getattr(hint, "__metadata__", ())

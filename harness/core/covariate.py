@@ -35,18 +35,18 @@ def corrected(
 ) -> Estimate | None:
     """Return the mean of values (E,), corrected by control variates; None if it cannot be.
 
-    A layout is one drawn start situation of a scenario, which one episode starts from. A control
-    variate is a variable that goes with the values and is known of more layouts than they are. It
-    is None with fewer than `LEAST` values, without further layouts, or if the values or all
-    variables are constant.
+    A layout is one drawn start situation of a scenario, from which one episode starts. A control
+    variate is a variable that correlates with the values and is known of more layouts than they
+    are. None is returned with fewer than `LEAST` values, without further layouts, or if the values
+    or all variables are constant.
 
     Args:
-        plain: the uncorrected mean with its interval.
-        values: of E layouts, a random part of all, from `least` to 1.
-        variables: the K variables of these layouts, (E, K).
-        pool: the variables of all N layouts, these included, (N, K).
-        least: the least that a value can be.
-        level: of confidence, of the plain interval.
+        plain: the uncorrected mean of `values` with its interval.
+        values: one of each of E layouts that are a random part of all, from `least` to 1, (E,).
+        variables: the K control variates of these layouts, in the same order, (E, K).
+        pool: the control variates of all N layouts, these included, (N, K).
+        least: the least that a value can be, such as 0 for a share, -1 for a difference of shares.
+        level: the level of confidence of the interval of `plain`, from 0 to 1.
     """
     from harness.core.special import stdtrit
 
@@ -73,9 +73,9 @@ def corrected(
 def worth(plain: Estimate, better: Estimate) -> float:
     """Return how many times as many layouts the mean `plain` needs to be as precise as `better`.
 
-    Both are estimates of the same mean, over layouts (start situations of episodes). The result is
-    the squared ratio of the widths of their intervals, at the end farther from the bounds of the
-    values; 1 if not known.
+    Both are estimates of the same mean, over layouts (drawn start situations of episodes). The
+    result is the square of how many times as wide the interval of `plain` is: of its lower or its
+    upper half, whichever gives less; 1 if neither is known.
     """
     below = plain.value - plain.low, better.value - better.low
     above = plain.high - plain.value, better.high - better.value

@@ -71,8 +71,8 @@ def _text_of(thing: object) -> str:
 def sayable(what: str, name: str, repair: str = "rename it") -> str:
     """Return `name` unchanged, if terminals and tables can show it as it is.
 
-    Raises UserError if it has control characters, invalid UTF-8 or the separator ` · `. `what` says
-    in the message what is named so, and `repair` what to do.
+    Raises UserError if it has control characters, invalid UTF-8 or the separator ` · `. In the
+    message `what` says what has this name, such as `file of channels`, and `repair` what to do.
     """
     if not name.isprintable():
         raise UserError(
@@ -91,10 +91,16 @@ def one_line(error: Exception) -> str:
 
 
 def unknown(kind: str, name: str, known_names: Iterable[str], hint: str = "") -> UserError:
-    """Build the `UserError` for an unknown name; it suggests the nearest known name.
+    """Build the error for a name that is not among `known_names`; it suggests the nearest of them.
 
-    It lists all known names, or the nearest of more than `MOST_LISTED`, or of more than `FEW` if a
-    command of `LISTS` prints all. `kind` is what was named, and `hint` is appended.
+    Args:
+        kind: what is named, in words for the message, such as `model`.
+        name: the name that is unknown.
+        known_names: all names that are allowed.
+        hint: more words, appended to the message.
+
+    The message lists the known names; if they are many (`MOST_LISTED`, or `FEW` where a command
+    lists them all), only the nearest, and that command.
     """
     names = sorted(known_names)
     nearest = get_close_matches(name, names, n=1)
@@ -115,7 +121,7 @@ def unknown(kind: str, name: str, known_names: Iterable[str], hint: str = "") ->
 
 
 def in_range(option: str, value: float, least: float, most: float) -> None:
-    """Raise UserError unless `least` <= `value` <= `most`; `option` names the value."""
+    """Raise UserError unless `least` <= `value` <= `most`; `option` names it in the message."""
     if not least <= value <= most:
         given = f"{value:g}" if isinstance(value, float) else printable(value, 40)
         raise UserError(f"{option} {given} is out of range; give {least} to {most}")

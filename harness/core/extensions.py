@@ -59,37 +59,46 @@ Texts = Mapping[str, str]
 class Setting:
     """Describe a setting of a run that an extension adds, an option of `harness eval` and `drive`.
 
-    A setting of the kind `tuple` holds texts: its option may be repeated, and its default is ().
-    `help` is a sentence for people. `behind` names settings, each with its table, such as
-    `world.limit`: files and help list this one after the first of them that the world of a run has,
-    and in its table. It is empty for a table of their own. `only` names the world that alone has
-    the option, `frozen` or `closed-loop`; empty for both. `listed` allows to type it several times.
+    `kind` is the type of its values: str, int, float, bool, or tuple for several texts. `default`
+    is the value where none is typed, and `help` a sentence for people. `only` names the kind of run
+    that alone has the option: `frozen` (recorded scenes) or `closed-loop` (driving); empty for
+    both. `listed` is true for a text that may be typed several times and is joined by commas,
+    `models` for names of models.
+
+    Extensions that ship with the harness also say where files and help list the setting. `behind`
+    names other settings, each with its table in the file, such as `world.limit`; this one follows
+    the first of them that a run has. `place` is its own place as `TABLE.KEY`; empty for its name,
+    in the table of the setting that it follows. Both are empty for settings of other packages,
+    which stand in one table of their own.
     """
 
-    kind: type  # str, int, float, bool or tuple, for texts
-    # None, which nobody can type, only with `behind`
+    kind: type  # of its values: str, int, float, bool, or tuple for several texts
+    # the value where none is typed; None, which nobody can type, only with `behind`
     default: str | int | float | bool | tuple[()] | None
     help: str  # a sentence for people
-    # of one that ships: settings of the core, and of extensions, behind the first of which files
-    # and help have it. Empty for the table of all that extensions add
+    # other settings, such as `world.limit`, of which files and help list this one behind the first
+    # that a run has; only of extensions that ship. Empty for the table of all that extensions add
     behind: tuple[str, ...] = ()
     only: str = ""  # the world that alone has its option: `frozen` or `closed-loop`; empty for both
-    # of one behind another: where files have it, as `TABLE.KEY`; empty for its name, in that one's
-    # table
+    # of one behind another: where files have it, as `TABLE.KEY`; empty for its name, in the table
+    # of the setting that it is listed behind
     place: str = ""
     listed: bool = False  # a text that may be typed several times, which are joined by commas
     models: bool = False  # names of models: a file alone opens only those that have a card
 
     @property
     def table(self) -> str:
-        """Return the table of files in which it stands behind another setting; empty for none."""
+        """Return the name of the table that has this setting in a run's TOML file, such as `world`.
+
+        It is empty for a setting that follows no other one (`behind`).
+        """
         beside = self.place or next(iter(self.behind), "")
         return beside.rpartition(".")[0]
 
     def path(self, name: str) -> str:
-        """Return the key of files that have this setting, behind its table: `world.limit`.
+        """Return where a run's TOML file has this setting, as table and key, such as `world.limit`.
 
-        `name` is the setting's.
+        `name` is the setting's name, which is the key unless `place` states another.
         """
         return self.place or f"{self.table}.{name}".lstrip(".")
 
@@ -98,27 +107,33 @@ class Setting:
 class Extension:
     """Describe what a package adds to the harness: commands, studies, settings and plug-ins.
 
-    `name` is that of its entry point, and `interface` the version of this class it was written for.
-    All else are tables by name: `adds` has plug-ins by kind (such as `rules`) and name, `groups`
-    the help of groups of commands, `panels` the panel of each command on the first screen, and
-    `spellings` what replaces older commands; `kinds` has kinds of plug-ins that others may add to
-    this extension. A function or object is given as `module:name`,
-    imported at first use.
+    `name` is the same as that of its entry point of the group `swarmdrive.extensions`, and
+    `interface` the version of this class that it was written for. All else are dicts. A function or
+    object is given as a text `module:name`, which is imported at first use.
+
+    `commands` has the function of each command (what is typed after `harness`), `groups` the help
+    of each group of commands, `panels` the heading under which the command list shows each,
+    `spellings` the new words for a command's older ones, and `short` the whole command for a short
+    one. `studies` has the name in lists of each kind of study (an evaluation of several runs) that
+    it writes. `settings` has options of runs by name. `adds` has plug-ins by kind (such as `rules`)
+    and by name, and `kinds` a description of each kind of plug-in that others may add to this
+    extension.
     """
 
     name: str  # the same as that of its entry point
     interface: int = INTERFACE  # the version of this class that it was written for
-    # What follows are tables by name.
-    # what is typed after `harness`, and the function's place
+    # What follows are dicts. A place is the text `module:name` of a function or object.
+    # words typed after `harness`, and the place of the function that they call
     commands: Texts = field(default_factory=dict)
     # the groups of commands that it opens, and their help
     groups: Texts = field(default_factory=dict)
-    # its words of the first screen, and the panel of each
+    # its words in the list of commands, and the heading that each stands under
     panels: Texts = field(default_factory=dict)
     # older spellings of its commands, and what replaces them
     spellings: Texts = field(default_factory=dict)
-    short: Texts = field(default_factory=dict)  # what is short for one of its commands, for good
-    # kinds of study that it writes, and what lists call them; `<kind>.json` marks such a folder
+    short: Texts = field(default_factory=dict)  # short words, and the command of each
+    # kinds of study (evaluations of several runs) that it writes, and what lists call each;
+    # `<kind>.json` marks such a study's folder
     studies: Texts = field(default_factory=dict)
     # settings of a run by the name of their option, with `_`; a run's `settings.extensions` has
     # their values
@@ -138,9 +153,10 @@ def extensions() -> Mapping[str, Extension]:
 
 
 def owner(command: str) -> str | None:
-    """Return the extension that a command or group of commands belongs to, or None.
+    """Return the name of the extension that a command or group of commands belongs to, or None.
 
-    It is read from package metadata, so it is known even if the extension's folder is missing.
+    `command` is what is typed after `harness`. The answer is read from package metadata, so it is
+    known even if the extension's folder is missing.
     """
     for name, entry in entries(COMMANDS).items():
         if f"{name} ".startswith(f"{command} "):
@@ -164,7 +180,7 @@ class OfExtension(NamedTuple):
     """Name the extension that a setting belongs to, as package metadata states it.
 
     So it is known even if the extension is not installed. `idle` is the setting's value that does
-    nothing, as text; empty for none.
+    nothing, as text, such as `0`; empty if there is none.
     """
 
     extension: str  # the extension's name
@@ -172,19 +188,21 @@ class OfExtension(NamedTuple):
 
 
 def setting_of_extension(name: str) -> OfExtension | None:
-    """Return the extension that adds a setting of conditions (operating points), or None.
+    """Return the extension that adds a setting of conditions, or None if none does.
 
-    `name` is the setting's; it is looked up in package metadata.
+    A condition is a named set of settings (of radio channel, asking and fusion) that a run is
+    scored under; `name` is the setting's name. It is looked up in package metadata, so the
+    extension need not be installed.
     """
     entry = entries(SETTINGS).get(name)
     return _of_entry(entry) if entry else None
 
 
 def beside() -> dict[str, Setting]:
-    """Return the settings of runs that stand among those of the core, by name.
+    """Return the settings, by name, that shipped extensions add among the core's own settings.
 
-    They are those that shipped extensions add; the settings of other packages stand in a table of
-    their own in files (`Setting.behind`).
+    They are listed between those of the core in files and help (`Setting.behind`). The settings of
+    other packages stand in a table of their own, and are not returned.
     """
     declared = entries(GROUP)
     settings: dict[str, Setting] = {}
@@ -195,10 +213,11 @@ def beside() -> dict[str, Setting]:
 
 
 def in_order(names: Iterable[str]) -> list[str]:
-    """Return the names of settings in the order in which files and help list them.
+    """Return the names of settings of runs in the order in which files and help list them.
 
-    `names` are those of the core, with the table before each, such as `world.limit`. Those that
-    extensions add come behind them; what stands behind none of them is left out.
+    `names` are the core's settings as table and key, such as `world.limit`. The result has them
+    with the settings that extensions add (`beside`, by name alone), each after the setting that it
+    follows; one that follows none of `names` is left out.
     """
     core, order, followers = list(names), list[str](), dict[str, list[str]]()
     others = {each.path(name): each for name, each in beside().items()}
@@ -218,29 +237,31 @@ def _followed(name: str, followers: Mapping[str, Sequence[str]]) -> Iterator[str
 
 
 def owner_of_plugin(kind: str, name: str) -> str | None:
-    """Return the extension that adds a plug-in, or None.
+    """Return the name of the extension that adds a plug-in, or None if none does.
 
-    `kind` is the plug-in's kind, such as `contents`, and `name` its name among these. It is read
-    from package metadata, so it is known even if the extension is missing.
+    `kind` is the plug-in's kind, such as `contents` or `rules`, and `name` its name among these. It
+    is read from package metadata, so it is known even if the extension is missing.
     """
     entry = entries(PLUG_INS).get(f"{kind} {name}")
     return _of_entry(entry).extension if entry else None
 
 
 def setting_of_run(name: str) -> OfExtension | None:
-    """Return the extension that adds the setting `name` of runs, and the value that does nothing.
+    """Return the extension that adds a setting of runs, and the value of it that does nothing.
 
-    None if no extension adds it. The name is that of files without its table, or the option's; with
-    the table where both differ. It is read from package metadata.
+    None if no extension adds it. `name` is the setting's: the key that a run's file has without its
+    table, or the option's name; if these two differ, also table and key as `TABLE.KEY`. It is read
+    from package metadata, so the extension need not be installed.
     """
     entry = entries(PLUG_INS).get(f"settings {name}")
     return _of_entry(entry) if entry else None
 
 
 def tables_of_settings() -> set[str]:
-    """Return the names of tables in files of runs whose settings all come from extensions.
+    """Return the names of the tables in runs' TOML files whose keys all come from extensions.
 
-    They are read from package metadata, which name such a setting by its table and key as well.
+    They are read from package metadata, so that a file's table is known even if the extension that
+    it belongs to is not installed.
     """
     places = [key.partition(" ")[2] for key in entries(PLUG_INS) if key.startswith("settings ")]
     return {place.partition(".")[0] for place in places if "." in place}
@@ -249,15 +270,19 @@ def tables_of_settings() -> set[str]:
 def control_settings() -> dict[str, str]:
     """Return the setting that each control of extensions stands for, by the control's name.
 
-    A control is a condition that replaces what helpers say, to show what cooperation gains; its
-    setting is such as `messages=blind`. It is read from package metadata.
+    A control is a set of settings under which a run is scored too, and that replaces what helpers
+    say, to show what cooperation gains; its setting is such as `messages=blind`. It is read from
+    package metadata.
     """
     values = {name: str(entry.value).partition(" ")[2] for name, entry in entries(CONTROLS).items()}
     return {name: setting.strip("[]") for name, setting in values.items()}
 
 
 def part_of(extension: str) -> str:
-    """Return the phrase that something is part of an extension which is not installed."""
+    """Return words for a message: that something is part of this extension, not installed here.
+
+    `extension` is the extension's name.
+    """
     return f"part of the extension {printable(extension)}, which is not installed"
 
 
@@ -275,16 +300,18 @@ def _extension_of(entry: Any) -> str:
 def joined(core: Texts, kind: str) -> Mapping[str, Any]:
     """Return one of the core's tables, such as its commands, extended by what extensions add.
 
-    `kind` is the field of `Extension` that has the additions. A name that the table has already is
-    not replaced; a line on stderr says so, once.
+    `core` is that table, texts by name, and `kind` the field of `Extension` that has the additions,
+    such as `commands`. A name that the table has already is not replaced; a line on stderr says so,
+    once.
     """
     return _joined(tuple(core.items()), kind, tuple(sys.path))
 
 
 def taken(path: str, table: Iterable[str]) -> bool:
-    """Return whether a command path equals, begins or extends one of the paths in `table`.
+    """Return whether a command's words equal, begin or extend one of the commands in `table`.
 
-    Paths are words such as `model list`.
+    Both are words as typed after `harness`, such as `model list`: it begins `model list all`, and
+    extends `model`. Then a command of that name would hide another.
     """
     return any(
         f"{each} ".startswith(f"{path} ") or f"{path} ".startswith(f"{each} ") for each in table
@@ -292,18 +319,19 @@ def taken(path: str, table: Iterable[str]) -> bool:
 
 
 def studies() -> Texts:
-    """Return the kinds of study and the name that lists give each.
+    """Return every kind of study, such as `sweep`, with the name that lists give it.
 
-    Kinds that extensions add are there even where the extension is missing.
+    A study is an evaluation made of several runs, or of one run under several settings. Kinds that
+    extensions add are there even where the extension is missing.
     """
     gone = {kind: kind for kind in entries(STUDIES)}
     return {**gone, **joined(formats.STUDIES, "studies")}
 
 
 def added(group: str) -> Mapping[str, Any]:
-    """Return what extensions add to a plug-in group such as `swarmdrive.rules`, by name.
+    """Return the plug-ins that extensions add to a group such as `swarmdrive.rules`, by name.
 
-    Each is like an entry point, which loads the plug-in.
+    Each is an `Added`, which loads the plug-in as an entry point does.
     """
     if group == GROUP:
         return {}
@@ -316,7 +344,10 @@ def added(group: str) -> Mapping[str, Any]:
 
 
 def shipped(group: str) -> frozenset[str]:
-    """Return the names of the plug-ins of a group that this distribution's own extensions add."""
+    """Return the names of a group's plug-ins that this distribution's own extensions add.
+
+    `group` is such as `swarmdrive.rules`.
+    """
     return _shipped(group, tuple(sys.path))
 
 

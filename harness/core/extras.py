@@ -23,14 +23,18 @@ OPTIONAL = Plugins[tuple[str, str]]("swarmdrive.extras", tuple, {
 
 
 def install(extra: str) -> str:
-    """Return the shell command that installs an optional extra of this distribution."""
+    """Return the shell command that installs an optional extra of this distribution.
+
+    `extra` is its name in the distribution's metadata, such as `inspect`.
+    """
     return f"pip install 'swarmdrive-harness[{extra}]'"
 
 
 def need(what: str, *modules: str) -> None:
-    """Raise UserError if one of the modules, keys of `OPTIONAL`, is not installed.
+    """Raise UserError if one of some optional modules is not installed.
 
-    `what` names the command or option that needs them.
+    `what` names the command or option that needs them, for the message; `modules` are keys of
+    `OPTIONAL`, which has the extra that installs each.
     """
     for module in modules:
         if find_spec(module) is None:
@@ -38,5 +42,8 @@ def need(what: str, *modules: str) -> None:
 
 
 def without(what: str, package: str, extra: str) -> UserError:
-    """Build the error for a command or option (`what`) that needs a missing package."""
+    """Build the error for a command or option (`what`) that needs a missing package.
+
+    `extra` is the name of this distribution's optional extra that installs it.
+    """
     return UserError(f"{what} needs {package}, which is not installed; run `{install(extra)}`")

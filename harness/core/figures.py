@@ -35,7 +35,9 @@ class Counted(Bounded, Protocol):
 class Unit:
     """Describe how a quantity is written: its unit's name, decimals and factor.
 
-    An unknown value is written as a dash, and zero never as -0.
+    A stored value is multiplied by `factor` (such as 100 for a share in %), written with `decimals`
+    digits behind the point, and followed by `name`. An unknown value is written as a dash, and zero
+    never as -0.
     """
 
     name: str = ""  # stands behind the number
@@ -45,7 +47,8 @@ class Unit:
     def number(self, value: float | None, sign: str = "", digits: int | None = None) -> str:
         """Write a value without the unit's name, with at most `digits` significant digits if given.
 
-        `sign` is a format option such as `+`.
+        `value` is as it is stored, before `factor`; None or NaN is a dash. `sign` is a format
+        option such as `+`.
         """
         if value is None or math.isnan(value):
             return DASH
@@ -56,7 +59,7 @@ class Unit:
         return f"{number:{sign}z.{max(places, 0)}f}"
 
     def text(self, value: float | None) -> str:
-        """Write a value with the unit's name."""
+        """Write a stored value with the unit's name, such as `89.0 %`."""
         is_known = value is not None and not math.isnan(value)
         return f"{self.number(value)} {self.name}" if is_known and self.name else self.number(value)
 
@@ -70,8 +73,8 @@ class Unit:
     ) -> str:
         """Write a value and its interval as `89.0 [81.4, 93.7]`; a dash if the value is not known.
 
-        `sign` is a format option such as `+`, and `digits` the greatest number of significant
-        digits.
+        Values are as they are stored, before `factor`. `sign` is a format option such as `+`, and
+        `digits` the greatest number of significant digits.
         """
         number, *ends = (self.number(each, sign, digits) for each in (value, low, high))
         return number if number == DASH else f"{number} [{', '.join(ends)}]"
@@ -86,7 +89,10 @@ PERCENT, POINTS, PLAIN = Unit("%", 1, 100.0), Unit("points", 1, 100.0), Unit()
 
 
 def interval_of(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
-    """Write a value and its interval as `89.0 [81.4, 93.7]`, without the unit's name."""
+    """Write a value and its interval as `89.0 [81.4, 93.7]`, without the unit's name.
+
+    `unit` says how its numbers are written; `sign` is a format option such as `+`.
+    """
     return unit.interval(bounded.value, bounded.low, bounded.high, sign)
 
 
@@ -110,9 +116,9 @@ def some_of(names: Sequence[str], most: int = 3) -> str:
 
 
 def crossed(episodes: int, seeds: int) -> str:
-    """Write the size of a run, whose episodes are played with each channel seed.
+    """Write the size of a run, such as `6 episodes × 1 channel seed`.
 
-    It is such as `6 episodes × 1 channel seed`.
+    Each episode is played with each channel seed, a number that fixes which messages get lost.
     """
     return f"{amount(episodes, 'episode')} × {amount(seeds, 'channel seed')}"
 
@@ -132,6 +138,6 @@ def number_or_none(value: float | None) -> float | None:
 
 
 def as_mapping(estimate: Counted) -> dict[str, float | int | None]:
-    """Return `value`, `low`, `high` and `n` by name; NaN becomes None."""
+    """Return a dict of an estimate's `value`, `low`, `high` and `n`; NaN becomes None."""
     ends = {end: number_or_none(getattr(estimate, end)) for end in ("value", "low", "high")}
     return {**ends, "n": estimate.n}

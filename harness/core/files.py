@@ -77,10 +77,11 @@ MOST_TIMES = 200
 
 
 def opened(path: str | Path, kind: Kind) -> BufferedReader:
-    """Open a file for reading in binary mode; `kind`, a key of `LARGEST`, says how large it may be.
+    """Open a file for reading in binary mode, and refuse one that is too large for its kind.
 
-    It is checked after it is opened, so that nothing can replace it in between. Raises OSError, and
-    Refused if it is not a regular file or is larger than `LARGEST` of its kind.
+    `kind` is a key of `LARGEST`, such as `text`, whose value is the most bytes allowed. The file is
+    checked after it is opened, so that nothing can replace it in between. Raises OSError, and
+    Refused if it is not a regular file or too large.
     """
     file = open(path, "rb", opener=_at_once)  # noqa: SIM115
     try:
@@ -107,9 +108,10 @@ def _size(size: int) -> str:
 
 
 def bytes_of(path: str | Path, kind: Kind) -> bytes:
-    """Read a whole file, in the size that it had when it was opened.
+    """Read a whole file; bytes that are appended after it was opened are not read.
 
-    Raises what `opened` raises.
+    `kind`, a key of `LARGEST`, says how large it may be. Raises OSError, and Refused if it is not a
+    regular file or too large.
     """
     with opened(path, kind) as file:
         return file.read(os.fstat(file.fileno()).st_size)
@@ -118,13 +120,17 @@ def bytes_of(path: str | Path, kind: Kind) -> bytes:
 def text_of(path: str | Path, kind: Kind = "text") -> str:
     """Read a UTF-8 text file, without the byte order mark that some editors put first.
 
-    Raises what `opened` raises, and UnicodeDecodeError.
+    `kind`, a key of `LARGEST`, says how large it may be. Raises OSError, Refused if it is not a
+    regular file or too large, and UnicodeDecodeError.
     """
     return bytes_of(path, kind).decode("utf-8-sig")
 
 
 def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Decorate a function that reads a file: its result is kept until the file is modified."""
+    """Decorate a function that reads a file: it reads each file once, until the file is modified.
+
+    What `read` returned for a path is returned again; 64 of them are kept.
+    """
 
     @lru_cache(maxsize=64)
     def kept(path: Path, written_ns: int) -> T:
@@ -158,7 +164,8 @@ def neutral(cell: T) -> T | str:
 def refuse_bomb(archive: "ZipFile", packed: int, most: float = math.inf) -> None:
     """Raise BadZipFile if a ZIP archive states that it unpacks to too much; nothing is unpacked.
 
-    The limit is the lesser of `most` bytes and `MOST_TIMES` its size `packed` (bytes) plus 1 MB.
+    It is called before unpacking what somebody else may have made. The limit is the lesser of
+    `most` bytes and `MOST_TIMES` its size `packed` (bytes) plus 1 MB.
     """
     from zipfile import BadZipFile  # imported here, since few commands need it
 
@@ -173,7 +180,11 @@ def sha256_bytes(data: bytes) -> str:
 
 
 def sha256_file(path: Path, kind: Kind = "weights") -> str:
-    """Return the hex SHA-256 digest of a file's content. Raises what `opened` raises."""
+    """Return the hex SHA-256 digest of a file's content.
+
+    `kind`, a key of `LARGEST`, says how large it may be. Raises OSError, and Refused if it is not a
+    regular file or too large.
+    """
     with opened(path, kind) as f:
         return hashlib.file_digest(f, "sha256").hexdigest()
 
@@ -185,9 +196,9 @@ def digest(value: Any) -> str:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Enter a context in which errors of the disk name the file `path`.
+    """Enter a context in which an OSError of a full or failing disk names the file `path`.
 
-    An OSError that the disk is full, or fails, comes without it.
+    Python raises such an error of a write without a name.
     """
     try:
         yield
@@ -199,9 +210,10 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[BinaryIO]:
-    """Open a file to append bytes, created if it is missing; an OSError names the file.
+    """Enter a context that yields a file open to append bytes, created if it is missing.
 
-    Raises OSError for a link, a pipe or a device, which a stranger's folder may have in its place.
+    An OSError names the file; it is also raised for a link, a pipe or a device, which somebody
+    else's folder may have in its place.
     """
     with naming(path), open(path, "ab", opener=_in_place) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -228,10 +240,10 @@ def folder_in(run: Path, name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary file to write; it replaces `path` on success and is deleted on an error.
+    """Enter a context that yields a temporary file to write, which then replaces `path`.
 
-    Temporary files of killed processes are deleted as well. Raises OSError if `path` cannot be
-    written, but never FileNotFoundError.
+    On an error it is deleted, and `path` stays as it was. Temporary files of killed processes are
+    deleted as well. Raises OSError if `path` cannot be written, but never FileNotFoundError.
     """
     sayable("file", path.name, "give another name")
     if path.is_dir():  # fail now, and not only after all is written
@@ -258,16 +270,20 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def refuse_taken(option: str, folder: Path) -> None:
-    """Raise UserError if anything exists at `folder`, which an option names as a new folder."""
+    """Raise UserError if anything exists at `folder`, where a command is to make a new folder.
+
+    `option` names the option that gave it, such as `--out`.
+    """
     if os.path.lexists(folder):
         raise UserError(f"{option} {printable(folder)} is there already; give a new folder")
 
 
 @contextmanager
 def making(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder to fill; it becomes `folder` on success and is deleted on an error.
+    """Enter a context that yields a temporary folder to fill, which then becomes `folder`.
 
-    Temporary folders of killed processes are deleted as well. Raises OSError if it cannot be made.
+    On an error it is deleted. Temporary folders of killed processes are deleted as well. Raises
+    OSError if it cannot be made.
     """
     sayable("folder", folder.name, "give another name")
     whole = folder.absolute()
@@ -300,7 +316,7 @@ def write_whole(path: Path, data: str | bytes) -> None:
 
 @contextmanager
 def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
-    """Hold an exclusive lock on a folder or file; a missing file is created.
+    """Enter a context that holds an exclusive lock on a folder or file; a missing file is created.
 
     The lock of a killed process is released. On systems without such locks (Windows) nothing is
     locked. Raises BlockingIOError if another process still holds it after `patience_s` seconds, and

@@ -24,9 +24,10 @@ STUDIES = {"sweep": "sweep"}
 
 
 def refuse_data(option: str, out: Path) -> None:
-    """Raise UserError if a file that an option names is data of a run, a suite or a dataset.
+    """Raise UserError if writing to the file `out` would destroy data of a run or a dataset.
 
-    A page or an export that is written over it would lose the run.
+    That is so if the file exists and is one that a run, a suite of runs or a dataset consists of,
+    such as `run.json`. `option` names the option that gave it.
     """
     is_source = SOURCES in out.absolute().parts[-5:]
     if (out.name in DATA or is_source) and os.path.lexists(out):

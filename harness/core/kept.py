@@ -14,7 +14,10 @@ _PACKAGE = Path(__file__).parent.parent
 
 
 def folder() -> Path:
-    """Return the cache folder: `$SWARMDRIVE_CACHE`, or the harness's folder in the user's cache."""
+    """Return the cache folder, where things that can be computed again are kept.
+
+    It is `$SWARMDRIVE_CACHE`, or else the harness's own folder in the user's cache folder.
+    """
     if moved := os.environ.get("SWARMDRIVE_CACHE"):
         return Path(moved)
     caches = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
@@ -37,9 +40,9 @@ def keep(name: str, data: bytes) -> None:
 
 @cache
 def code_sha256(*patterns: str) -> str:
-    """Return a digest of the package's source files that match glob patterns, and of its version.
+    """Return a digest of the source files of `harness` that match glob patterns, and its version.
 
-    For cache keys that must change with the code.
+    It is part of cache keys that must change with the code. Patterns are such as `world/**/*.py`.
     """
     files = sorted(file for pattern in patterns for file in _PACKAGE.glob(pattern))
     return digest([__version__, *(sha256_file(file) for file in files)])

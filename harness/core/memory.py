@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Suspend the garbage collector, for code that creates many objects without cycles.
+    """Enter a context without the garbage collector, for code that creates many objects.
 
-    The collector would walk all objects whenever memory has grown by a quarter, which took up to
-    half of the time of code that reads JSON or rows.
+    They must have no cycles. The collector would walk all objects whenever memory has grown by a
+    quarter, which took up to half of the time of code that reads JSON or rows.
     """
     was_on = gc.isenabled()
     gc.disable()

@@ -58,11 +58,12 @@ def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
 
 
 def holm(p_values: Sequence[float], comparisons: int | None = None) -> list[float]:
-    """Correct p-values for multiple comparisons by Holm's step-down method (1979), in order.
+    """Correct p-values for multiple comparisons by Holm's step-down method (1979).
 
-    Differences whose corrected p is at most `LEVEL` include a false alarm with a probability of at
-    most 5 %, however they depend on each other. `comparisons` is the number from which these were
-    picked, if larger.
+    Returns the corrected p-values in the order given. Differences whose corrected p is at most
+    `LEVEL` include a false alarm with a probability of at most 5 %, however they depend on each
+    other. `comparisons` is the number of comparisons from which these were picked, if larger than
+    their own number.
     """
     order = np.argsort(p_values, kind="stable")
     steps = np.array(p_values)[order] * ((comparisons or len(p_values)) - np.arange(len(p_values)))

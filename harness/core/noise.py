@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 def generator(*key: object) -> np.random.Generator:
     """Return the random generator of a key; equal keys give equal draws on every machine.
 
-    Parts of the key are joined by their `repr`, so `1` and `"1"` differ.
+    `key` has any values with a stable `repr`, such as a purpose and seeds. They are joined by their
+    `repr`, so `1` and `"1"` differ.
     """
     seed = hashlib.sha256("\x1f".join(map(repr, key)).encode()).digest()[:16]
     # The words of the digest as a whole number, which NumPy would take apart at thrice the cost.
@@ -22,5 +23,5 @@ def generator(*key: object) -> np.random.Generator:
 
 
 def uniforms(shape: tuple[int, ...], *key: object) -> NDArray[np.float64]:
-    """Return uniform draws in [0, 1) of this shape, always the same for a key."""
+    """Return uniform draws in [0, 1) of this shape, always the same for a key (see `generator`)."""
     return generator(*key).random(shape)

@@ -30,12 +30,12 @@ _RAY = re.compile(r"ray(?::(//)?([\w.\[\]:-]+:\d+))?", re.ASCII)
 
 @dataclass(frozen=True)
 class Ray:
-    """Name a Ray cluster by its address.
+    """Name a Ray cluster by its address, such as `ray://HOST:10001`, to run items on its nodes.
 
     None means the cluster of `RAY_ADDRESS`, or else a new one on this machine.
     """
 
-    address: str | None = None
+    address: str | None = None  # such as `ray://HOST:10001`; None: see above
 
 
 Flags = MutableSequence[int]  # 0 or 1 for each worker
@@ -45,7 +45,8 @@ Workers = int | Ray  # a number of processes, or a cluster
 def workers_of(text: str) -> Workers:
     """Parse the value of `--workers`: a number of processes, or a Ray cluster.
 
-    Raises UserError if it is neither.
+    It is `ray` for a cluster, with `://HOST:10001` or `:HOST:6379` behind for one elsewhere. Raises
+    UserError if it is neither.
     """
     if text.isascii() and text.isdigit() and len(text) < 9 and 1 <= int(text) <= MOST_WORKERS:
         return int(text)
@@ -58,7 +59,10 @@ def workers_of(text: str) -> Workers:
 
 
 class Executor(Protocol):
-    """Run items on workers; each submitted item comes back once, as result or `WorkerDied`."""
+    """Run items on workers (processes, or nodes of a cluster), in any order.
+
+    Each item that is given comes back once, as its result or `WorkerDied`.
+    """
 
     def room(self) -> bool:
         """Return whether another item can be submitted."""
@@ -100,7 +104,7 @@ def each(
     Args:
         work: the function; it and the items can be pickled.
         items: its arguments.
-        workers: 1 means this process.
+        workers: number of processes, 1 for this one, or a Ray cluster.
         on_result: called with an item's index and its result as soon as the result arrives.
         label: gives an item's name in messages.
         repeatable: whether the same item must give the same result on another node;
@@ -144,7 +148,10 @@ def each(
 
 
 def done(work: Callable[[Item], Result], item: Item) -> Result:
-    """Return `work(item)`, kept from ending the program or changing its working folder."""
+    """Return `work(item)`, with two things refused that the code of a package may do there.
+
+    It may neither end the program (that raises UserError) nor leave it in another working folder.
+    """
     with strangers():
         return work(item)
 
@@ -157,9 +164,18 @@ def spread(
     label: Callable[[Item], str] = str,
     repeatable: bool = True,
 ) -> list[Result]:
-    """Return `[work(i) for i in items]`, computed by workers (see `each`).
+    """Return `[work(i) for i in items]`, computed by workers.
 
-    `progress(1)` is called after every item.
+    Args:
+        work: the function; it and the items can be pickled.
+        items: its arguments.
+        workers: number of processes, 1 for this one, or a Ray cluster.
+        progress: called as `progress(1)` after every item.
+        label: gives an item's name in messages.
+        repeatable: whether the same item must give the same result on another node.
+
+    Raises:
+        Unfinished: the workers of some items died; all other items are done.
     """
     results: dict[int, Result] = {}
 
@@ -238,9 +254,10 @@ _shared: tuple[Flags, int] | None = None  # of a worker: which workers have work
 
 
 def share(total: int) -> int:
-    """Return this worker's share of `total` (such as threads), at least 1.
+    """Return this worker's share of `total`, such as of threads for a model, at least 1.
 
-    All workers that still have work divide it; outside a worker, and on a cluster, it is all.
+    All workers of this machine that still have work divide it; outside a worker, and on a cluster,
+    it is all.
     """
     if _shared is None:
         return total

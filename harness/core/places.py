@@ -20,10 +20,11 @@ COMMAND = "command"  # key of a value that is a command line
 
 
 def nameless(value: Any, key: str = "") -> Any:
-    """Return a JSON value with file names in place of absolute paths, for others to read.
+    """Return a JSON value with file names in place of absolute paths, to be given to others.
 
     URLs lose user, password and query. A path with spaces is found only if it is a whole text, or a
-    word of a command line; `key` is the key of `value`, as of a command.
+    word of a command line. `key` is the key under which a dict has `value`: `command` says that it
+    is a command line; empty for a value outside of dicts.
     """
     if isinstance(value, str):
         return _command(value) if key == COMMAND else text(value)
@@ -35,7 +36,7 @@ def nameless(value: Any, key: str = "") -> Any:
 
 
 def text(value: str) -> str:
-    """Return a text with file names in place of absolute paths; see `nameless`."""
+    """Return a text with file names in place of absolute paths; URLs lose user and password."""
     if _WHOLE.fullmatch(value) and not _ADDRESS.match(value):
         return name(value)
     return _PATH.sub(lambda match: address(match[0]) if match["address"] else name(match[0]), value)

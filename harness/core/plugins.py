@@ -22,9 +22,10 @@ LOADING_S = 3.0  # after which a line says which package a command waits for
 
 
 def entries(group: str) -> Mapping[str, Any]:
-    """Return the packages' entry points of a group, such as `swarmdrive.rules`, by name.
+    """Return all installed packages' entry points of a group, such as `swarmdrive.rules`, by name.
 
-    Of two with one name, this distribution's or else the first is taken, and stderr says so.
+    Each is an `importlib.metadata.EntryPoint`. If two have one name, this distribution's is taken,
+    or else the first, and a line on stderr says so.
     """
     return _entries(group, tuple(sys.path))
 
@@ -92,10 +93,10 @@ def _of_groups(distribution: Any) -> set[tuple[str, str]]:
 
 
 def is_ours(entry: Any) -> bool:
-    """Return whether an entry point is of this distribution, whose names nobody else's replace.
+    """Return whether an entry point belongs to this distribution, and not to another package.
 
-    `entry` is an `importlib.metadata.EntryPoint`, or `Added`. A package's may name an object of the
-    harness's: who has the entry point decides.
+    `entry` is an `importlib.metadata.EntryPoint`, or `Added`. What it points to does not decide: an
+    entry point of another package that names an object of the harness is not ours.
     """
     return str(entry.value).startswith("harness.") and _name_of(entry.dist) == OURS
 
@@ -137,9 +138,9 @@ def say_once(line: str) -> None:
 
 
 def texts(answer: Any, what: str = "its answer") -> list[str]:
-    """Return texts that a package gave as plain `str`, without its subclasses' code.
+    """Return texts that another package gave, as plain `str` without the code of a subclass.
 
-    Raises TypeError, which begins with `what`, for anything but a list of texts.
+    Raises TypeError, which begins with `what`, if `answer` is anything but an iterable of texts.
     """
     each = () if isinstance(answer, str) else tuple(answer)
     if isinstance(answer, str) or not all(isinstance(text, str) for text in each):
@@ -148,9 +149,10 @@ def texts(answer: Any, what: str = "its answer") -> list[str]:
 
 
 def line_or_none(answer: Any, what: str) -> str | None:
-    """Return a package's text as a plain one of one line, 300 characters at most; None as it is.
+    """Return a text that another package gave, as a plain `str` of one line; None if it gave None.
 
-    Raises ValueError, which names `what` it is, for what is no text, or an empty one.
+    It is cut to 300 characters. `what` names the text in messages. Raises ValueError if `answer` is
+    neither None nor a text, or an empty one.
     """
     if answer is None:
         return None
@@ -160,42 +162,51 @@ def line_or_none(answer: Any, what: str) -> str | None:
 
 
 class Failed(UserError):
-    """Report, in place of what a plug-in should have said, whose plug-in failed and why."""
+    """Report which plug-in of a package failed, and why, where a list shows one line for each.
+
+    The message begins with the plug-in's name.
+    """
 
 
 def of_type(kind: type) -> Allowed:
-    """Return a rule for an attribute of a plug-in: that its value is of one type.
+    """Return a rule that the value of a plug-in's attribute is of one type.
 
-    Rules are given in `Plugins.stated`.
+    A rule is a pair: a test of a value, and words for what it allows. Rules are given in
+    `Plugins.stated`.
     """
     return lambda value: isinstance(value, kind), kind.__name__
 
 
 def one_of(*values: object) -> Allowed:
-    """Return a rule for an attribute of a plug-in: that its value is one of these.
+    """Return a rule that the value of a plug-in's attribute is one of these.
 
-    Rules are given in `Plugins.stated`.
+    A rule is a pair: a test of a value, and words for what it allows. Rules are given in
+    `Plugins.stated`.
     """
     return values.__contains__, ", ".join(map(str, values))
 
 
 def tuple_of(each: Allowed) -> Allowed:
-    """Return a rule for an attribute of a plug-in: that it is a tuple of what `each` allows.
+    """Return a rule that a plug-in's attribute is a tuple of which each item fits the rule `each`.
 
-    Rules are given in `Plugins.stated`.
+    A rule is a pair: a test of a value, and words for what it allows. Rules are given in
+    `Plugins.stated`.
     """
     fits, words = each
     return lambda value: isinstance(value, tuple) and all(map(fits, value)), f"a tuple of {words}"
 
 
 class Plugins(Mapping[str, T], Generic[T]):
-    """Hold the plug-ins of one group by name: built-in ones, and those of entry points.
+    """Hold the plug-ins of one group by name: built-in ones, and those that packages add.
 
-    A package's plug-in is loaded and checked when it is looked up: it must be an instance of `kind`
-    (a class or a runtime-checkable protocol), and its attributes must follow the rules `stated` (a
-    test and its words, by attribute). Built-in plug-ins cannot be replaced.
+    Packages add them by entry points of the group, such as `swarmdrive.rules`. A package's plug-in
+    is loaded and checked when it is looked up: it must be an instance of `kind` (a class or a
+    runtime-checkable protocol), and each of its attributes that `stated` names must fit the rule
+    there (a test of its value, and words for what is allowed). Built-in plug-ins cannot be
+    replaced.
     """
 
+    # by attribute: a test of its value, and words for what is allowed
     stated: ClassVar[Mapping[str, Allowed]] = {}
 
     def __init__(self, group: str, kind: Any, built_in: Mapping[str, T]) -> None:
@@ -215,7 +226,10 @@ class Plugins(Mapping[str, T], Generic[T]):
         return name in self.built_in or name in shipped(self.group)
 
     def of_package(self, name: str) -> str:
-        """Return what messages call a package's plug-in, whose package they name."""
+        """Return words for a plug-in in messages, with the package that adds it.
+
+        `name` is the plug-in's, which must be one that an entry point or an extension adds.
+        """
         package = package_of(self._entries()[name])
         return f"plug-in {printable(name)!r} ({self.group}) of package {package}"
 
@@ -228,8 +242,9 @@ class Plugins(Mapping[str, T], Generic[T]):
     def ask(self, name: str, question: Callable[[T], Said]) -> Said:
         """Return what `question` returns for a plug-in, such as its description for people.
 
-        The plug-in is that called `name`. Raises Failed if it does not load or its code fails, and
-        UserError if it raises that.
+        `name` is the plug-in's; `question` is called with the plug-in, and may run a package's
+        code. Raises Failed if the plug-in does not load or its code fails; a UserError that its
+        code raises passes.
         """
         try:
             plugin = self[name]
@@ -286,26 +301,33 @@ class Plugins(Mapping[str, T], Generic[T]):
         return plugin
 
     def check(self, name: str, plugin: T) -> None:
-        """Raise any error if a package's plug-in is inconsistent; for subclasses to override."""
+        """Check a package's plug-in when it is loaded; any error that this raises refuses it.
+
+        The base class accepts all; subclasses override it.
+        """
 
 
 class Shipped(Plugins[T]):
-    """Hold plug-ins that the core and the shipped extensions have; other packages add none."""
+    """Hold plug-ins that only the core and the shipped extensions add; other packages add none."""
 
     def _entries(self) -> Mapping[str, Any]:
         return {name: entry for name, entry in super()._entries().items() if is_ours(entry)}
 
 
 class ChosenBySettings(Protocol):
-    """Describe a plug-in that a run's settings of its extension choose."""
+    """Describe a plug-in that a run uses if it has certain settings of an extension."""
 
     @property
     def chosen_by(self) -> tuple[str, ...]:
-        """Return the names of these settings."""
+        """Return the names of the settings of runs that choose this plug-in."""
         ...
 
     def opened(self, settings: Mapping[str, Any], /) -> Any:
-        """Return the plug-in as these settings, by name, open it; None if they choose none."""
+        """Return the object that does the plug-in's work under a run's settings; None for none.
+
+        `settings` has the run's settings of extensions, values by name. None means that they do not
+        choose this plug-in.
+        """
         ...
 
 
@@ -313,21 +335,24 @@ Chosen = TypeVar("Chosen", bound=ChosenBySettings)
 
 
 class ShippedChoices(Shipped[Chosen]):
-    """Plug-ins that ship, one of which a run's settings of extensions may choose."""
+    """Hold plug-ins that ship, of which a run uses the one that its settings choose, or none."""
 
     def chosen(self, settings: Mapping[str, Any]) -> Chosen | None:
-        """Return the plug-in that settings, values by name, choose, opened; None for none."""
+        """Return what the plug-in that a run's settings choose opens; None if they choose none.
+
+        `settings` has the run's settings of extensions, values by name.
+        """
         for each in self.values():
             if opened := each.opened(settings):
                 return cast(Chosen, opened)
         return None
 
     def settings(self) -> set[str]:
-        """Return the names of the settings that choose."""
+        """Return the names of all settings of runs that choose one of these plug-ins."""
         return {name for each in self.values() for name in each.chosen_by}
 
     def without(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return settings, values by name, without those that choose."""
+        """Return a run's settings of extensions, by name, without those that choose a plug-in."""
         choosing = self.settings()
         return {name: value for name, value in settings.items() if name not in choosing}
 
@@ -335,8 +360,8 @@ class ShippedChoices(Shipped[Chosen]):
 class FilesAndPlugins(Plugins[T]):
     """Hold plug-ins that may also be TOML files, shipped or in the user's project.
 
-    Built-in ones come first, then files, then packages. `folder` is the name of the folder of these
-    files, such as `channels`.
+    A name is looked for among the built-in ones first, then the files, then packages. `folder` is
+    the name of the folder of these files, such as `channels`.
     """
 
     folder: str  # kind of resource that the files are, such as `channels`

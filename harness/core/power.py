@@ -22,19 +22,21 @@ HALVINGS = 60  # of a bracket: to the rounding of a number
 class Spread:
     """Hold how much a paired difference of success varies between episodes, in each of H strata.
 
-    Strata are groups of episodes that are averaged apart, such as those with a danger. `shares`,
-    (H,), are the shares of all episodes in each, and `variances`, (..., H), those of an episode's
-    difference there. The mean over strata is unweighted, as in `statistics.paired_difference`.
+    Strata are groups of episodes that are averaged apart, such as those with a danger (a vehicle in
+    the ego's way) and those without. `shares`, (H,), has the share of all episodes that is in each,
+    and `variances`, (..., H), the variance of one episode's difference of success there. The mean
+    over strata is unweighted, as in `statistics.paired_difference`.
     """
 
     shares: Floats  # share of all episodes that is in each stratum, (H,); they sum to 1
     variances: Floats  # variance of an episode's difference in each stratum, (..., H)
 
     def episodes(self, difference: float, power: float) -> Floats:
-        """Return how many episodes find a difference of success with this power, (...).
+        """Return how many episodes are needed to find a difference of success, (...).
 
-        `difference` is one of shares, and `power` the probability that it is found: that the 95 %
-        interval excludes 0. Whole numbers; inf above `MOST`.
+        `difference` is one of shares of success, from 0 to 1, and `power` the probability with
+        which it shall be found: that its 95 % interval excludes 0. The result has whole numbers;
+        inf above `MOST`.
         """
         low, high = np.ones(self._shape), np.full(self._shape, MOST)
         for _ in range(HALVINGS):  # of the ratio, since the bracket spans nine orders of magnitude
@@ -46,8 +48,8 @@ class Spread:
     def difference(self, n: float, power: float) -> Floats:
         """Return the least difference of success that n episodes find with this power, (...).
 
-        It is one of shares; `power` is the probability that it is found: that the 95 % interval
-        excludes 0. NaN if they find none up to 1.
+        It is a difference of shares, from 0 to 1; `power` is the probability that it is found: that
+        its 95 % interval excludes 0. NaN if they find none up to 1.
         """
         low, high = np.zeros(self._shape), np.ones(self._shape)
         for _ in range(HALVINGS):

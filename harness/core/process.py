@@ -29,7 +29,10 @@ STREAMS = {"stdin": "r", "stdout": "w", "stderr": "w"}  # in the order of their 
 
 
 class Stop(KeyboardInterrupt):
-    """Report that SIGTERM or SIGINT came, wherever the program is; it holds the signal's number."""
+    """Report that SIGTERM or SIGINT came, wherever the program is; it holds the signal's number.
+
+    It is raised in the main thread as a KeyboardInterrupt is.
+    """
 
     @property
     def word(self) -> str:
@@ -196,7 +199,7 @@ def _open_streams() -> None:
 
 @contextmanager
 def streams_kept(what: str) -> Iterator[None]:
-    """Run code that may close or replace stdout and stderr; both are restored afterwards.
+    """Enter a context for code that may close or replace stdout and stderr; both are restored.
 
     A line on stderr then says that `what`, the name of the code, did so.
     """

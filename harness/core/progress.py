@@ -11,7 +11,7 @@ class Progress:
         """Add to what is done."""
 
     def more(self, count: int) -> None:
-        """Add to the count of what there is to do."""
+        """Add `count` to the number of things that there are to do."""
 
     def say(self, text: str) -> None:
         """Show a line of text."""

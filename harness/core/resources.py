@@ -23,32 +23,36 @@ _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def root() -> Path:
-    """Return the folder of the shipped resources, such as `prompts/` and `datasets/`."""
+    """Return the folder of the files that ship: `prompts/`, `datasets/` and others lie in it."""
     checkout = _PACKAGE.parent
     return checkout if (checkout / "pyproject.toml").is_file() else _PACKAGE / "_data"
 
 
 def folder(kind: str) -> Path:
-    """Return the folder of one kind of shipped resource, such as `prompts` or `channels`."""
+    """Return the folder of shipped files of one kind, such as `prompts` or `channels`."""
     return root() / kind
 
 
 def entries(kind: str, pattern: str) -> list[Path]:
     """List the paths of one kind of resource that match a glob pattern, sorted.
 
-    A kind is a folder's name, such as `prompts` or `channels`; it is searched where the harness
-    ships it and in the user's project.
+    A resource is a file that the harness reads by name, such as a prompt version or a model card; a
+    kind is the name of its folder, such as `prompts` or `channels`. It is searched where the
+    harness ships it and in the user's project.
     """
     return sorted(path for where in _folders(kind) for path in where.glob(pattern))
 
 
 def names(kind: str) -> list[str]:
-    """Return the sorted names (file stems) of the TOML files of one kind, such as `channels`."""
+    """Return the sorted names (file stems) of the TOML files of one kind, such as `channels`.
+
+    They are those that ship and those of the user's project.
+    """
     return sorted({path.stem for path in entries(kind, "*.toml")})
 
 
 def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserError]:
-    """Load every name with `load`; return, by name, what it gave or the UserError it raised."""
+    """Load every name with `load`; return, by name, what it returned or the UserError it raised."""
     loaded: dict[str, T | UserError] = {}
     for name in names:
         try:
@@ -59,10 +63,11 @@ def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserEr
 
 
 def find(kind: str, name: str) -> Path:
-    """Return the path of a resource by kind and name, such as `prompts` and `v4`.
+    """Return the path of the file or folder of one kind with this name, such as `prompts`, `v4`.
 
-    The project and the shipped folder are searched; if it does not exist, it is its path among the
-    shipped ones. Raises UserError if both have it, or the name cannot be shown.
+    It is looked for in the user's project and among what ships. If neither has it, the path where
+    it would ship is returned, which does not exist. Raises UserError if both have it, or the name
+    has characters that terminals cannot show.
     """
     # one, if `name` is absolute
     candidates = list(dict.fromkeys(where / name for where in _folders(kind)))
@@ -78,9 +83,10 @@ def find(kind: str, name: str) -> Path:
 
 
 def card_to_copy(model: str) -> str | None:
-    """Return the advice for a model whose card no longer ships: where it is, where to copy it.
+    """Return a sentence on a model whose model card no longer ships: where to copy the card from.
 
-    None for all other names.
+    A model card is a TOML file that describes a model. `model` is what was typed, a name with
+    options behind `:`. None for all other names.
     """
     page = root() / "docs" / "model-cards.md"
     name, _, _ = model.partition(":")

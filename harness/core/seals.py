@@ -29,10 +29,11 @@ KEY, KEY_BYTES = "seal.key", 32
 
 
 def seal(content: Mapping[str, bytes], place: str) -> str | None:
-    """Return the seal of files, a digest that only this user's key makes; None if there is no key.
+    """Return the seal of files: a digest that only this user's key on this machine makes.
 
-    `content` has the files' bytes by name; `place` names what they belong to, such as their folder:
-    for another name the seal is another. There is no key where the cache folder cannot be written.
+    A seal shows later that the files are as this user's program wrote them. `content` has the
+    files' bytes by name; `place` is a text that names what they belong to, and is sealed with them.
+    None if there is no key, which is where the cache folder cannot be written.
     """
     key = _key()
     if key is None:
@@ -42,18 +43,21 @@ def seal(content: Mapping[str, bytes], place: str) -> str | None:
 
 
 def write_seal(part: Path, content: Mapping[str, bytes]) -> None:
-    """Write the seal of a part of unfinished work beside where the part will lie.
+    """Write a seal file for a part of unfinished work, before the part itself is written.
 
-    A part is a file or a folder of files in a working folder, `content` its files by name. Nothing
-    is written where there is no key.
+    A part is the path of a file or of a folder of files in a working folder, and `content` has its
+    files' bytes by name. A seal (see `seal`) shows, when the work goes on, that the part is as this
+    user's program wrote it. Nothing is written where there is no key.
     """
     if sealed := seal(content, _place(part)):
         write_whole(_seal_file(part), sealed)
 
 
 def is_sealed(part: Path) -> bool:
-    """Return whether a part is as `write_seal` sealed it, for this user on this machine, and for
-    the work whose record lies beside it.
+    """Return whether a part of unfinished work is as this user's program wrote it on this machine.
+
+    `part` is the path of a file or folder in a working folder. Its seal must have been made by
+    `write_seal`, of the same content, for the work whose `config.json` lies beside it.
     """
     try:
         file_seal = text_of(_seal_file(part), "record")
@@ -65,9 +69,10 @@ def is_sealed(part: Path) -> bool:
 
 
 def say_unsealed(out: Path, count: int, what: str, therefore: str) -> None:
-    """Say on stderr that so many parts of an output folder bear no seal, and what comes of it.
+    """Say on stderr that `count` parts of an output folder bear no seal, and what comes of it.
 
-    `what` names one of them, such as `finished part`.
+    They were not written by this user's program on this machine. `what` names one of them, such as
+    `finished part`; `therefore` says what the command does with them.
     """
     where = f"{printable(out)} has {amount(count, what)} that nobody finished here with your key"
     lacks = "" if _key() else f" ({printable(kept.folder() / KEY)} cannot be written)"

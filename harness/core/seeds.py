@@ -18,9 +18,11 @@ LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 
 
 def purpose(first: int, count: int) -> Purpose:
-    """Return what the layout seeds `first` to `first + count - 1` are for.
+    """Return the purpose (`tune`, `train` or `report`) of a range of `count` layout seeds.
 
-    It is `tune`, `train` or `report`. Raises UserError if they are for several.
+    A layout seed is a number that fixes a drawn start situation of a scenario; each range of them
+    has one purpose, so that no situation is tuned or trained on and then reported. `first` is the
+    first seed. Raises UserError if the range has several purposes.
     """
     present = purposes(first, count)
     if len(present) > 1:
@@ -35,12 +37,18 @@ def purpose(first: int, count: int) -> Purpose:
 
 
 def seeds_text(first: int, count: int) -> str:
-    """Write a range of layout seeds with its purpose: `layout seeds 0 to 239 (tune)`."""
+    """Write a range of layout seeds with its purpose: `layout seeds 0 to 239 (tune)`.
+
+    `first` is the first of `count` seeds; each fixes a drawn start situation of a scenario.
+    """
     return f"layout seeds {first} to {first + count - 1} ({' and '.join(purposes(first, count))})"
 
 
 def purposes(first: int, count: int) -> list[Purpose]:
-    """Return all purposes (`tune`, `train`, `report`) of a range of `count` layout seeds."""
+    """Return all purposes (`tune`, `train`, `report`) of a range of `count` layout seeds.
+
+    `first` is the first of them; each seed fixes a drawn start situation of a scenario (`purpose`).
+    """
     names = list(FIRST)
     ends = [*list(FIRST.values())[1:], first + count]
     return [

@@ -35,7 +35,7 @@ TASKS = {"SLURM_ARRAY_TASK_ID": 1, "JOB_COMPLETION_INDEX": 0}
 class Shard:
     """Name one of the equal parts into which some work is divided, to be done apart.
 
-    It is part `number`, from 1, of `of` parts.
+    It is part `number`, counted from 1, of `of` parts; as text `3/16`.
     """
 
     number: int  # which part, from 1
@@ -45,7 +45,7 @@ class Shard:
         return f"{self.number}/{self.of}"
 
     def part(self, items: Sequence[T]) -> Sequence[T]:
-        """Return this shard's contiguous slice of a sequence.
+        """Return this shard's contiguous slice of the items of a whole work, in their order.
 
         Raises UserError if there are more shards than items.
         """
@@ -88,10 +88,12 @@ Start = TypeVar("Start", bound=work.WorkStart)
 
 
 def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
-    """Read the stored settings of the shards in some folders, and check that they make up one work.
+    """Read the settings of all shards of one work, and check that they are complete.
 
-    Raises UserError if a folder holds no shard, one is still being written, they are of different
-    works, or one is missing.
+    A shard is one part of a work (a run or a dataset), made with `--shard`, in an output folder of
+    its own. `kind` is the type of its record of settings. Returns the records in the order of
+    `folders`. Raises UserError if a folder holds no shard, one is still being written, they are of
+    different works, or one is missing.
     """
     configs = [_read(folder, kind) for folder in folders]
     first, facts = folders[0], configs[0].facts()
@@ -121,10 +123,10 @@ def read(folders: Sequence[Path], kind: type[Start]) -> list[Start]:
 
 @contextmanager
 def made_whole(folders: Sequence[Path], out: Path) -> Iterator[None]:
-    """Turn errors of damaged shards into a UserError, while code makes the whole in folder `out`.
+    """Enter a context for code that makes one run or dataset of shards in the folder `out`.
 
-    The context is entered around code that makes one dataset or run of what the files of its shards
-    (parts of the work) in `folders` state. If it fails, `out` is not there if it was not before.
+    Errors that damaged files of shards cause there become a UserError. `folders` are those of the
+    shards, the parts of the work. On such an error `out` is deleted, unless it was there before.
     """
     was_there = out.exists()
     try:
@@ -162,12 +164,18 @@ def owners(
     parts: Sequence[str],
     label: Callable[[str], str],
 ) -> dict[str, Path]:
-    """Return the path of each part of the work, by its name, in the folder of its shard.
+    """Return the path of each item of a work, by its file name, in the folder of its shard.
 
-    A part is a file or folder of the working folder, such as that of an episode. `folders` and
-    `configs` are those of the shards, in the same order; `parts` are the names of all parts, in
-    order; `label` gives a part's name in messages. Raises UserError if a shard is not finished, or
-    a part differs between two folders.
+    An item is a file or folder of the working folder, such as that of an episode.
+
+    Args:
+        folders: the output folders of all shards.
+        configs: their records of settings, in the same order, as `read` returns them.
+        parts: the file names of all items of the work, in order.
+        label: gives an item's name in messages from its file name.
+
+    Raises:
+        UserError: a shard is not finished, or an item differs between two folders.
     """
     paths: dict[str, Path] = {}
     for folder, config in zip(folders, configs, strict=True):
@@ -189,10 +197,11 @@ def owners(
 
 
 def collect(parts: Mapping[str, Path], folder: Path) -> None:
-    """Copy parts (files or folders, by name) to a working folder, each in one step.
+    """Copy files or folders from shards to a working folder, each in one step.
 
-    Parts that the folder already holds with the same bytes are skipped; copied ones are sealed,
-    since whoever typed the command wants them as they are.
+    `parts` has the path of each by its name in `folder`. What the folder already holds with the
+    same bytes is skipped. Copies are sealed (`seals.write_seal`), so that work that goes on there
+    trusts them, since whoever typed the command wants them as they are.
     """
     for name, part in parts.items():
         copy, there = folder / f".{name}.{os.getpid()}.part", folder / name

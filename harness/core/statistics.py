@@ -49,12 +49,13 @@ def safe_target(safe: Bools) -> Floats:
 
 
 def brier(p: Floats, target: Floats) -> Floats:
-    """Return the Brier score (1950) of intents against target distributions, `(..., A)` to `(...)`.
+    """Return the Brier score (1950) of distributions over A actions, `(..., A)` to `(...)`.
 
-    Both are probabilities of A actions. It is their squared distance: 0 is best, 2 worst. The
-    target may be a distribution (`safe_target`) instead of one true class. It is smallest at p =
-    target: with two safe actions, an intent that is sure of one scores 0.5, and one that is
-    undecided between both scores 0.
+    `p` has the probabilities that an intent (an answer's distribution) gives to the actions, and
+    `target` those it is scored against: of one true action, or of several (`safe_target`). The
+    score is their squared distance: 0 is best, 2 worst. It is smallest at p = target: with two safe
+    actions, an intent that is sure of one scores 0.5, and one that is undecided between both scores
+    0.
     """
     score: Floats = np.sum((p - target) ** 2, axis=-1)
     return score
@@ -63,11 +64,11 @@ def brier(p: Floats, target: Floats) -> Floats:
 def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
     """Return -ln of the probability that intents give to the safe ones of A actions, `(...)`.
 
-    `p`, `(..., A)`, has the probabilities, and `safe`, `(..., A)`, says after which actions the
-    episode can still succeed. This is the logarithmic score (Good 1952) of the event that the
-    action is safe, in nats; 0 is best. How the probability is spread among safe actions does not
-    matter. NaN where no action is safe. An answer that is sure and wrong costs -ln(`LEAST_MASS`) =
-    9.2.
+    `p`, `(..., A)`, has the probabilities that an intent (an answer's distribution) gives to the
+    actions, and `safe`, `(..., A)`, says after which of them the episode can still succeed. This is
+    the logarithmic score (Good 1952) of the event that the action is safe, in nats; 0 is best. How
+    the probability is spread among safe actions does not matter. NaN where no action is safe. An
+    answer that is sure and wrong costs -ln(`LEAST_MASS`) = 9.2.
     """
     mass = np.sum(np.where(safe, p, 0.0), axis=-1)
     # Rounding may put the mass of a distribution slightly above 1.
@@ -75,10 +76,10 @@ def negative_log_likelihood(p: Floats, safe: Bools) -> Floats:
 
 
 def seed_interval(per_seed_means: Floats) -> Estimate:
-    """Return the mean over S seeds, `(S,)`, with Student's 95 % interval.
+    """Return the mean over S channel seeds with Student's t interval at 95 %.
 
-    Each value is the mean of one channel seed, which keys the draws of lost messages; the paper's
-    error bars are made so. With one seed, or if all have the same mean, the ends are NaN.
+    `per_seed_means`, `(S,)`, has the mean over all episodes under each channel seed, a number that
+    fixes which messages get lost. With one seed, or if all have the same mean, the ends are NaN.
     """
     return _student(per_seed_means, np.arange(len(per_seed_means)))
 
@@ -88,11 +89,15 @@ def episode_interval(
 ) -> Estimate:
     """Return the mean with Student's t interval over episodes; for shares see `rate_interval`.
 
-    Values are of E episodes, `(E,)`, or `(E, ...)` with more axes such as steps, over which an
-    episode's known values are averaged; an episode that is all NaN is excluded. With `episodes`,
-    (n,), they are n values `(n,)` of the episodes with these numbers: the mean is over values, and
-    the variance is that of a ratio of totals (Cochran 1977, section 6.3). If all episodes are alike
-    the ends are NaN.
+    Args:
+        values_by_episode: of E episodes, `(E,)`, or `(E, ...)` with more axes such as steps, over
+            which an episode's known values are averaged; an episode that is all NaN is excluded.
+            With `episodes`, n values, `(n,)`.
+        episodes: the number of each value's episode, `(n,)`. The mean is then over values, and the
+            variance that of a ratio of totals (Cochran 1977, section 6.3).
+        level: of confidence, from 0 to 1.
+
+    If all episodes are alike the ends are NaN.
     """
     values = values_by_episode.reshape(
         len(values_by_episode), math.prod(values_by_episode.shape[1:])
@@ -102,7 +107,10 @@ def episode_interval(
 
 
 def known_mean(values: Floats, axis: int) -> Floats:
-    """Return the mean along an axis, which is dropped; NaN are left out, or returned if all are."""
+    """Return the mean of `values`, of any shape, along an axis, which is dropped.
+
+    NaN are left out, or returned if all values along the axis are NaN.
+    """
     is_known = ~np.isnan(values)
     count = np.sum(is_known, axis=axis)
     total = np.sum(np.where(is_known, values, 0.0), axis=axis)
@@ -110,11 +118,11 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 
 def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
-    """Return the mean of n shares from 0 to 1, with Wilson's interval for their effective size.
+    """Return the mean of n shares from 0 to 1, with Wilson's 95 % interval of the effective size.
 
     `values` are `(n,)`, NaN left out. `episodes`, `(n,)`, has the number of each value's episode;
-    by default each value has one of its own. Values of one episode count as clustered
-    (`_effective_n`).
+    by default each value has one of its own. Values of one episode correlate, so the effective size
+    is smaller than n by the variance between episodes.
     """
     is_known = ~np.isnan(values)
     n, n_excluded = int(is_known.sum()), int((~is_known).sum())
@@ -167,26 +175,29 @@ def seed_rate_interval(values: Floats) -> Estimate:
 def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate:
     """Return the unweighted mean of the strata's mean differences, with an interval over episodes.
 
-    The strata are such as the layouts with a danger and without of each family, and the variance is
-    that of a stratified mean (Cochran 1977, section 5.6). It is enlarged for rare differences that
-    were not seen, in two ways that were found by simulation (`benchmarks/differences.py` measures
-    coverage and power). Each stratum's variance is mixed with that of all, as of `ALIKE` more
-    episodes over all strata. And two episodes that differ are added, one each way (as Bonett and
-    Price 2012 add pairs): with k that differ, their squared weight goes from the largest possible
-    to the usual one by exp(-k / `FEW`).
+    Strata are groups of episodes, such as those with a danger (a vehicle in the ego's way) and
+    those without. The variance is that of a stratified mean (Cochran 1977, section 5.6). It is
+    enlarged for rare differences that were not seen, in two ways that were found by simulation
+    (`benchmarks/differences.py` measures coverage and power). Each stratum's variance is mixed with
+    that of all, as of `ALIKE` more episodes over all strata. And two episodes that differ are
+    added, one each way (as Bonett and Price 2012 add pairs): with k that differ, their squared
+    weight goes from the largest possible to the usual one by exp(-k / `FEW`). The ends are NaN if a
+    stratum has only one episode.
 
     Args:
-        parts: the strata: differences from -1 to 1 of each one's episodes, (E,) each; NaN is left
-        out.
-        level: of confidence.
-
-    The ends are NaN if a stratum has only one episode.
+        parts: for each stratum the differences of its E episodes, from -1 to 1, (E,); NaN is left
+            out.
+        level: of confidence, from 0 to 1.
     """
     return paired_reach(parts, _normal(level))
 
 
 def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
-    """Return `paired_difference` of the strata `parts`, with ends `errors` standard errors away."""
+    """Return `paired_difference` of strata, with ends that are so many standard errors away.
+
+    `parts` has for each stratum the differences of its E episodes, from -1 to 1, (E,); `errors` is
+    the number of standard errors from the mean to either end, such as 1.96.
+    """
     value, error = _paired_error(parts)
     n = sum(int((~np.isnan(part)).sum()) for part in parts)
     half = errors * error
@@ -257,8 +268,8 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
     """Return the unweighted mean of independent estimates, with an interval combined from theirs.
 
     The distances of the ends from the values are combined as the root of their sum of squares
-    ("MOVER": Zou and Donner 2008), so the level of confidence is that of the estimates. They are
-    taken as fixed, not as a sample of more. NaN where any estimate is.
+    ("MOVER": Zou and Donner 2008), so the level of confidence is that of the estimates. The
+    estimates are taken as all there are, not as a sample of more. NaN where any estimate is.
     """
     value = np.array([estimate.value for estimate in estimates])
     low = np.array([estimate.low for estimate in estimates])
@@ -280,11 +291,11 @@ def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
 
 
 def resampled_estimate(values: Floats, n: int) -> Estimate:
-    """Return a figure of n units with the 95 % percentile interval of its bootstrap.
+    """Return a statistic of n units with the 95 % percentile interval of its bootstrap.
 
-    A unit is what is drawn with replacement, such as an episode. `values`, `(1 + times,)`, are the
-    figure itself, then that of each resample, in the order of `resampled`. NaN resamples are left
-    out; if the figure itself is NaN, there is no interval.
+    A unit is what is drawn with replacement, such as an episode. `values`, `(1 + times,)`, has the
+    statistic of the units themselves, then that of each resample, in the order of `resampled`. NaN
+    resamples are left out; if the first is NaN, there is no interval.
     """
     resamples = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]):

@@ -29,9 +29,10 @@ _watchers: set[int] = set()  # processes with a thread that watches
 
 @contextmanager
 def watched(what: str, patience_s: float | None = None) -> Iterator[None]:
-    """Run code; if it takes longer than `patience_s` seconds, a line on stderr names it, once.
+    """Enter a context in which a line on stderr names code that takes long, once.
 
-    `what` names the code; the default is `PATIENCE_S`.
+    `what` names the code, and `patience_s` is how many seconds it may take before that;
+    `PATIENCE_S` by default. The code is not stopped.
     """
     call = object()
     _calls[call] = what, time.monotonic(), patience_s or PATIENCE_S
@@ -56,7 +57,7 @@ def _watch() -> None:
 
 @contextmanager
 def strangers(what: str = "a package") -> Iterator[None]:
-    """Run code that may be another package's; `what` names it in messages.
+    """Enter a context for code that may be another package's; `what` names it in messages.
 
     If it tries to end the program (except by a typed Ctrl-C), this raises UserError. A changed
     working folder is put back, and a line on stderr says so.
@@ -77,19 +78,21 @@ def strangers(what: str = "a package") -> Iterator[None]:
 
 @contextmanager
 def aside(what: str) -> Iterator[None]:
-    """Run a package's code as `strangers` does; its stdout goes to stderr.
+    """Enter a context for another package's code that prints: its stdout goes to stderr.
 
-    A line on stderr says if it takes long (`watched`).
+    As in `strangers`, it can neither end the program nor change the working folder, and a line on
+    stderr says if it takes long. `what` names it in messages.
     """
     with watched(what), strangers(what), redirect_stdout(sys.stderr):
         yield
 
 
 def is_ours(thing: object) -> bool:
-    """Return whether a thing acts by the harness's own code alone.
+    """Return whether an object acts by the harness's own code alone, and not by a package's.
 
-    That is so if a module of the harness has its class, and nothing that is set on the thing hides
-    a member of that class. What a class states of its module anybody can write, so it is looked up.
+    That is so if its class is defined in a module of the harness, and no attribute that is set on
+    the object itself hides a method of that class. The class is looked up in that module, since any
+    class may state a false module name.
     """
     kind = type(thing)
     hides = [name for name in getattr(thing, "__dict__", ()) if callable(getattr(kind, name, None))]
@@ -97,9 +100,9 @@ def is_ours(thing: object) -> bool:
 
 
 def is_in_harness(named: Any) -> bool:
-    """Return whether a module of the harness has this class or function under its name.
+    """Return whether a class or function is defined in a module of the harness.
 
-    That is looked up, since an object may state any module and name.
+    It is looked up there by its name, since an object may state any module and name.
     """
     module = str(getattr(named, "__module__", ""))
     if not module.startswith("harness."):
@@ -116,9 +119,10 @@ def worded(
     built_in: bool = False,
     door: Callable[[str], AbstractContextManager[None]] = strangers,
 ) -> Iterator[None]:
-    """Run a package's code, and turn its errors into a one-line UserError that names `what`.
+    """Enter a context for a package's code, whose errors become a one-line UserError.
 
-    If `built_in` is true the code runs as it is. `door` is `strangers` or `aside`.
+    `what` names the code in it. If `built_in` is true the code is the harness's own, and runs as it
+    is. `door` is the context that it runs in: `strangers` or `aside`.
     """
     if built_in:
         yield
@@ -135,9 +139,9 @@ def worded(
 
 
 def ends_the_program(error: BaseException) -> bool:
-    """Return whether an exception would end the program though no error: such as SystemExit.
+    """Return whether an exception would end the program though it is no error, as SystemExit does.
 
-    A Ctrl-C that somebody typed, and `Stop`, do not count.
+    A Ctrl-C that somebody typed, and `process.Stop` (a signal to stop), do not count.
     """
     if isinstance(error, Stop):
         return False

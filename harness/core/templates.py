@@ -119,14 +119,19 @@ _account = _Account()
 
 
 def begin() -> None:
-    """Give the template rendering that begins in this thread its full budget of `MOST_STEPS`."""
+    """Give the template rendering that begins in this thread its full budget of `MOST_STEPS`.
+
+    A step is one item that it reads, or eight characters.
+    """
     _account.left = MOST_STEPS
 
 
 def spend(steps: int) -> bool:
-    """Charge steps to the rendering's budget. Raises TooMuch if it has fewer left.
+    """Charge steps to the budget of the template rendering that runs in this thread.
 
-    Returns True, so that it can stand in an expression.
+    The budget limits the work of one rendering; a step is one item that is read, or eight
+    characters. Raises TooMuch if the budget has fewer left. Returns True, so that it can stand in
+    an expression.
     """
     _account.left -= steps
     if _account.left < 0:
@@ -135,16 +140,20 @@ def spend(steps: int) -> bool:
 
 
 def read(value: Any) -> Any:
-    """Return a template's value, after charging the rendering's budget for reading all of it."""
+    """Return a value that a template reads, after charging its budget for the value's size.
+
+    The budget is a number of steps that limits the work of one rendering.
+    """
     if type(value) not in _SMALL and not (type(value) is str and len(value) < _SHORT):
         spend(_size(value))
     return value
 
 
 def written(value: Any) -> Any:
-    """Return a value that a template writes, after charging the budget for reading it.
+    """Return a value that a template writes, after charging its budget for the value's size.
 
-    Raises Unwritten if its text is its memory address.
+    The budget is a number of steps that limits the work of one rendering. Raises Unwritten if the
+    value's text is its memory address, which differs in every process.
     """
     if isinstance(value, _ADDRESSED):
         raise Unwritten(value)
@@ -152,7 +161,10 @@ def written(value: Any) -> Any:
 
 
 def looked_in(value: Any) -> Any:
-    """Return a container, after charging the budget for a search in it; a mapping costs nothing."""
+    """Return a container that a template searches (`in`), after charging for the search.
+
+    The rendering's budget of steps is charged with its length; a mapping costs nothing.
+    """
     return value if isinstance(value, _MAPPINGS) else read(value)
 
 
@@ -324,12 +336,12 @@ class _Namespace(Namespace):
 
 
 class Code(CodeGenerator):
-    """Generate the code of a template, which charges the budget for what it reads.
+    """Generate Python code of a Jinja template which counts the steps that it takes.
 
-    It does so for what it joins and repeats, too.
+    What it reads, joins and repeats is charged to the rendering's budget of steps.
     """
 
-    environment: "Sandbox"
+    environment: "Sandbox"  # the environment that compiles the template
 
     @optimizeconst
     def visit_Filter(self, node: nodes.Filter, frame: Frame) -> None:
@@ -404,7 +416,10 @@ def _cost(body: Iterable[nodes.Node]) -> int:
 
 
 class Bounded(Template):
-    """Hold a compiled template, each of whose renderings begins with the full budget of steps."""
+    """Hold a compiled template, each of whose renderings begins with the full budget of steps.
+
+    A step is one item that a rendering reads, or eight characters; the budget is `MOST_STEPS`.
+    """
 
     def render(self, *given: Any, **named: Any) -> str:
         begin()
@@ -471,7 +486,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
         )
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Return whether an expression is known to cost nothing to read: a constant."""
+        """Return whether an expression of a template is known to cost nothing to read: a constant.
+
+        The code that is generated for it charges the rendering's budget of steps for all others.
+        """
         return isinstance(node, nodes.Const)
 
     def _put_steps_into(self, source: nodes.Template) -> None:
@@ -494,7 +512,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
             raise TemplateSyntaxError("its parts are nested too deeply", 1) from None
 
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
-        """Compute a binary operator, after charging the budget for its operands and result."""
+        """Compute a binary operator, such as `+`, of the values `left` and `right` in a template.
+
+        The rendering's budget of steps is charged for both and for what comes out.
+        """
         if isinstance(left, int) and isinstance(right, int):
             bits = left.bit_length(), right.bit_length()
             powers = bits[0] * abs(right) if operator == "**" else 0
@@ -520,7 +541,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
             read(right)
 
     def call(self, context: Context, called: Any, /, *given: Any, **named: Any) -> Any:
-        """Call a function of a template, and charge the budget for its arguments and result."""
+        """Call a function in a template, and return what it returns.
+
+        The rendering's budget of steps is charged for its arguments and for what it returns.
+        """
         if given or named:
             spend(sum(map(_size, chain(given, named.values()))))
         owner = getattr(called, "__self__", None)
@@ -546,7 +570,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return given
 
     def getattr(self, obj: Any, attribute: str) -> Any:
-        """Return an attribute as Jinja does.
+        """Return an attribute of an object, or else its item of that name, as templates read it.
 
         While a template is compiled it raises jinja2's Impossible: nothing would be charged then.
         """
@@ -555,11 +579,18 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return super().getattr(obj, attribute)
 
     def getitem(self, obj: Any, argument: Any) -> Any:
-        """Return an item as Jinja does, after charging the budget for a key that is not plain."""
+        """Return an item of an object, or else its attribute of that name, as templates read it.
+
+        The rendering's budget is charged for comparing a key that is not a plain text or number.
+        """
         return super().getitem(obj, argument if type(argument) in (str, int) else read(argument))
 
     def is_safe_attribute(self, obj: Any, attr: str, value: Any) -> bool:
-        """Return whether a template may read an attribute; not methods that make large results."""
+        """Return whether a template may read the attribute `attr` of `obj`, whose value is `value`.
+
+        It may not where Jinja's sandbox forbids it, or where it is a method that makes large
+        results.
+        """
         if isinstance(obj, bytes | int):
             return False
         return not (isinstance(obj, str) and attr == "translate") and super().is_safe_attribute(
@@ -567,7 +598,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
         )
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:
-        """Return a text's `format` method as one that charges the budget; None if it is none."""
+        """Return a text's method `format` as one that charges the rendering's budget of steps.
+
+        `value` is what a template calls; None if it is no such method.
+        """
         method = super().wrap_str_format(value)
         if method is None:
             return None

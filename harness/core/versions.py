@@ -21,9 +21,10 @@ _version = cache(metadata.version)
 
 
 def versions(packages: Sequence[str] = PACKAGES) -> Any:
-    """Return, by name, the versions of the harness, Python, the platform and installed packages.
+    """Return a dict of versions, as texts: of the harness, Python, the platform and packages.
 
-    `parser`, `decisions` and `figures` are versions of the harness's own results.
+    `packages` are names of distributions; one that is not installed is left out. `parser`,
+    `decisions` and `figures` count changes of the harness's own results.
     """
     installed = {
         "harness": __version__,
@@ -43,7 +44,10 @@ def versions(packages: Sequence[str] = PACKAGES) -> Any:
 
 @cache
 def node_versions() -> dict[str, str]:
-    """Return the versions that all nodes of one job must share, and a digest of the source."""
+    """Return the versions, by name, that all nodes of one job must share.
+
+    They are those of packages that results depend on, and a digest of the harness's source.
+    """
     required: dict[str, str] = versions(
         (*PACKAGES, "pyarrow", "shapely", "gymnasium", "msgspec", "pillow")
     )
@@ -54,7 +58,7 @@ def node_versions() -> dict[str, str]:
 def differing(wanted: dict[str, str]) -> str | None:
     """Describe the first version that differs here from `wanted`; None if none does.
 
-    `wanted` are versions by package, such as those of `node_versions`.
+    `wanted` has versions by name, as `node_versions` gives them on another node.
     """
     here = node_versions()
     for name in {**wanted, **here}:

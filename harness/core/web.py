@@ -33,17 +33,17 @@ class HeadInTime(H11Protocol):
     _late: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin the time limit of the connection's first request."""
+        """Begin the time limit of a new connection's first request; the event loop calls this."""
         super().connection_made(transport)
         self._watch()
 
     def data_received(self, data: bytes) -> None:
-        """Handle data, and begin or end the time limit of a request's head."""
+        """Handle bytes that came, and begin or end the time limit of a request's head."""
         super().data_received(data)
         self._watch()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Cancel the time limit of a connection that is gone."""
+        """Cancel the time limit of a connection that is gone; the event loop calls this."""
         super().connection_lost(exc)
         self._relax()
 
@@ -78,7 +78,10 @@ def is_loopback(host: str) -> bool:
 
 
 def server_of(app: ASGIApp, **limits: Any) -> uvicorn.Server:
-    """Return a uvicorn server for an application; `limits` are further settings of uvicorn."""
+    """Return a uvicorn server for an ASGI application, with the harness's limits, not started.
+
+    `limits` are further settings of `uvicorn.Config`, by name.
+    """
     config = uvicorn.Config(
         app,
         log_level="critical",
@@ -100,11 +103,11 @@ def serve(
     """Serve an application by HTTP until Ctrl-C.
 
     Args:
-        app: the application.
-        host: an address of this machine.
+        app: the ASGI application.
+        host: an address of this machine, such as `127.0.0.1`.
         port: 0 for a free one.
         listening: called with the base URL as soon as it is listened on.
-        limits: further settings of uvicorn.
+        limits: further settings of `uvicorn.Config`, by name.
 
     Raises:
         UserError: the address or the port is not available.

@@ -33,17 +33,21 @@ SHORT = 30  # most characters of a setting's value that a message has
 
 
 class WorkStart(msgspec.Struct, frozen=True, kw_only=True):
-    """Hold the settings that a piece of work began with, as stored in its working folder.
+    """Hold the settings that a command's work began with, as its working folder stores them.
 
-    `settings` are plain values that must be the same for the work to be resumed; `shard` says which
-    part of the work it is, such as `3/16`, empty for the whole.
+    A working folder is `.work` in the output folder; from it the same command resumes after it was
+    stopped. `settings` has plain values by name, which must be the same for that; `shard` says
+    which part of the work is done here, such as `3/16`, empty for the whole.
     """
 
     settings: dict[str, Any]  # plain values that must be the same for the work to be resumed
     shard: str = ""  # which part of the work this is, such as `3/16`; empty for the whole
 
     def facts(self) -> dict[str, Any]:
-        """Return the values that must be equal in all shards of one work."""
+        """Return the values, by name, that must be equal in all shards of one work.
+
+        A shard is a part of the work that is done apart.
+        """
         return self.settings
 
 
@@ -53,8 +57,9 @@ Kind = TypeVar("Kind", bound=WorkStart)
 def start_of(out: Path, kind: type[Kind]) -> Kind | None:
     """Read what the unfinished work in an output folder began with; None if there is none.
 
-    None means that the folder is new, empty or `idle`. `kind` is the type of the record. Raises
-    UserError if the file is damaged, or the folder holds something else.
+    None means that the folder is new or empty, or that its work stopped before anything was done.
+    `kind` is the type of the record to read, a `WorkStart`. Raises UserError if the file is
+    damaged, or the folder holds something else.
     """
     sayable("--out", out.name, "give another name")
     folder, file = printable(out), out / WORK / CONFIG
@@ -76,7 +81,8 @@ def start_of(out: Path, kind: type[Kind]) -> Kind | None:
 def unanswered(out: Path) -> str | None:
     """Return why the work in an output folder stopped, if its model could not be asked, else None.
 
-    The subfolders of a study are searched as well.
+    `out` may also be a study's folder, whose runs are subfolders: the first such reason is
+    returned.
     """
     for place in (out, *([] if (out / "run.json").is_file() else sorted(out.glob("*/")))):
         with suppress(OSError, ValueError, UserError):
@@ -107,8 +113,12 @@ def same(
 ) -> None:
     """Raise UserError, naming the differences, unless the settings `now` equal the `stored` ones.
 
-    `out` is the output folder. `typed` returns words for the message, of what the work began with
-    and what was typed now; empty words are replaced by the names of the settings.
+    Args:
+        out: the output folder, named in the message.
+        now: the settings of the command as typed now, values by name.
+        stored: those that its unfinished work began with.
+        typed: returns words for the message on what was typed then and now; if it returns none, the
+            message names the settings that differ.
     """
     # turns tuples into lists, as they are stored
     now = msgspec.json.decode(msgspec.json.encode(now))
@@ -137,11 +147,15 @@ def held(out: Path) -> bool:
 
 @contextmanager
 def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Path]:
-    """Lock the working folder of `out`, create it if there is none, and yield its path.
+    """Enter a context that works in `.work` of the folder `out`, locked; yield the path of it.
 
-    A new one stores `begin`. On a UserError or OSError before anything is done, the folders created
-    here are deleted; but if the model could not be asked, the folder keeps the reason
-    (`unanswered`). `last` is the file that finished work leaves in `out`. Raises UserError if
+    Args:
+        out: the output folder, made if it is missing.
+        begin: the settings of the work; a new working folder stores them.
+        last: the name of the file in `out` that is written when the work is finished.
+
+    On a UserError or OSError before anything is done, the folders created here are deleted; but if
+    the model could not be asked, the folder keeps the reason (`unanswered`). Raises UserError if
     another process works there, or has finished since.
     """
     work, created = out / WORK, [path for path in (out, *out.parents) if not path.exists()]
@@ -192,7 +206,10 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
 
 @contextmanager
 def going_on(out: Path) -> Iterator[None]:
-    """Add a note to an interrupt or `Unfinished` error: the folder keeps what is done."""
+    """Enter a context that adds a note to an interrupt or `Unfinished` error.
+
+    It says that the output folder `out` keeps what is done.
+    """
     try:
         yield
     except (KeyboardInterrupt, Unfinished) as error:
@@ -202,7 +219,10 @@ def going_on(out: Path) -> Iterator[None]:
 
 @contextmanager
 def kept_file(file: Path) -> Iterator[None]:
-    """Read a file that unfinished work kept; whatever fails is one line, which names the file."""
+    """Enter a context for reading a file of unfinished work; any error becomes one UserError line.
+
+    It names the file and says that it is damaged.
+    """
     try:
         yield
     except Exception as error:  # whatever its format's reader raises
@@ -212,7 +232,10 @@ def kept_file(file: Path) -> Iterator[None]:
 
 
 def tidy(out: Path) -> None:
-    """Delete the working folder of `out`, and temporary files of killed processes in `out`."""
+    """Delete the working folder `.work` of an output folder, once its work is finished.
+
+    Temporary files of killed processes in `out` are deleted as well.
+    """
     with suppress(OSError):  # first, so that nothing resumes from a half-deleted folder
         os.unlink(out / WORK / CONFIG)
     shutil.rmtree(out / WORK, ignore_errors=True)
