@@ -31,10 +31,11 @@ _MORE = (
 
 
 def read_config(folder: Path, subject: str) -> dict[str, Any]:
-    """Return the configuration of a LoRA adapter's folder, as its `adapter_config.json` states it.
+    """Return the configuration of a LoRA adapter, the dict of its `adapter_config.json`.
 
-    `subject` names the model in messages. Raises UserError if it cannot be read, or the adapter is
-    more than plain LoRA of linear layers.
+    An adapter is a small file that changes a model's weights; `folder` is where it lies, and
+    `subject` names the model in messages. Raises UserError if the file cannot be read, or the
+    adapter is more than plain LoRA of linear layers.
     """
     try:
         config: dict[str, Any] = json.loads(text_of(folder / CONFIG, "record"))
@@ -64,8 +65,8 @@ def read_config(folder: Path, subject: str) -> dict[str, Any]:
 def find_adapter(card: Card) -> Path | None:
     """Return the folder of the LoRA adapter that a model card names; None if it names none.
 
-    The path is absolute, or else relative to the folder of the cards. Raises UserError if the
-    folder is no adapter.
+    A model card is a TOML file that describes a model. The path in it is absolute, or else relative
+    to the folder of the cards. Raises UserError if the folder is no adapter.
     """
     if card.adapter is None:
         return None
@@ -89,9 +90,10 @@ def find_tensors(folder: Path, subject: str) -> Path:
 
 
 def foreign(subject: str, file: Path, reason: str) -> UserError:
-    """Return the error for an adapter in `file` that does not fit its model, for `reason`.
+    """Return the error for an adapter that does not fit its model.
 
-    `subject` names the model in messages.
+    `file` is the adapter's file, `reason` says in words what does not fit, and `subject` names the
+    model in messages.
     """
     return UserError(
         f"{subject}: {printable(file)} is no adapter of this model: {reason}; give the adapter "
@@ -103,8 +105,9 @@ def merge(card: Card, model: Any) -> None:
     """Add the LoRA adapter that a model card names to weights: W + alpha / r * B A, in float32.
 
     `model` is a loaded model of the package transformers, which is changed in place; A, B, alpha
-    and r are the adapter's matrices, scale and rank. Nothing is done if the card names no adapter.
-    Raises UserError if the adapter is of another model, or its file is not whole.
+    and r are the adapter's matrices, scale and rank. `card` is the model card, the TOML file that
+    describes a model; nothing is done if it names no adapter. Raises UserError if the adapter is of
+    another model, or its file is not whole.
     """
     if (folder := find_adapter(card)) is None:
         return

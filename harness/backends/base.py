@@ -40,16 +40,23 @@ AGAIN = "#2"  # suffix of the id of a repair turn's request
 class Request:
     """Hold one question to a model: its chat messages, and how the answer is to be given.
 
-    It is what the program asks of a vehicle in one scene, once the prompt is rendered: the ego, or
-    a helper, as `role` says, about the ego's next action among `actions`. `answer` is the answer
-    mode: `json`, in which the model writes freely; `constrained`, in which it fills in a fixed
-    text; `readout`, in which it is asked for one letter an action; `decision`, in which it gives
-    each option of `question` a probability. `form`, `extension` and `placeholders` are those of the
-    answer's `Shape`; `orders` and `flips` are the chats of a read-out with the actions in other
-    orders. `sums` says what is done where probabilities do not sum to 1; `sample` is the answer's
-    number among several to one question. `agent` is the index of the model that is asked, 0 the
-    ego's. `view` and `truth` are what the vehicle sees and what there is, for rules, which read no
-    messages.
+    It is what the program asks of a vehicle in one scene: the ego, or a helper, as `role` says,
+    about the ego's next action among `actions`. `id` is `<scene>/<viewer>`, `max_tokens` the most
+    tokens of the answer.
+
+    `answer` is the answer mode: `json`, in which the model writes freely; `constrained`, in which
+    it fills in a fixed text; `readout`, in which it is asked for one letter an action; `decision`,
+    in which it gives each option of `question` a probability. `form`, `extension` and
+    `placeholders` say what the answer's JSON must look like (see `Shape`); `sums` what is done
+    where its probabilities do not sum to 1: `refuse` or divide by the sum. `orders` and `flips` are
+    the chats of a read-out with the actions in other orders.
+
+    `thinking` says whether the model thinks first, `reasons_first` that the prompt wants reasons.
+    Tokens are drawn at `temperature`, 0 for the likeliest; `sample` is the answer's number among
+    several to one question. `timed` says whether its time is measured. `agent` is the index of the
+    model that is asked, 0 the ego's. `image` is a picture of the scene. `view` and `truth` are what
+    the vehicle sees and what there is, and `scenario` the kind of traffic situation: for rules,
+    which read no messages.
     """
 
     id: str  # unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`
@@ -97,7 +104,10 @@ class Request:
 
     @property
     def shape(self) -> Shape:
-        """Return the form of its answer's JSON: a bare distribution if it is `bare`."""
+        """Return what the answer's JSON must look like: for whom, which actions, which members.
+
+        It is a bare distribution over the actions if the answer is probabilities alone (`bare`).
+        """
         if self.bare:
             return Shape("ego", self.actions, "distribution")
         return Shape(self.role, self.actions, self.form, self.extension, self.placeholders)
@@ -112,11 +122,18 @@ class Request:
 
     @property
     def divides(self) -> bool:
-        """Return whether the answer's probabilities are divided by their sum, whatever it is."""
+        """Return whether the answer's probabilities are divided by their sum, whatever that is.
+
+        If not, only a sum that is off 1 by rounding is divided out, and an answer of another sum
+        fails to be parsed.
+        """
         return self.answer == "constrained" or self.sums == "divide"
 
     def alike(self, **changes: Any) -> "Request":
-        """Return a copy with other values in some fields; a third of the time of `replace`."""
+        """Return a copy with other values in some fields, given by name.
+
+        It does what `dataclasses.replace` does and takes a third of the time.
+        """
         request = object.__new__(Request)
         vars(request).update(vars(self), **changes)
         return request
@@ -129,9 +146,10 @@ class Request:
 def by_scenario(
     requests: Sequence[Request], answer: Callable[[Sequence[Request]], Sequence[T]]
 ) -> list[T]:
-    """Return the answers to requests, in order; `answer` is called once for each scenario.
+    """Return the answers to requests, in order, asked separately for each scenario.
 
-    It gets all requests whose scene is of that scenario, and returns their answers in order.
+    A scenario is the kind of traffic situation of a request's scene. `answer` is called once for
+    each: it gets all its requests, and returns their answers in the same order.
     """
     places: dict[int, list[int]] = {}
     for n, request in enumerate(requests):
@@ -150,13 +168,17 @@ class Completion:
     `finish_reason` says why it ends: `stop`, `length` (the token limit), `refusal`, or `error`,
     with the message in `error`. `seconds` is the time of an answer that was asked alone, None if
     not measured; `first_token_s` is that to its first token, `token_s` that of each further one.
-    `slow_s` are seconds that a rule declares to take longer. `label_mass` is the letters' total
-    probability in a read-out; `letter_share` and `follows_letter` say how far that goes by the
-    letter and not the action, and `flipped` whether it changes with the list reversed. None is
-    unknown, or does not apply.
+    `slow_s` are seconds that a rule declares to take longer. `batch_size` is how many requests were
+    computed together, `retries` how many attempts failed before, `cached` whether it was stored
+    earlier, and `server` the address of the server that gave it.
+
+    In a read-out, which asks for one letter an action, `label_mass` is the letters' total
+    probability; `letter_share` (0 to 1) and `follows_letter` say how far that goes by the letter
+    and not the action, and `flipped` whether the likeliest action changes with the list reversed.
+    None is unknown, or does not apply.
     """
 
-    request_id: str
+    request_id: str  # of the request that it answers (`Request.id`)
     # the model's text, unchanged but for lone surrogates, which are legal JSON and which no file
     # can hold; empty on an error
     text: Text
@@ -181,10 +203,10 @@ class Completion:
     first_token_s: Seconds | None = None
     # time per output token (TPOT, see `per_token_s`); None of only one token
     token_s: Seconds | None = None
-    # How much of a read-out over several orders follows the letter, 0 to 1
-    # (`harness.backends.orders`), and whether one letter is the likeliest in every order; None
-    # otherwise.
+    # how much of a read-out over several orders follows the letter, 0 to 1
+    # (`harness.backends.orders`); None otherwise
     letter_share: Share | None = None
+    # whether one letter is the likeliest in every order of a read-out; None otherwise
     follows_letter: bool | None = None
     # address of the server that gave it; None in process, or of several servers
     server: str | None = None
@@ -198,9 +220,10 @@ class Completion:
 
 
 def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:
-    """Return the completion of a request that got no answer: its text is empty, `error` says why.
+    """Return the completion of a request that got no answer: its text is empty.
 
-    `prompt_tokens` is the number of tokens that were read, None if unknown.
+    `error` says in one sentence why; `prompt_tokens` is the number of tokens that were read, None
+    if unknown.
     """
     return Completion(request.id, "", prompt_tokens, None, "error", None, 1, error)
 
@@ -208,9 +231,10 @@ def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Co
 def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None) -> float | None:
     """Return the time per output token (TPOT) in s: (seconds - first_token_s) / (tokens - 1).
 
-    As in `vllm bench serve`; None if a number is unknown or there are fewer than two tokens. Only
-    tokens that the model chose count: the fixed tokens of a constrained answer are read as input,
-    and their time is part of the next chosen token's.
+    `seconds` is the whole answer's time, `first_token_s` that to its first token, and `tokens` the
+    number of its tokens. The definition is that of `vllm bench serve`; None if a number is unknown
+    or there are fewer than two tokens. Only tokens that the model chose count: the fixed tokens of
+    a constrained answer are read as input, and their time is part of the next chosen token's.
     """
     if first_token_s is None or tokens is None or tokens < 2:
         return None
@@ -221,14 +245,15 @@ class Backend(Protocol):
     """Describe what answers requests: a model in this process, a server, or a rule."""
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return one completion a request, in the same order; `error` says why one failed."""
+        """Return a completion for each request, in the same order; `error` says why one failed."""
         ...
 
     def identity(self) -> dict[str, Any]:
-        """Return all that decides the answers, as JSON values, for a run's record.
+        """Return all that decides the answers, as JSON values by name, for a run's record.
 
-        Such as engine, versions, digests of weights and settings. `answers` is the version of the
-        engine's answers, by its registration.
+        Such as engine, versions, digests of weights and settings. Two backends with equal
+        identities give equal answers. `answers` is the version of the engine's answers, as its
+        registration states it.
         """
         ...
 
@@ -236,7 +261,8 @@ class Backend(Protocol):
 def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Return whether two identities, as `Backend.identity` returns them, are of one model.
 
-    What servers state now and did not state in `stored` is not compared.
+    `stored` is that of an earlier run and `now` that of the open backend. What servers state now
+    and did not state in `stored` is not compared.
     """
     return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
 
@@ -315,8 +341,8 @@ def served(backend: Backend) -> list[Served]:
 def doubt(backend: Backend) -> str | None:
     """Return a sentence on why cached answers may come from other weights; None if they cannot.
 
-    A cached answer is one that the same model gave in an earlier run; a server's identity may not
-    tell which weights it has.
+    A cached answer is one that was stored in an earlier run of the same model by name; a server may
+    not tell which weights it has.
     """
     return getattr(backend, "doubt", None)
 
@@ -327,6 +353,9 @@ def several(backend: Backend) -> Sequence[str]:
 
 
 class Timed(Backend, Protocol):
-    """Describe a backend of stored answers, whose times are known and are not measured again."""
+    """Describe a backend of answers stored by an earlier run, whose times are not measured again.
+
+    `latency` says how long an answer took there.
+    """
 
     def latency(self) -> "Latency": ...

@@ -87,7 +87,7 @@ _HAS_CODE = "SELECT 1 FROM sqlite_master WHERE type IN ('view', 'trigger')"
 
 
 def default_file() -> Path:
-    """Return the SQLite file in which completions are cached by default."""
+    """Return the SQLite file in which models' answers are kept between runs by default."""
     return kept.folder() / "completions.sqlite"
 
 
@@ -96,10 +96,15 @@ def key(
 ) -> str:
     """Return the hex digest under which a completion is cached; it reveals no prompt, no secret.
 
-    It covers all that decides an answer: `identity`, as `Backend.identity` returns it; `prompt`,
-    the text that the model reads; the request; and `batch_size`, the number of requests that are
-    computed together. That counts for quantised and 16-bit weights, where other requests in a batch
-    move an answer by rounding; for float32 weights it is None.
+    It covers all that decides an answer.
+
+    Args:
+        identity: what `Backend.identity` returns.
+        prompt: the text that the model reads.
+        request: the question, with its answer mode and settings.
+        batch_size: number of requests that are computed together, which moves answers by rounding
+            if weights are quantised or have 16 bits; None for float32 weights, where it does not
+            count.
     """
     request_fields = {
         f.name: getattr(request, f.name) for f in fields(request) if f.name not in NOT_IN_KEY
@@ -110,17 +115,20 @@ def key(
 
 
 class CompletionFile:
-    """Store completions in a SQLite file, by key.
+    """Store completions in a SQLite file under keys, as the function `key` makes them.
 
-    It is opened for every call, so it may be deleted. Methods raise sqlite3.Error or OSError if it
-    cannot be read or written.
+    The file is opened for every call, so it may be deleted. Methods raise sqlite3.Error or OSError
+    if it cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def find(self, keys: Sequence[str]) -> dict[str, Completion]:
-        """Return the stored completions by key; they have no seconds, and an empty request id."""
+        """Return those of the completions under `keys` that are stored, by key.
+
+        They have no seconds, and an empty request id.
+        """
         rows: list[tuple[str, str]] = []
         with self._open() as file:
             for start in range(0, len(keys), _AT_ONCE):
@@ -206,10 +214,11 @@ def _sources(servers: Sequence[str]) -> tuple[dict[str, str], Sequence[str]]:
 
 
 def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
-    """Return a backend that looks in the completion cache `file` before it asks `backend`.
+    """Return a backend that looks for an answer in the file `file` before it asks `backend`.
 
-    The completion cache keeps answers between runs. `card` is the model card of the backend, which
-    is returned itself if `file` is None, or its engine cannot show its prompts.
+    The file keeps answers between runs. `card` is the backend's model card, the TOML file that
+    describes a model. `backend` itself is returned if `file` is None, or if its engine cannot show
+    its prompts, by which answers are found.
     """
     if file is None or not capabilities(card.engine).renders:
         return backend

@@ -63,11 +63,12 @@ _PER_ENGINE = (
 
 @dataclass(frozen=True)
 class Latency:
-    """Hold the time that a model card declares for one answer of its model.
+    """Hold the time that a model card (a model's TOML file) declares for one answer of its model.
 
-    `source` says which time a run takes: `card` the declared `inference_s`, in seconds; `paper`,
-    and `cited` unless the user asks for the card's, that of the paper. `basis` says in words where
-    the number comes from.
+    `source` says which time a run takes: `card` is the declared `inference_s`, in seconds; `paper`
+    is the 145 ms of the paper that this benchmark repeats, where none is declared; `cited` is also
+    the paper's, unless the user asks for the card's. `inference_s` is None if the paper's is taken.
+    `basis` says in words where the number comes from.
     """
 
     # `card` means `inference_s`, `paper` the paper's 145 ms if no time is declared; `cited` means
@@ -87,11 +88,11 @@ class Failures:
     """Hold the shares of a rule's answers that are spoilt on purpose, drawn for each request.
 
     They are for the engine `proxy`, a rule in place of a model, to test parsing and repair. A text
-    is spoilt in one way at most; any answer may be slow as well. The intent is recovered from an
-    answer in a code `fence` or among `prose`; parsing fails on one that is cut off (`truncation`),
-    has a probability NaN (`nan`) or an action that is none (`unknown_action`), or never ends its
-    thought (`unclosed_think`). The share `slow_tail` takes `slow_s` seconds longer than the card's
-    latency.
+    is spoilt in one way at most; any answer may be slow as well. The intent (the actions'
+    probabilities) is recovered from an answer in a code `fence` or among `prose`; parsing fails on
+    one that is cut off (`truncation`), has a probability NaN (`nan`) or an action that is none
+    (`unknown_action`), or never ends its thought (`unclosed_think`). The share `slow_tail` takes
+    `slow_s` seconds longer than the card's latency.
     """
 
     fence: Share = 0.0  # the answer is in a code fence. Recovered.
@@ -103,7 +104,7 @@ class Failures:
     # the answer is in a thought that never ends. Failed, `truncated_reasoning`.
     unclosed_think: Share = 0.0
     slow_tail: Share = 0.0  # the answer takes `slow_s` seconds longer than the card's latency
-    slow_s: Seconds = 0.0
+    slow_s: Seconds = 0.0  # how much longer the share `slow_tail` takes
 
     def __post_init__(self) -> None:
         if (total := sum(self.texts.values())) > 1 + 1e-9:
@@ -127,17 +128,23 @@ class Card:
     An engine is the program that runs the model: transformers, llama.cpp, a server, or a rule.
     `weights` is where the model is: a directory, a GGUF file or a hub id, of which `file`,
     `revision` and `sha256` say more; a run's folder for the engine `replay`, the model's name at a
-    server. `latency` is the declared time of an answer, and `privileged` says that the model sees
-    behind the occlusion, as an upper reference. `thinking` says whether its template can open a
-    thought, for at most `thinking_tokens`. The other fields are those of some engines; None is
+    server. `dtype` is the number format of its weights, `context_tokens` the most tokens of prompt
+    and answer together, `max_new_tokens` the most of an answer.
+
+    `latency` is the declared time of an answer, and `privileged` says that the model sees behind
+    the occlusion, as an upper reference. `thinking` says whether its template can open a thought,
+    for at most `thinking_tokens`. `vision` says how it takes pictures, by the file `projector`;
+    `adapter` is the folder of a LoRA adapter. `system` says where the system text goes, `letters`
+    whether an answer by the probabilities of one letter an action is averaged over orders of the
+    actions. `server`, `failures` and `price` are tables for the engines that have them; None is
     none, or unknown.
     """
 
     # stem of its file, `<stem>:<engine>`, name of a directory or file, hub id, or `replay:<run>`
     name: str
-    engine: str
+    engine: str  # name of the program that runs it, such as `transformers`
     description: str  # one line for people
-    latency: Latency
+    latency: Latency  # the declared time of one answer
     # Directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
     # `replay`; the server's name of the model for `openai`; None without a model.
     weights: str | None = None
@@ -188,11 +195,10 @@ class Card:
         return f"model {printable(self.name)!r}"
 
     def at(self, urls: tuple[str, ...]) -> "Card":
-        """Return the model card with other server addresses.
+        """Return this card, which describes a model, with other addresses of its servers.
 
-        It is unchanged if it has none or `urls` is empty.
-
-        Raises ValueError if one is not a base URL, or is named twice.
+        `urls` are base URLs such as `http://host:8000/v1`. It is unchanged if it has no server or
+        `urls` is empty. Raises ValueError if one is not a base URL, or is named twice.
         """
         return (
             replace(self, server=replace(self.server, base_url=urls))
@@ -201,7 +207,10 @@ class Card:
         )
 
     def record(self) -> dict[str, Any]:
-        """Return the model card as plain values for a run's record; `convert` makes it again."""
+        """Return the model card, what a model's TOML file states, as plain values by key.
+
+        A run's record has them; `core.config.convert` makes the card of them again.
+        """
         record = asdict(self)
         del record["letters"]  # the agent's settings say how its letters are read
         for name in ("adapter", "price"):

@@ -52,14 +52,18 @@ _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 
 
 def names() -> list[str]:
-    """Return the sorted names of all files of model cards, the project's and those that ship."""
+    """Return the sorted names of all files of model cards, the project's and those that ship.
+
+    A model card is a TOML file that describes a model; its name is without `.toml`.
+    """
     return resources.names("models")
 
 
 def each_engine(stem: str) -> list[Card]:
     """Return the model cards in the file `models/<stem>.toml`, one for each engine that it lists.
 
-    The default engine's is first. Raises UserError for a mistake in the file.
+    A model card describes a model on one engine, the program that runs it; the default engine's is
+    first. Raises UserError for a mistake in the file.
     """
     return read_cards(resources.find("models", f"{stem}.toml"))
 
@@ -67,7 +71,8 @@ def each_engine(stem: str) -> list[Card]:
 def load(name: str) -> Card:
     """Return the model card named `<name>` or `<name>:<engine>`, the default engine's without one.
 
-    Raises UserError if there is none, or its file has a mistake.
+    A model card is the TOML file that describes a model. Raises UserError if there is none, or its
+    file has a mistake.
     """
     stem, _, engine = name.partition(":")
     if stem not in names():
@@ -79,17 +84,20 @@ def load(name: str) -> Card:
 
 
 def load_all() -> list[Card]:
-    """Return the model cards of all files, one for each engine that a file lists."""
+    """Return all model cards, one for each engine that a TOML file of `models/` lists.
+
+    A model card describes a model on one engine, the program that runs it.
+    """
     return [card for name in names() for card in each_engine(name)]
 
 
 def resolve(text: str, engine: str | None = None) -> Card:
-    """Return the model card of what a user names as the model: `text`, as typed after `--model`.
+    """Return the model card, which describes a model, for `text` as typed after `--model`.
 
-    It is a card's name, a server's URL, `replay:RUN_DIR`, a path or a hub id, tried in this order.
-    `engine` chooses the engine if there is a choice. The server at a URL is asked what it serves.
-    Raises UserError if there is no such model or engine, or the model does not run on the engine;
-    Unanswered if no server answers.
+    The text is the name of a card's TOML file, a server's URL, `replay:RUN_DIR`, a path or a hub
+    id, tried in this order. `engine` chooses the engine if there is a choice. The server at a URL
+    is asked what it serves. Raises UserError if there is no such model or engine, or the model does
+    not run on the engine; Unanswered if no server answers.
     """
     if engine is not None:
         registration(engine)
@@ -112,7 +120,10 @@ def resolve(text: str, engine: str | None = None) -> Card:
 
 
 def argument(card: Card) -> str:
-    """Return the text after `--model` that names this model card, its name if there is none."""
+    """Return the text after `--model` that names the model of this card.
+
+    It is the card's name if a file has this card, or else its server's URL, run, path or hub id.
+    """
     if card.name.partition(":")[0] in names() and load(card.name) == card:
         return card.name
     if card.server:
@@ -123,12 +134,19 @@ def argument(card: Card) -> str:
 
 
 def find_own(stated_card: Card, given: Sequence[Card], where: str, hint: str) -> Card:
-    """Return the user's own model card of the model that a run states.
+    """Return the user's own model card for the model that a run's record states.
 
-    So a run, which may be a stranger's, opens nothing of its own. Only the stated name is looked
-    up, first in `given`, then in the card files; all else is compared. Raises UserError, with
-    `where` and `hint` in the message, if there is no such card or it differs in what decides
-    answers.
+    A model card is the TOML file that describes a model. So a run, which may be a stranger's, opens
+    nothing of its own: only the name is taken from it.
+
+    Args:
+        stated_card: the model card in the run's record.
+        given: cards to look the name up in first; then the card files are searched.
+        where: names the run in messages.
+        hint: what to do, for the message if there is no such card.
+
+    Raises:
+        UserError: there is no such card, or it differs in what decides answers.
     """
     name = printable(stated_card.name)
     card = next((card for card in given if card.name == stated_card.name), None)

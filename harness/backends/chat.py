@@ -58,9 +58,9 @@ class Tokenizer(Protocol):
 
 
 class HubTokenizer:
-    """Make a `Tokenizer` of a tokenizer of the package transformers.
+    """Wrap a tokenizer of the package transformers, to be used as a `Tokenizer` here.
 
-    Its methods mean what those of `Tokenizer` do.
+    It turns texts into token ids and back, and has the model's chat template.
     """
 
     def __init__(self, hub: Any) -> None:
@@ -97,8 +97,9 @@ class HubTokenizer:
 class Chat:
     """Render messages to prompts by a model's chat template, and encode these by its tokenizer.
 
-    The template writes `image_token` for a picture; None if the model takes none. With `system`
-    `first-user`, the system text stands in the first user turn; with None in a message of its own.
+    The template writes `image_token` for a picture; None if the model takes none. `system` says
+    where the system text stands: at the beginning of the first user turn (`first-user`), or in a
+    message of its own (None).
     """
 
     def __init__(
@@ -128,7 +129,10 @@ class Chat:
 
     @property
     def thinking(self) -> Thinking:
-        """Return how its template opens thoughts: `always`, by a `switch`, or `none`."""
+        """Return how the template opens thoughts: `always`, `none`, or if a `switch` is on.
+
+        The switch is a variable of the template, which is set for each prompt.
+        """
         if self._switch:
             return "switch"
         prompt = self.render(({"role": "user", "content": "?"},), thinking=False)
@@ -157,8 +161,9 @@ class Chat:
     def render(self, messages: Sequence[Mapping[str, str]], *, thinking: bool) -> str:
         """Return the prompt of chat messages, as the model reads it up to its answer.
 
-        A picture stands as `image_token`. Raises UserError if the template refuses the messages, or
-        leaves out a text of them.
+        `messages` are dicts with `role` and `content`; `thinking` says whether the model is asked
+        to think first. A picture stands as `image_token`. Raises UserError if the template refuses
+        the messages, or leaves out a text of them.
         """
         template_messages = self._template_messages(with_system(messages, self.system))
         try:
@@ -207,7 +212,8 @@ class Chat:
     def spellings(self, letters: str) -> dict[str, list[int]]:
         """Return, by letter, the ids of all tokens that stand for that letter.
 
-        Such a token is the letter alone, with blanks around it, or as a byte.
+        `letters` is a text such as `ABC`. Such a token is the letter alone, with blanks around it,
+        or as a byte.
         """
         tokens: dict[str, list[int]] = {letter: [] for letter in letters}
         candidates = self.tokenizer.candidates(letters)
@@ -220,9 +226,10 @@ class Chat:
 def in_parts(
     messages: Sequence[Mapping[str, str]], picture: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
-    """Return messages whose contents are lists of parts, as models with vision take them.
+    """Return chat messages whose contents are lists of parts, as models with vision take them.
 
-    A message with the key `image` gets `picture`, the part that stands for it, before its text.
+    `messages` are dicts with `role` and `content`. One with the key `image` gets `picture`, the
+    part that stands for it, before its text.
     """
     return [
         {

@@ -29,7 +29,8 @@ class Refused(UserError):
 class ChatTemplate:
     """Render messages to a model's prompt by its chat template, compiled in a sandbox.
 
-    The text is what transformers renders.
+    A chat template is Jinja text that comes with the model's weights. What it writes is what the
+    package transformers would write.
     """
 
     def __init__(self, name: str, text: str) -> None:
@@ -41,10 +42,11 @@ class ChatTemplate:
             raise UserError(f"{self._shown} is no Jinja ({printable(error)}); {_REMEDY}") from None
 
     def render(self, messages: Messages, **values: Any) -> str:
-        """Return the prompt of some messages; `values` are further names for the template.
+        """Return the prompt of some chat messages, dicts with `role` and `content`.
 
-        Raises Refused if the template refuses the messages, and UserError if rendering takes too
-        much time or memory.
+        `values` are further variables of the template by name, such as `enable_thinking`. Raises
+        Refused if the template refuses the messages, and UserError if rendering takes too much time
+        or memory.
         """
         given = {"tools": None, "documents": None, "add_generation_prompt": True, **values}
         try:
@@ -58,9 +60,10 @@ class ChatTemplate:
 
 
 def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any], ...]:
-    """Return messages with the system text where a model card's `system` wants it.
+    """Return chat messages with the system text where a model's template takes it.
 
-    That is at the beginning of the first user message (`first-user`), or where it is (None).
+    `way` is what the model's TOML file states as `system`: `first-user` puts it at the beginning of
+    the first user message, None leaves it in a message of its own.
     """
     if way != FIRST_USER or len(messages) < 2 or messages[0]["role"] != "system":
         return tuple(messages)
@@ -71,8 +74,8 @@ def with_system(messages: Messages, way: str | None) -> tuple[Mapping[str, Any],
 def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
     """Return the first of a chat's messages whose text is missing in the rendered prompt.
 
-    None if the prompt has all of them, in their turn. White space around a text does not matter,
-    and thoughts of earlier turns may be left out.
+    Messages are dicts with `role` and `content`. None if the prompt has all of them, in their turn.
+    White space around a text does not matter, and thoughts of earlier turns may be left out.
     """
     at = 0
     for message in messages:
@@ -88,7 +91,10 @@ def lost_message(messages: Messages, prompt: str) -> Mapping[str, Any] | None:
 
 
 def needs_first_user(text: str) -> bool:
-    """Return whether a template refuses a system message, but takes its text in the user's."""
+    """Return whether a chat template refuses a system message, but takes its text in the user's.
+
+    `text` is the template's Jinja text.
+    """
     messages = (
         {"role": "system", "content": "Be brief."},
         {"role": "user", "content": "Where to?"},

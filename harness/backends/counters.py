@@ -21,7 +21,11 @@ SAMPLED_S = 0.02  # time between two samples of a power
 
 @dataclass(frozen=True)
 class Counter:
-    """Describe one energy meter (`joules`) or power meter (`watts`) of this machine."""
+    """Describe one energy meter (`joules`) or power meter (`watts`) of this machine.
+
+    `name` is such as `nvml 0`. One of the functions is set: `joules()` returns the joules counted
+    so far, from any start, and `watts()` the present power.
+    """
 
     name: str  # such as `nvml 0`, `rapl package-0` or `jetson VDD_IN`
     joules: Callable[[], float] | None = None  # reads the joules counted so far, from any start
@@ -31,7 +35,7 @@ class Counter:
 def counters(sys: Path = SYS) -> list[Counter]:
     """Return the energy and power meters that can be read on this machine: NVML, RAPL, Jetson.
 
-    `sys` is the folder in which the kernel shows its own.
+    `sys` is the folder in which the kernel shows its own meters, `/sys`.
     """
     return [*_nvml(), *_rapl(sys), *_jetson(sys)]
 

@@ -29,8 +29,8 @@ from harness.prompts.readout import answer_json, letters
 class Choice:
     """Choose the next tokens of a batch of answers: the likeliest, or drawn at a temperature.
 
-    Draws are keyed by the prompt and the answer's number, so other requests, their order and a
-    resume change none.
+    Draws are keyed by the prompt's tokens and the request's `sample`, the answer's number among
+    several to one question, so other requests, their order and a resume change none.
     """
 
     def __init__(self, requests: Sequence[Request], prompts: Sequence[Sequence[int]]) -> None:
@@ -49,7 +49,7 @@ class Choice:
     def next(
         self, session: Session, places: Sequence[int], among: Sequence[Sequence[int] | None]
     ) -> list[int]:
-        """Return the chosen next token id of each sequence that is still written in a session.
+        """Return the chosen next token id of each of n sequences of a session, in its order.
 
         `places` has, for each sequence, the index of its request in the batch; `among` the token
         ids to choose from, None for the whole vocabulary.
@@ -68,7 +68,10 @@ class Choice:
 
 
 class Decoding:
-    """Answer requests in all answer modes with one engine, which only knows tokens."""
+    """Answer requests in all answer modes (free text, constrained, letters) with one engine.
+
+    The engine only reads tokens and gives the probabilities of the next ones.
+    """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -91,11 +94,12 @@ class Decoding:
     def answer(
         self, requests: Sequence[Request], orders: Sequence[Sequence[list[int]]]
     ) -> list[Completion]:
-        """Return the answers to a batch of requests of one answer mode; prompt tokens not counted.
+        """Return the answers to a batch of requests of one answer mode.
 
-        `orders` has the token ids of each request's prompt; for a read-out over several orders of
-        its list one prompt for each, equally many. A single request is timed. The first token of a
-        read-out comes when it is complete.
+        They have no prompt token counts. `orders` has, for each request, the token ids of its
+        prompt: one prompt, or for a read-out (an answer by letters' probabilities) one for each
+        order of the actions in its list, equally many for all. A single request is timed. The first
+        token of a read-out comes when it is complete.
         """
         start_s = time.perf_counter()
         prompts = [prompt for prompt, *_ in orders]

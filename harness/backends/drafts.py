@@ -15,8 +15,9 @@ MOST = 8  # most tokens of a guess
 class Drafts:
     """Remember which token followed which ones in a batch's answers, to guess how others go on.
 
-    The model checks guesses, several tokens at a time, which is faster than writing them. Tokens
-    with digits count as equal. A token is guessed only where all answers went on alike.
+    The model then checks several guessed tokens at a time, which is faster than writing them. For
+    what came before, tokens with digits count as equal. A token is guessed only where all answers
+    went on alike.
     """
 
     def __init__(self, chat: Chat) -> None:
@@ -25,18 +26,19 @@ class Drafts:
         self._numeric: dict[int, bool] = {}
 
     def learn(self, kind: Hashable, tokens: Sequence[int]) -> None:
-        """Remember the last token id of the answer `tokens` as what follows those before it.
+        """Remember that the last token of an answer so far follows those before it.
 
-        `kind` is the form of the answer: answers of other forms are kept apart.
+        `tokens` are the answer's token ids. `kind` tells answers of different forms apart, such as
+        that of the ego and of helpers: they are not guessed by each other.
         """
         place = self._place(kind, tokens[:-1])
         if self._next.setdefault(place, tokens[-1]) != tokens[-1]:
             self._next[place] = None
 
     def after(self, kind: Hashable, tokens: Sequence[int], most: int) -> list[int]:
-        """Return up to `most` guessed token ids after `tokens`; none if nothing is known.
+        """Return up to `most` guessed token ids after the answer so far, `tokens`; none if unknown.
 
-        `kind` is the form of the answer, as `learn` takes it.
+        `kind` tells answers of different forms apart, as in `learn`.
         """
         guess: list[int] = []
         while len(guess) < min(most, MOST):

@@ -28,9 +28,10 @@ CHOSEN = {CONSTANT: ("constants", CONSTANTS), OPEN_LOOP: ("open_loops", OPEN_LOO
 
 
 def open(card: Card, **_: Any) -> "DriverBackend":
-    """Return the backend of the driver that a model card names: a rule that needs no model.
+    """Return the backend of the driver that a model card names: a rule in place of a model.
 
-    Raises UserError if there is none of that name.
+    `card` is what a TOML file of `models/` says. Drivers are such as `cruise` and `brake`; other
+    options of engines are ignored. Raises UserError if there is none of that name.
     """
     if card.name not in REFERENCES:
         raise unknown("driver", card.name, REFERENCES)
@@ -82,7 +83,10 @@ class DriverBackend:
         return Completion(request.id, text, None, None, "stop", None, 1)
 
     def identity(self) -> dict[str, Any]:
-        """Return the driver's name, its answer version, and a digest of the table it chooses by."""
+        """Return the driver's name, the version of its answers, and a digest of its decision table.
+
+        Only drivers that look up their action in a file have such a table.
+        """
         chosen = {}
         if self.driver in CHOSEN:
             name, file = CHOSEN[self.driver]

@@ -15,28 +15,31 @@ from harness.core.image import Image
 
 
 class Session(Protocol):
-    """Describe n token sequences in a model that advance together.
+    """Describe n token sequences in a loaded model that advance together, one for each answer.
 
     The model has read them, and knows its distribution over the next token of each.
     """
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
-        """Return each sequence's likeliest next token id, the lowest of equals.
+        """Return each sequence's likeliest next token id, n of them; of equals the lowest id.
 
         `among` has for each sequence the ids to choose from, None for all.
         """
         ...
 
     def log_probs(self, tokens: Sequence[int] | None = None) -> Floats:
-        """Return log-probabilities of next tokens, `(n, K)` for the K ids in `tokens`.
+        """Return log-probabilities of the next token of each of n sequences, `(n, K)`.
 
-        All ids of the vocabulary are taken for None. Values are normalised over the whole
-        vocabulary.
+        They are those of the K ids `tokens`; None takes all ids of the vocabulary. Values are
+        normalised over the whole vocabulary in either case.
         """
         ...
 
     def advance(self, chunks: Sequence[Sequence[int]]) -> None:
-        """Append token ids to each sequence; an empty chunk leaves it and its distribution."""
+        """Append the token ids `chunks[i]` to each sequence i, which the model reads.
+
+        An empty chunk leaves a sequence and its distribution as they are.
+        """
         ...
 
     def follow(
@@ -44,9 +47,9 @@ class Session(Protocol):
     ) -> list[int]:
         """Append a chunk to each sequence, and as much of its guess as the model would write.
 
-        That is while the guess has the likeliest next tokens. A chunk is not empty, a guess may be.
-        Returns how many tokens of each guess were appended; an engine that checks none appends
-        none.
+        `chunks` and `guesses` have the token ids for each sequence; a chunk is not empty, a guess
+        may be. A guess is appended while its tokens are the likeliest next ones. Returns how many
+        tokens of each guess were appended; an engine that checks none appends none.
         """
         self.advance(chunks)
         return [0] * len(guesses)
@@ -61,7 +64,10 @@ class Session(Protocol):
         ...
 
     def keep(self, places: Sequence[int]) -> None:
-        """Drop all sequences but those at the indices `places`, which are then in this order."""
+        """Drop all sequences but those at the indices `places`, which are then in this order.
+
+        It is called when some answers are finished.
+        """
         ...
 
     def close(self) -> None: ...
@@ -88,10 +94,11 @@ class Engine(Protocol):
         ...
 
     def begin(self, prompts: Sequence[Sequence[int]], exact: Sequence[int] = ()) -> Session:
-        """Return a session that has read some prompts; their common beginning is computed once.
+        """Return a session that has read some prompts; each is one of its sequences.
 
-        No prompt may be empty. The logits of the token ids in `exact` are computed in float32,
-        whatever the weights' number format.
+        A prompt is a list of token ids. Their common beginning is computed once. No prompt may be
+        empty. The logits of the token ids in `exact` are computed in float32, whatever the weights'
+        number format.
         """
         ...
 
@@ -106,9 +113,9 @@ LEAST_SAVED = 64  # fewer tokens saved are cheaper to read than a group of promp
 
 
 def check_logits(largest: Sequence[float]) -> None:
-    """Raise ArithmeticError if one of `largest` is not finite, as from damaged weights.
+    """Raise ArithmeticError if a logit is not finite, as damaged weights make them.
 
-    They are the largest logit of each sequence.
+    `largest` has the largest logit of each sequence.
     """
     if not all(map(math.isfinite, largest)):
         raise ArithmeticError(
@@ -130,10 +137,10 @@ def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
 
 
 def group_by_beginning(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
-    """Yield groups of sequences that share long beginnings, as indices, each index once.
+    """Yield groups of token sequences that share long beginnings, to be read together.
 
-    `sequences` are token ids. A group of its own is made only where that saves reading
-    `LEAST_SAVED` tokens.
+    A group is a list of indices into `sequences`, lists of token ids; each index is in one group. A
+    group of its own is made only where that saves reading `LEAST_SAVED` tokens.
     """
     order = sorted(range(len(sequences)), key=sequences.__getitem__)
     shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]

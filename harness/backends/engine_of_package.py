@@ -28,9 +28,9 @@ UNSTATED = object()
 
 
 class EngineOfPackage:
-    """Check and copy what a package's backend answers, and what it says of itself.
+    """Stand before a backend that another package adds: check and copy what it answers and states.
 
-    All other attributes are passed on to that backend.
+    A wrong answer becomes a one-line UserError. All other attributes are passed on to that backend.
     """
 
     def __init__(self, backend: Backend, card: "Card") -> None:

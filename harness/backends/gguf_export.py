@@ -50,11 +50,11 @@ _DEEPSTACK = {"norm": "norm", "linear_fc1": "fc1", "linear_fc2": "fc2"}
 def export(checkpoint: Path, out: Path, dtype: Dtype = "F16") -> None:
     """Write a saved Qwen3 or Qwen3-VL checkpoint as a GGUF file, whole or not at all.
 
-    The folder has config.json, model.safetensors (float32, float16 or bfloat16), tokenizer.json, a
-    chat template and, of a Qwen3-VL, preprocessor_config.json. Its vision encoder becomes a file
-    beside `out`, named `mmproj-` and the name of `out`. `dtype` is that of matrices; vectors are
-    always F32. Raises UserError for another architecture or tokenizer, and for files that are not
-    whole.
+    The folder `checkpoint` has config.json, model.safetensors (float32, float16 or bfloat16),
+    tokenizer.json, a chat template and, of a Qwen3-VL, preprocessor_config.json. Its vision encoder
+    becomes a file beside `out`, named `mmproj-` and the name of `out`. `dtype` is the number format
+    of matrices in the file; vectors are always F32. Raises UserError for another architecture or
+    tokenizer, and for files that are not whole.
     """
     subject = f"checkpoint {printable(checkpoint)}"
     try:

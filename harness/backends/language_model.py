@@ -82,9 +82,10 @@ class LanguageModel:
         return [self.chat.render(r.messages, thinking=r.thinking) for r in requests]
 
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
-        """Return log-probabilities of the first V token ids after each of n prompts, `(n, V)`.
+        """Return log-probabilities of the first token after each of n prompts, `(n, V)`.
 
-        V is `vocabulary`; the prompts are those of the requests.
+        The prompts are those of the requests, and V is `vocabulary`: the values are of the token
+        ids 0 to V - 1.
         """
         with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))

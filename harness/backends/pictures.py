@@ -27,7 +27,10 @@ def locate_picture(token: int) -> tuple[int, int]:
 
 
 def pictures_in(tokens: Iterable[int]) -> list[int]:
-    """Return the numbers of the pictures whose first token id is among `tokens`, in order."""
+    """Return the numbers of the pictures whose first token id is among `tokens`, in order.
+
+    A picture's number is the one that its negative token ids hold (`locate_picture`).
+    """
     located = (locate_picture(token) for token in tokens if token < 0)
     return [number for number, place in located if place == 0]
 
@@ -35,7 +38,8 @@ def pictures_in(tokens: Iterable[int]) -> list[int]:
 class Pictures(Generic[T]):
     """Keep pictures by number, and the encodings of those that were used last.
 
-    `encode` turns pictures into what an engine's model reads (`T`), one for each.
+    The number is taken from the picture's digest. `encode` turns a list of pictures into what an
+    engine's model reads (`T`), one for each.
     """
 
     def __init__(self, encode: Callable[[list[Image]], list[T]]) -> None:
@@ -44,13 +48,19 @@ class Pictures(Generic[T]):
         self._encoded: OrderedDict[int, T] = OrderedDict()  # the least recently used come first
 
     def add(self, image: Image, count: int) -> list[int]:
-        """Return the `count` negative token ids of a picture, which must stay alive until read."""
+        """Return the negative token ids that stand for a picture in a prompt, `count` of them.
+
+        The `Image` is not kept: the caller must hold it until it is encoded.
+        """
         number = int(image.sha256[:_DIGITS], 16)
         self._images[number] = image
         return [-1 - ((number << _PLACE_BITS) | place) for place in range(count)]
 
     def image(self, number: int) -> Image:
-        """Return a picture by number. Raises LookupError if it is no longer alive."""
+        """Return the picture of a number, as `locate_picture` finds it in a token id.
+
+        Raises LookupError if it is no longer alive: pictures are not kept.
+        """
         if (image := self._images.get(number)) is None:
             raise LookupError(
                 "a picture is gone that a prompt's tokens stand for; look at it again"
@@ -58,9 +68,10 @@ class Pictures(Generic[T]):
         return image
 
     def encodings(self, numbers: Sequence[int]) -> list[T]:
-        """Return the encodings of pictures by number; those not kept are computed in one batch.
+        """Return the encodings of the pictures of these numbers, in order.
 
-        Raises LookupError if such a picture is no longer alive.
+        Those that are not kept are computed in one batch. Raises LookupError if such a picture is
+        no longer alive.
         """
         if new := [number for number in dict.fromkeys(numbers) if number not in self._encoded]:
             self._encoded |= zip(
@@ -74,6 +85,6 @@ class Pictures(Generic[T]):
         return encodings
 
     def forget(self, tokens: Iterable[int]) -> None:
-        """Drop the encodings of the pictures that `tokens` have parts of."""
+        """Drop the encodings of the pictures that some of the token ids `tokens` stand for."""
         for number in {locate_picture(token)[0] for token in tokens if token < 0}:
             self._encoded.pop(number, None)

@@ -14,12 +14,14 @@ MILLION = 1e6
 class Price:
     """Hold what a million tokens of a served model cost, by its maker's price list.
 
-    It is the table `[price]` of a model card: `input` is the price of tokens that the model reads,
-    `output` that of those that it writes, thoughts included, in `currency`.
+    It is the table `[price]` of a model card (a TOML file that describes a model): `input` is the
+    price of tokens that the model reads, `output` that of those that it writes, thoughts included,
+    in `currency`, such as `USD`.
     """
 
     input: _Amount  # of those that the model reads
     output: _Amount  # of those that it writes, thoughts included
+    # of both prices
     currency: Annotated[
         str, Meta(pattern=r"^[A-Z]{3}\Z", description="three capitals, such as USD")
     ]

@@ -30,14 +30,18 @@ OTHER = 0.10  # probability shared by the actions that are neither SLOWER nor th
 
 
 def open(card: Card, **_: Any) -> "Proxy":
-    """Return the backend of the rule `proxy`, which spoils answers as its model card says."""
+    """Return the backend of the rule `proxy`, which spoils some answers as its model card says.
+
+    A model card is the TOML file that describes a model. Options of other engines are ignored.
+    """
     return Proxy(card.failures)
 
 
 class Proxy:
-    """Answer requests by a fixed rule that plans on a scene graph, in place of a language model.
+    """Answer requests by a fixed rule in place of a language model, for tests without one.
 
-    It answers in the form that the prompt asks for. With `failures`, some answers are spoilt.
+    It plans on what the vehicle sees, and answers in the form that the prompt asks for. With
+    `failures`, shares of the answers are spoilt on purpose.
     """
 
     def __init__(self, failures: Failures | None = None) -> None:
@@ -67,7 +71,7 @@ class Proxy:
 
 
 def answers(requests: Sequence[Request]) -> list[str]:
-    """Return the rule's answers to requests as texts, before any is spoilt."""
+    """Return the answers of the rule `proxy` to requests, in order, before any is spoilt."""
     return by_scenario(requests, _answers)
 
 
@@ -98,10 +102,11 @@ def _text(request: Request, view: SceneGraph, intent: dict[str, float]) -> str:
 
 
 def distribution(scenario: Scenario, view: SceneGraph) -> dict[str, float]:
-    """Return the probability that the rule gives each action, by name.
+    """Return the probability that the rule `proxy` gives each action, by the action's name.
 
-    `view` is the scene graph of a viewer: what that vehicle sees. The planner's action is
-    likeliest, and less so the more of the ego's sectors the viewer cannot see.
+    `view` is what the vehicle that is asked sees. The action that the rule plans on it is
+    likeliest, and less so the more of the directions that cars may come from the vehicle cannot
+    see.
     """
     return _hedged(scenario.actions, plan(scenario, view), view)
 
@@ -140,8 +145,9 @@ def _reason(view: SceneGraph) -> str:
 def draw_failure(failures: Failures, request_id: str) -> tuple[str | None, float]:
     """Draw how a request's answer is spoilt (None if not), and its extra delay in seconds.
 
-    The first is a name of `Failures.texts`. The draw depends on the id only, so batch, order,
-    prompt and condition do not change it.
+    `failures` has the shares of answers that are spoilt. The first is a name of `Failures.texts`,
+    such as `prose`. The draw depends on the id only, so batch, order, prompt and the settings that
+    are scored do not change it.
     """
     text, slow = noise.uniforms((2,), "proxy failure", request_id).tolist()
     slow_s = failures.slow_s if slow < failures.slow_tail else 0.0
@@ -155,7 +161,8 @@ def draw_failure(failures: Failures, request_id: str) -> tuple[str | None, float
 def spoil(text: str, how: str, actions: Sequence[str]) -> tuple[str, FinishReason]:
     """Return a good answer's text spoilt as `how` says, and its finish reason.
 
-    `text` ends in compact JSON; `how` is a name of `Failures.texts`, or ValueError is raised.
+    `text` ends in compact JSON, `how` is a name of `Failures.texts`, such as `fence`, and `actions`
+    are the names of the meta-actions. Raises ValueError for another `how`.
     """
     match how:
         case "fence":

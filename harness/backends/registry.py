@@ -31,14 +31,16 @@ class Capabilities:
 
     Other code tests these fields, never an engine's name. `language_model` is false for rules,
     `answer_modes` are the ways in which it can answer, and `thinks` says which models are asked to
-    think first. `renders` says that prompts can be shown as its model reads them, `has_weights`
-    that it loads some, `asks_helpers` that helpers are asked as well as the ego, and `closed_loop`
-    that it answers for new scenes. With `own_latency` its answers were timed earlier; a `reference`
-    is a driver that reports compare models with; `samples` says that it heeds a temperature.
+    think first: `always` all, `card` those whose model card (TOML file) says that they can, `never`
+    none. `renders` says that prompts can be shown as its model reads them, `has_weights` that it
+    loads some, `asks_helpers` that helpers are asked as well as the ego, and `closed_loop` that it
+    answers for new scenes. With `own_latency` its answers were timed earlier; a `reference` is a
+    driver that reports compare models with; `samples` says that it heeds a temperature.
     """
 
-    # whose answers can be timed, and which can be asked to fuse messages
+    # whether it is a model that reads prompts, whose answers are timed and which can fuse messages
     language_model: bool = True
+    # the ways in which it can answer (`Request.answer`)
     answer_modes: tuple[AnswerMode, ...] = ("json", "constrained", "readout", "decision")
     thinks: Literal["always", "card", "never"] = "always"  # if its `card` says so
     # is `Rendering`: its answers can be cached, a check can show what its model reads
@@ -55,13 +57,14 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class Registration:
-    """Describe an engine: what it can do, what its cards need, and how a backend is opened.
+    """Describe an engine: what it can do, what its model cards need, and how a backend is opened.
 
-    `opens`, `finds`, `prepares` and `sees` are functions of a model card, `module:function`: they
-    open a backend, find the weights, prepare fetched ones, and count the tokens of a picture; empty
-    for none. `answers` is the version of the engine's answers. `card_keys` are further keys that
-    its cards may have, `required_keys` those that they must have. `packages` has the packages that
-    it needs by their module, and `install` is the command for these.
+    `opens`, `finds`, `prepares` and `sees` name functions of a model card (the TOML file that
+    describes a model) as `module:function`: they open a backend, find the weights, prepare fetched
+    ones, and count the tokens of a picture; empty for none. `answers` is a version that goes up
+    when the engine answers a request otherwise than before. `card_keys` are further keys that its
+    cards may have, `required_keys` those of them that they must have. `packages` has the packages
+    that it needs by the name of their module, and `install` is the command that installs them.
     """
 
     # `module:function`, called with a card and the options of `open_backend`; returns a backend
@@ -150,7 +153,7 @@ BUILT_IN: Mapping[str, Registration] = {
 
 
 class Engines(Plugins[Registration]):
-    """Hold all engines by name; the registration of a package's engine is checked, and copied."""
+    """Hold the registrations of all engines by name; those of packages are checked and copied."""
 
     def _load(self, name: str) -> Registration:
         package_registration = super()._load(name)
@@ -178,7 +181,10 @@ def registration(engine: str) -> Registration:
 
 
 def capabilities(engine: str) -> Capabilities:
-    """Return what an engine can do, by its name; raises as `registration`."""
+    """Return what an engine can do, by its name.
+
+    Raises UserError if there is none of that name, or a package's engine does not load.
+    """
     return registration(engine).capabilities
 
 
@@ -191,12 +197,13 @@ def reads_prompts(engine: str) -> bool:
 def open_backend(
     card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
 ) -> Backend:
-    """Return the backend of a model card, with its weights loaded.
+    """Return the backend of the model that a model card describes, with its weights loaded.
 
-    The options are for engines with weights. The device is `cpu`, `cuda` or `cuda:N`; None takes
-    CUDA if there is any. `dtype` is a number format instead of the card's; `batch_size` the most
-    requests that go through the engine together. Raises UserError if a package or the weights are
-    missing, an option is wrong, or a file does not load.
+    A model card is what a TOML file of `models/` says. The options are for engines with weights.
+    The device is `cpu`, or a GPU: `cuda` or `cuda:N` of transformers, `gpu` of llama.cpp; None
+    takes a GPU if there is any. `dtype` is a number format instead of the card's; `batch_size` the
+    most requests that go through the engine together. Raises UserError if a package or the weights
+    are missing, an option is wrong, or a file does not load.
     """
     engine = registration(card.engine)
     if package := missing_package(card.engine):
@@ -216,7 +223,11 @@ def open_backend(
 
 
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
-    """Return a model card's backend as `open_backend` does, opened only once in each process."""
+    """Return the backend of the model that a card describes, opened only once in each process.
+
+    The arguments and errors are those of `open_backend`: the device, the number format and the most
+    requests computed together.
+    """
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 
 
@@ -236,7 +247,9 @@ def import_object(place: str) -> Any:
 
 
 def engine_answer(card: "Card", place: str) -> Any:
-    """Return what a function of the model card's engine returns for the card.
+    """Return what a function of an engine returns for a model card, such as the path of weights.
+
+    A model card is the TOML file that describes a model, and an engine the program that runs it.
 
     `place` is where the function is, `module:name`, as the engine's registration has it.
     """
@@ -253,9 +266,10 @@ def missing_package(engine: str) -> str | None:
 
 
 def missing(card: "Card") -> str | None:
-    """Return what keeps a model card's model from running here; None if nothing does.
+    """Return what keeps the model that a card describes from running here; None if nothing does.
 
-    It is the name of a package that is not installed, or `weights`.
+    A model card is the TOML file that describes a model. What is missing is the name of a package
+    that is not installed, or `weights`.
     """
     if package := missing_package(card.engine):
         return package
@@ -270,7 +284,7 @@ def missing(card: "Card") -> str | None:
 def locate(card: "Card") -> Path:
     """Return the path of the weights that a model card names, by the rules of its engine.
 
-    Raises UserError if they are not found.
+    A model card is the TOML file that describes a model. Raises UserError if they are not found.
     """
     where = engine_answer(card, registration(card.engine).finds)
     if not isinstance(where, Path):
@@ -279,9 +293,10 @@ def locate(card: "Card") -> Path:
 
 
 def processor_tokens(card: "Card") -> int | None:
-    """Return how many tokens a model card's own image processor makes of its picture.
+    """Return how many tokens a model's own image processor makes of one picture.
 
-    None if its engine or weights are not installed, or take no pictures.
+    `card` is its model card, which states the picture's size. None if its engine or weights are not
+    installed, or take no pictures.
     """
     if missing(card) or not (sees := registration(card.engine).sees):
         return None

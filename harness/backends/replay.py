@@ -27,10 +27,11 @@ _KEPT = [field.name for field in fields(Completion)[2:] if field.name != "server
 
 
 def open(card: Card, **_: Any) -> "Replay":
-    """Return the backend that answers from the run folder that a model card names.
+    """Return the backend that answers from the folder of an earlier run, which a card names.
 
-    Raises UserError if it is not a finished run, is a driver's run, which has answers of the ego
-    only, or lacks answers that no run can do without.
+    A model card, here made of `replay:` and the folder, names what answers. Options of other
+    engines are ignored. Raises UserError if it is not a finished run, is a rule-based driver's,
+    which has answers of the ego only, or lacks answers that no run can do without.
     """
     run = read(Path(card.weights or ""))
     engine = ENGINES.get(str(run.manifest.model.get("engine")))
@@ -49,9 +50,9 @@ def open(card: Card, **_: Any) -> "Replay":
 class Replay:
     """Answer requests from a finished run, whose answers are found by scene and viewer.
 
-    The viewer is the vehicle that was asked. If other decisions lead to a scene that the run did
-    not reach, the run's model is asked; its identity must be the same. Raises UserError for a
-    prompt other than the one that was answered.
+    The viewer is the vehicle that was asked. If decisions other than the run's lead to a scene that
+    it did not reach, the run's model is asked; its identity must be the same. Raises UserError for
+    a prompt other than the one that was answered.
     """
 
     def __init__(self, run: Run) -> None:
@@ -194,8 +195,8 @@ class Replay:
 class LacksAnswer(UserError):
     """Report that a run has no answer to a question which its own record says was asked.
 
-    `question` is the id of the request; `otherwise` counts the run's answers that the rule-based
-    model here gives otherwise.
+    `question` is the id of the request; `otherwise` counts answers of the run that differ from what
+    the rule-based model here gives, from which they are said to come.
     """
 
     def __init__(self, run: Path, question: str) -> None:
@@ -206,8 +207,9 @@ class LacksAnswer(UserError):
 class Kept(Replay):
     """Answer requests from a finished run, and never open a model.
 
-    So a stranger's run opens nothing: a missing answer raises UserError. A delay that it states of
-    an answer is not taken; only rules declare such, and they are asked.
+    So a run that may be a stranger's opens nothing: a missing answer raises UserError. A delay that
+    the run states of an answer is not taken, since only rules declare delays, and rules are asked
+    again.
     """
 
     def _completion(self, request: Request, answer: Answer) -> Completion:

@@ -55,8 +55,8 @@ class Saved(NamedTuple):
 def read(checkpoint: Path, subject: str) -> Saved:
     """Return what the small files of a Qwen3 or Qwen3-VL checkpoint say.
 
-    `subject` names it in messages. Raises UserError if a file is missing, or says what llama.cpp
-    would take otherwise.
+    `checkpoint` is its folder, and `subject` names it in messages. Raises UserError if a file is
+    missing, or says something that llama.cpp would understand otherwise.
     """
     texts = {
         name: text_of(checkpoint / name, "record")
@@ -125,7 +125,10 @@ def _check(config: Mapping[str, Any], only: Mapping[str, Any], subject: str) -> 
 
 
 def rope(config: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a config's parameters of rotary embeddings; newer files have them in a table."""
+    """Return a config's parameters of rotary position embeddings, by name, such as `rope_theta`.
+
+    Newer config files have them in a table, others among all keys.
+    """
     parameters: Mapping[str, Any] = config.get("rope_parameters") or config
     return parameters
 

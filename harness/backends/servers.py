@@ -66,11 +66,11 @@ _RESERVED = frozenset(
 
 @dataclass(frozen=True)
 class Fields:
-    """Say how a server is sent request fields that servers refuse or call by other names.
+    """Say how a server is sent request fields that some servers refuse or call by other names.
 
-    Each is true (as it is), false (left out), or the name under which it is sent, as in `max_tokens
-    = "max_completion_tokens"`. No other field can be changed. Raises ValueError for a name that
-    another field has.
+    Each is true (sent as it is), false (left out), or the name under which it is sent, as in
+    `max_tokens = "max_completion_tokens"`. No other field can be changed. Raises ValueError for a
+    name that another field has.
     """
 
     max_tokens: _Sent = True  # most tokens of the answer
@@ -144,7 +144,13 @@ _OF_MODELS = {
 class Server:
     """Describe the servers of a model and how they are asked: a model card's `[server]` table.
 
-    Raises ValueError for a URL or variable name that is not allowed, without showing the URL.
+    A model card is the TOML file that describes a model. `base_url` has one URL or several, up to
+    and with `/v1`; `kind` is the server program, which decides how a constrained answer is asked
+    for; `key_env` names the environment variable with the key. `timeout_s` is the longest time of
+    one attempt, in seconds, and `retries` the number of attempts after the first; `top_logprobs` is
+    how many of the likeliest tokens are asked for where letters' probabilities are the answer, None
+    for 20. `fields` are request fields that are left out or renamed. Raises ValueError for a URL or
+    variable name that is not allowed, without showing the URL.
     """
 
     # URL up to and with `/v1`; http or https, without credentials, query or fragment. With a list
@@ -186,9 +192,9 @@ class Server:
     def key(self) -> str | None:
         """Return the server's key; None if its variable is not set.
 
-        A model card may come from others, so it may not have any variable sent to its server.
-        Raises UserError if the variable's name is not that of a key of models, and the user does
-        not list it.
+        A model card (a model's TOML file) may come from others, so it may not have any variable
+        sent to its server. Raises UserError if the variable's name is not that of a key of models,
+        and the user does not list it.
         """
         if not self.key_env or not (key := os.environ.get(self.key_env, "").strip()):
             return None
@@ -219,10 +225,10 @@ class Server:
 
 
 def readable(variable: str) -> bool:
-    """Return whether a model card may have this environment variable sent to its server as a key.
+    """Return whether a model's TOML file may have this environment variable sent as a key.
 
-    It ends in KEY or TOKEN and has the word of a service or a server of models, or the user lists
-    it in `SWARMDRIVE_KEYS`.
+    The key goes to the server that the file names. The name of the variable ends in KEY or TOKEN
+    and has the word of a service or a server of models, or the user lists it in `SWARMDRIVE_KEYS`.
     """
     *words, last = variable.split("_")
     listed = {name.strip() for name in os.environ.get(KEYS, "").split(",")}
@@ -230,7 +236,10 @@ def readable(variable: str) -> bool:
 
 
 def meant(address: str) -> str | None:
-    """Return the base URL that is meant by an address without `http://`; None if unclear."""
+    """Return the base URL that is meant by an address without `http://`; None if unclear.
+
+    It is for the advice in an error message.
+    """
     match = _ADDRESS.fullmatch(address)
     if match is None or address.startswith(("http://", "https://")):
         return None

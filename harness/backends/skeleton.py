@@ -40,10 +40,11 @@ class Branch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Describe a place in a constrained answer where the model decides.
+    """Describe a position in a constrained answer at which the model decides.
 
-    It chooses one of the texts `options`, or, where `most` is above 0, writes a text of at most so
-    many characters. Then one of `branches` follows, or one of `instead` stands in its place: the
+    A constrained answer is JSON whose fixed text is given. The model chooses one of the texts
+    `options`, or, where `most` is above 0, writes a text of at most so many characters. Then one of
+    `branches` (fixed text and the next point) follows. Or one of `instead` stands in its place: the
     end of a list.
     """
 
@@ -55,9 +56,11 @@ class Point:
 
 
 def expand(schema: Mapping[str, Any], branches: Sequence[Branch]) -> list[Branch]:
-    """Return the branches that write a value of a JSON schema, and then go on in `branches`.
+    """Return the ways to write a value of a JSON schema, after which the answer goes on.
 
-    Fixed texts begin and end only beside letters and digits, where tokenizers split as well.
+    Each is a branch: fixed text, and the point after it at which the model decides. `branches` are
+    the ways in which the answer goes on after the value. Fixed texts begin and end only beside
+    letters and digits, where tokenizers split as well.
     """
     if "enum" in schema:
         options = [canonical_json(choice) for choice in schema["enum"]]
@@ -99,15 +102,18 @@ def _after(text: str, branches: Sequence[Branch]) -> list[Branch]:
 
 
 def start(shape: Shape) -> Point:
-    """Return the point at which a constrained answer of a form begins."""
+    """Return the point at which a constrained answer begins.
+
+    `shape` says what the answer's JSON must look like.
+    """
     return Point(("",), 0, tuple(expand(constrained_schema(shape), [Branch("", None)])))
 
 
 def filled(shape: Shape, place: int) -> str:
-    """Return an example of a constrained answer of a form (`Shape`), as text.
+    """Return an example of a constrained answer, as JSON text.
 
-    Where the model would choose, it has the option at index `place`; texts that the model would
-    write are empty.
+    `shape` says what it must look like. Where the model would choose, the text has the option at
+    index `place`; texts that the model would write are empty.
     """
     text, point = "", Branch("", start(shape)).then
     while point:
@@ -117,10 +123,10 @@ def filled(shape: Shape, place: int) -> str:
 
 
 def tokens_after(chat: Chat, before: str, text: str) -> tuple[int, ...]:
-    """Return the token ids of `text` where it follows `before`.
+    """Return the token ids of `text` where it follows the text `before`.
 
-    Some tokenizers mark the beginning of a text. If a token would span both texts, the ids are
-    those of `text` alone.
+    `chat` has the tokenizer. Some tokenizers mark the beginning of a text. If a token would span
+    both texts, the ids are those of `text` alone.
     """
     head, whole = chat.encode(before), chat.encode(before + text)
     return tuple(whole[len(head) :] if whole[: len(head)] == head else chat.encode(text))
@@ -132,8 +138,8 @@ class Ask(NamedTuple):
     `forced` are the token ids of fixed text to append first, `among` the sorted ids to choose from.
     """
 
-    forced: list[int]
-    among: Sequence[int]
+    forced: list[int]  # token ids of fixed text to append first
+    among: Sequence[int]  # token ids to choose from, sorted
 
 
 class Filled(NamedTuple):
@@ -158,7 +164,7 @@ class Leg(NamedTuple):
 
 
 class Skeleton:
-    """Hold the tokens of all constrained answers of a form (`Shape`), for one tokenizer.
+    """Hold the tokens of all constrained answers that a `Shape` allows, for one tokenizer.
 
     A constrained answer is JSON whose fixed text is given, so that the model only fills in values.
     Answers follow a line break, as in every chat template. Raises UserError if the tokenizer cannot

@@ -45,7 +45,10 @@ class Swarm:
 
 
 def open_each(cards: Sequence[Card], opens: Callable[[Card], Backend]) -> list[Backend]:
-    """Return the backend of each model card, in order, opened by `opens`; equal cards share one."""
+    """Return the backend of each model card, in order; equal cards share one.
+
+    `opens` opens the backend of a card, which is what a model's TOML file says.
+    """
     opened = {card: opens(card) for card in dict.fromkeys(cards)}
     return [opened[card] for card in cards]
 
@@ -55,10 +58,11 @@ def together(
 ) -> Backend:
     """Return one backend that passes each request to the model of the agent it is for.
 
-    An agent is one of the models that vehicles of a run ask. `cards` are the agents' model cards
-    and `backends` the opened models, both in the same order, the ego's first. `cache` is the file
-    of the completion cache (stored answers), which each of them then looks in before it asks its
-    model; None for no cache. A single agent needs no routing: its own backend is returned.
+    An agent is one of the models that vehicles of a run ask; a request has its index, 0 the ego's.
+    `cards` are the agents' model cards (what a TOML file says of each) and `backends` the opened
+    models, both in that order. `cache` is the file of answers stored by earlier runs, in which each
+    looks before it asks its model; None for no cache. A single agent needs no routing: its own
+    backend is returned.
     """
     agents = [cached(backend, card, cache) for backend, card in zip(backends, cards, strict=True)]
     return agents[0] if len(agents) == 1 else Swarm(agents)

@@ -142,10 +142,12 @@ def byte_level(model: Any, splits: Sequence[str] = (QWEN2_SPLIT,)) -> Any:
 def counter(
     source: Path | None, card: Card | None = None
 ) -> Callable[[Iterable[Mapping[str, str]]], int] | None:
-    """Return a function that counts the tokens of chat messages, without the chat template's.
+    """Return a function that counts the tokens of chat messages, without those of the template.
 
-    It uses the tokenizer at `source`, or else the one with the model card's weights; None if there
-    is neither. Raises UserError if there is no tokenizer at `source`.
+    The function takes the messages, dicts with the text at `content`, and returns their number. It
+    uses the tokenizer at `source` (a GGUF file, a tokenizer.json or a folder with one), or else the
+    one with the weights that the model card `card` names; None if there is neither. Raises
+    UserError if there is no tokenizer at `source`.
     """
     if source is None and card and card.weights:
         source = _of_weights(card)
@@ -166,6 +168,6 @@ def _of_weights(card: Card) -> Path | None:
 
 
 def summarize_counts(counts: Sequence[int]) -> dict[str, float]:
-    """Return the number `n`, `least`, `mean` and `most` of one or more token counts."""
+    """Return a dict of one or more token counts: their number `n`, `least`, `mean` and `most`."""
     mean = round(sum(counts) / len(counts), 1)
     return {"n": len(counts), "least": min(counts), "mean": mean, "most": max(counts)}

@@ -16,9 +16,11 @@ WIDE, HIGH = 16, 8  # tokens along the sides of a picture whose size the checkpo
 class Vision:
     """Describe how a model takes pictures: their size, and how many tokens they become.
 
-    A token stands for a square of `merge` x `merge` patches. A picture is scaled so that both sides
-    hold whole squares and its area lies within the limits (Qwen2-VL's `smart_resize`), or to one
-    size (Idefics3).
+    `width_px` and `height_px` are the size of the pictures that the model is shown. A token stands
+    for a square of `merge` x `merge` patches, each of `patch_px` x `patch_px` pixels. A picture is
+    scaled so that both sides hold whole squares and its area lies from `least_px` to `most_px`
+    pixels (Qwen2-VL's `smart_resize`), or to the one size `scaled_to_px` (Idefics3); None for no
+    limit.
     """
 
     width_px: Count  # width of the pictures that the model is shown
@@ -52,9 +54,10 @@ class Vision:
         return (width // square) * (height // square)
 
     def difference(self, tokens: int) -> str | None:
-        """Return the error for a processor that makes `tokens` of a picture, or None.
+        """Return an error message if an image processor makes too few or too many tokens.
 
-        It is None if that is how many tokens this record expects.
+        `tokens` is the number that it makes of a picture; None is returned if this record expects
+        as many.
         """
         if tokens == self.tokens:
             return None

@@ -36,7 +36,7 @@ _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 
 def find_checkpoint(card: Card) -> Path:
-    """Return the directory of the checkpoint that a model card names.
+    """Return the directory of the checkpoint that a model card (a model's TOML file) names.
 
     It is looked for as the path given, beside the cards, and in the hub's cache. Raises UserError
     if there is none, or it lacks a file.
@@ -74,7 +74,7 @@ def _check_files(card: Card, checkpoint: Path) -> None:
 
 
 def find_gguf(card: Card) -> Path:
-    """Return the GGUF file that a model card names.
+    """Return the GGUF file that a model card (a model's TOML file) names.
 
     It is looked for as the path given, beside the cards, in a package, and in the hub's cache.
     Raises UserError if there is none, or its projector (the file of its vision encoder) is missing.
@@ -104,13 +104,16 @@ def find_gguf(card: Card) -> Path:
 
 
 def is_gguf(card: Card) -> bool:
-    """Return whether a model card's weights are a GGUF file, on whatever engine."""
+    """Return whether the weights that a model card names are a GGUF file, whatever the engine.
+
+    A model card is the TOML file that describes a model.
+    """
     weights = card.file or card.weights or ""
     return weights.endswith(".gguf") or weights.startswith(packages.PREFIX)
 
 
 def find_weights(card: Card) -> Path:
-    """Return the checkpoint's directory or the GGUF file of a model card.
+    """Return the checkpoint's directory or the GGUF file of a model card, a model's TOML file.
 
     Raises UserError if there is none, or it is not complete.
     """
@@ -118,9 +121,9 @@ def find_weights(card: Card) -> Path:
 
 
 def check_digest(card: Card, file: Path) -> Path:
-    """Return `file`, after comparing its SHA-256 with the model card's, if that has one.
+    """Return `file`, after comparing its SHA-256 with that in its model card, if any.
 
-    Raises UserError if they differ.
+    A model card is the TOML file that describes a model. Raises UserError if they differ.
     """
     if (
         card.sha256
@@ -136,8 +139,9 @@ def check_digest(card: Card, file: Path) -> Path:
 def contradictions(card: Card) -> Iterator[str]:
     """Yield a line for each fact that a model card states otherwise than its weights do.
 
-    The facts are the licence, and a context longer than the weights'; the card's is used. Raises
-    UserError if the weights are not found.
+    The facts are the licence, and a context length above that of the weights. A model card is a
+    TOML file that describes a model; what it states is used. Raises UserError if the weights are
+    not found.
     """
     where = locate(card)
     facts = (
@@ -166,10 +170,11 @@ def _context_tokens(checkpoint: Path) -> int | None:
 
 
 def pull(card: Card) -> Path:
-    """Download a model card's weights into a cache, and return the checkpoint or the GGUF file.
+    """Download the weights that a model card names, and return the checkpoint or GGUF file.
 
-    Raises UserError if there is nothing to fetch, the hub or the registry is not reached or
-    refuses, or the digest is not the card's.
+    They go into a cache. A model card is the TOML file that describes a model. Raises UserError if
+    there is nothing to fetch, the hub or the registry is not reached or refuses, or the digest is
+    not the card's.
     """
     if not capabilities(card.engine).has_weights:
         raise UserError(f"{card.shown} runs on {card.engine}: it has no weights to pull")
@@ -217,12 +222,18 @@ def _download(card: Card) -> None:
 
 
 def hub_commit(folder: Path) -> str | None:
-    """Return the commit of a folder of the hub's cache; None for any other folder."""
+    """Return the commit that a folder of the hub's cache holds; None for any other folder.
+
+    The hub is the server of public models from which weights are downloaded.
+    """
     return folder.name if folder.parent.name == "snapshots" else None
 
 
 def fetching(card: Card) -> str:
-    """Return the advice, for a message, on a checkpoint that is missing or incomplete."""
+    """Return the advice, for an error message, on how to get a checkpoint that is not complete.
+
+    `card` is the model card that names it, the TOML file that describes a model.
+    """
     if Path(card.weights or "").is_absolute():
         return "copy the checkpoint again, or give another directory"
     return f"run `harness model pull {printable(card.name)}`, or point --model at a local directory"

@@ -20,9 +20,10 @@ SUFFIX = ".sparrow"
 
 
 def find(card: Card) -> Path:
-    """Return the file of the sparrow-decider weights that a model card names.
+    """Return the file of the sparrow-decider weights that a model card (a model's TOML file) names.
 
-    The card gives a path, or a file that the package has. Raises UserError if there is none.
+    Sparrow-decider is a package with a model that gives options probabilities. The card gives a
+    path, or a file that the package has. Raises UserError if there is none.
     """
     weights = card.weights or ""
     if (path := Path(weights).expanduser()).suffix == SUFFIX:
@@ -45,9 +46,10 @@ def find(card: Card) -> Path:
 
 
 def open(card: Card, **_: Any) -> "Sparrow":
-    """Return the backend of the sparrow-decider model that a model card names.
+    """Return the backend of the sparrow-decider model that a model card (a TOML file) names.
 
-    Raises UserError if it has none.
+    Sparrow-decider is a package with a model that gives options probabilities; other options of
+    engines are ignored. Raises UserError if the card names none.
     """
     from sparrow_decider import Decider
 
@@ -72,7 +74,11 @@ class Sparrow:
         self._model, self._file = model, file
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return one completion a request, in order, as the package's own server would answer."""
+        """Return one completion for each request, in order.
+
+        Its text is JSON with the actions' probabilities. They are those that the package's own
+        server would answer.
+        """
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Completion:

@@ -27,7 +27,7 @@ Shares = Iterable[tuple[Any, Any]]  # each option with its probability, as state
 def asked_of(request: Request) -> Question:
     """Return the typed question of a request: a text, and options to give probabilities to.
 
-    Raises ValueError if it has none.
+    Raises ValueError if the request has none, as it does in other answer modes than `decision`.
     """
     if request.question is None:
         raise ValueError(f"request {request.id} asks no question; only --answer decision does")
@@ -35,9 +35,9 @@ def asked_of(request: Request) -> Question:
 
 
 def questions(request: Request) -> dict[str, Any]:
-    """Return a request's question as the JSON that System One's API takes.
+    """Return the JSON body of a request's question for the API System One, `POST /v1/systemone`.
 
-    That is `POST /v1/systemone`. The options are in the order of the actions.
+    It has the question's text, and its options in the order of the actions.
     """
     question = asked_of(request)
     meant: Any = {action: question.meanings[action] for action in request.actions}
@@ -88,8 +88,8 @@ def _decisions(
 def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Return the completion in a reply of `POST /v1/systemone`, without its time.
 
-    `payload` is the reply's decoded JSON; `kind` is not used. A malformed reply gives a completion
-    with an error.
+    `payload` is the reply's decoded JSON, `request` the question that it answers; `kind`, the kind
+    of server, is not used. A malformed reply gives a completion with an error.
     """
     try:
         shares = _shares(payload["answers"][NAME], "noul", lambda listed: listed.items())
@@ -101,8 +101,8 @@ def read_systemone(payload: Any, request: Request, kind: Kind = "generic") -> Co
 def read_decisions(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Return the completion in a reply of `POST /v1/decisions`, without its time.
 
-    `payload` is the reply's decoded JSON; `kind` is not used. A malformed reply gives a completion
-    with an error.
+    `payload` is the reply's decoded JSON, `request` the question that it answers; `kind`, the kind
+    of server, is not used. A malformed reply gives a completion with an error.
     """
     try:
         [answer] = payload["answers"]
@@ -166,10 +166,10 @@ def open_systemone(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBacken
     """Return the backend of a decision model whose servers answer `POST /v1/systemone`.
 
     A decision model gives each option of a typed question a probability, and writes no text. `card`
-    is its model card, which has the servers' addresses; each server gets at most `batch_size`
-    requests at a time. Options for models in this process, such as `device`, are ignored. Raises
-    UserError if the servers' models differ or are no decision models, Unanswered if none answers or
-    one refuses the key.
+    is its model card, the TOML file that describes it, which has the servers' addresses; each
+    server gets at most `batch_size` requests at a time. Options for models in this process, such as
+    `device`, are ignored. Raises UserError if the servers' models differ or are no decision models,
+    Unanswered if none answers or one refuses the key.
     """
     return OpenAIBackend(card, batch_size, SYSTEMONE)
 
@@ -178,9 +178,9 @@ def open_decisions(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBacken
     """Return the backend of a decision model whose servers answer OpenAI's `POST /v1/decisions`.
 
     A decision model gives each option of a typed question a probability, and writes no text. `card`
-    is its model card, which has the servers' addresses; each server gets at most `batch_size`
-    requests at a time. Options for models in this process, such as `device`, are ignored. Raises
-    UserError if the servers' models differ or are no decision models, Unanswered if none answers or
-    one refuses the key.
+    is its model card, the TOML file that describes it, which has the servers' addresses; each
+    server gets at most `batch_size` requests at a time. Options for models in this process, such as
+    `device`, are ignored. Raises UserError if the servers' models differ or are no decision models,
+    Unanswered if none answers or one refuses the key.
     """
     return OpenAIBackend(card, batch_size, DECISIONS)

@@ -25,10 +25,11 @@ _PERMUTED: Mapping[str, Mapping[str, str]] = {
 
 
 def find_adapter_gguf(card: Card, base: Path) -> Path | None:
-    """Return the GGUF file of a model card's LoRA adapter, for the model file `base`; else None.
+    """Return the GGUF file of a model card's LoRA adapter; None if the card names none.
 
-    It is the one in the adapter's folder, or made of the safetensors file there and kept in the
-    cache folder. Raises UserError if it cannot be made.
+    `card` is the model card, the TOML file that describes a model, and `base` is the GGUF file of
+    the model that it changes. The adapter's file is the one in its folder, or made of the
+    safetensors file there and kept in the cache folder. Raises UserError if it cannot be made.
     """
     if (folder := find_adapter(card)) is None:
         return None

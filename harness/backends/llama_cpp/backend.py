@@ -37,7 +37,10 @@ def open(
 ) -> "LlamaBackend":
     """Return the backend of a model card's GGUF file, loaded by llama.cpp in a child process.
 
-    Raises UserError if the file is not found, does not load, or an option is not allowed.
+    `card` is the model card, the TOML file that describes a model. `device` is `cpu` or `gpu`, None
+    for a GPU if there is one; `dtype` may be None or `auto`, since the file decides; `batch_size`
+    is the most requests computed together. Raises UserError if the file is not found, does not
+    load, or an option is not allowed.
     """
     if dtype not in (None, "auto"):
         raise UserError(
@@ -53,10 +56,10 @@ class _Died(Exception):
 class Child:
     """Answer requests by a backend in a child process, so that a crash of its engine ends no run.
 
-    Its seconds are measured in the child. After a death, the same requests are asked again
-    together, since a different batch may move an answer by rounding. If that kills the engine, too,
-    they are asked one at a time, and one that kills it again gets a completion with an error. A
-    process that stays stopped is killed.
+    Seconds are measured in the child. If it dies, the same requests are asked again together, since
+    a different batch may move an answer by rounding. If that kills the engine, too, they are asked
+    one at a time, and one that kills it again gets a completion with an error. A process that stays
+    stopped is killed.
     """
 
     def __init__(self, name: str, opener: str, *arguments: Any, **options: Any) -> None:
@@ -89,9 +92,10 @@ class Child:
         return prompts
 
     def call(self, attribute: str, *arguments: Any, **options: Any) -> Any:
-        """Return an attribute of the child's backend by dotted name, or the result if a method.
+        """Return an attribute of the child's backend, or what it returns if it is a method.
 
-        Raises UserError if the backend raised it, or died of the call.
+        `attribute` is its name, dotted for an attribute of an attribute; `arguments` and `options`
+        are those of the method. Raises UserError if the backend raised it, or died of the call.
         """
         for _ in range(2):
             try:

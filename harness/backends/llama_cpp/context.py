@@ -28,8 +28,8 @@ class LlamaContext:
     picture's; a sequence may be cut before or after a picture, but not inside. All have equal room
     in memory that is allocated at first need; when one has filled it, memory of twice the size is
     allocated and all are computed again. (llama.cpp can also share one memory, but then each
-    sequence would attend to all the others' tokens, if only to mask them.) Keys and values are
-    `F32` for F32 weights, or else `F16`.
+    sequence would attend to all the others' tokens, if only to mask them.) Keys and values have the
+    number format `F32` for F32 weights, or else `F16`.
     """
 
     def __init__(
@@ -45,7 +45,10 @@ class LlamaContext:
         self._ends: dict[int, list[int]] = {}  # the position after each token
 
     def fork(self, source: int, copy: int, length: int) -> None:
-        """Make sequence `copy` of the first `length` computed tokens of sequence `source`."""
+        """Make sequence `copy` of the first `length` computed tokens of sequence `source`.
+
+        Both are the sequences' numbers.
+        """
         if length:  # llama.cpp can only copy a whole sequence, so the copy is cut afterwards
             c.llama_memory_seq_cp(self._memory(), source, copy, -1, -1)
             c.llama_memory_seq_rm(self._memory(), copy, self._ends[source][length - 1], -1)
@@ -57,7 +60,10 @@ class LlamaContext:
             c.llama_memory_seq_rm(self._memory(), sequence, -1, -1)
 
     def cut(self, sequence: int, length: int) -> None:
-        """Cut a sequence to its first `length` tokens; recurrent models compute it again."""
+        """Cut the sequence of a number to its first `length` tokens.
+
+        Recurrent models, which cannot go back, compute it again.
+        """
         tokens = self.tokens[sequence][:length]
         if self._model.whole_state:
             self.drop(sequence)
@@ -73,10 +79,10 @@ class LlamaContext:
             self._make(room)
 
     def extend(self, chunks: Mapping[int, Sequence[int]]) -> Logits:
-        """Append tokens, none empty, to some sequences; return logits after, `(n, vocabulary)`.
+        """Append tokens to some sequences; return the logits after them, `(n, vocabulary)`.
 
-        `chunks` has token ids by sequence number; logits are in that order. Raises RuntimeError if
-        llama.cpp fails; all sequences are lost then.
+        `chunks` has token ids, none empty, by the sequence's number; row i of the logits is of its
+        i-th entry. Raises RuntimeError if llama.cpp fails; all sequences are lost then.
         """
         try:
             logits = self._decode(chunks)

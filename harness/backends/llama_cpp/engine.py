@@ -39,7 +39,9 @@ _PICTURES = ("<|image_pad|>", "<image>")  # tokens that chat templates write for
 def open_here(card: Card, file: Path, device: str | None, batch_size: int) -> LanguageModel:
     """Return the backend of a GGUF file loaded in this process, which llama.cpp may abort.
 
-    Raises UserError if it does not load, or the batch size is too large.
+    `card` is the model card, the TOML file that describes a model, `device` is `cpu` or `gpu`, None
+    for a GPU if there is one, and `batch_size` the most requests computed together. Raises
+    UserError if it does not load, or the batch size is too large.
     """
     # a backtrace would start a debugger if there is one
     os.environ.setdefault("GGML_NO_BACKTRACE", "1")
@@ -172,7 +174,8 @@ class LlamaEngine:
     def peek(self, chunks: dict[int, Sequence[int]]) -> Logits:
         """Return the logits after further tokens of some sequences, which then drop these tokens.
 
-        `chunks` has the tokens by sequence number; the logits are `(n, vocabulary)`.
+        `chunks` has the token ids by the sequence's number; the logits are `(n, vocabulary)`, in
+        that order.
         """
         lengths = {place: len(self.context.tokens[place]) for place in chunks}
         logits = self.context.extend(chunks)
@@ -181,7 +184,10 @@ class LlamaEngine:
         return logits
 
     def forget(self) -> None:
-        """Drop kept beginnings and free the memory: where sequences lie moves numbers."""
+        """Drop kept beginnings of prompts and free the memory.
+
+        Where sequences lie in memory moves logits by rounding.
+        """
         self.context.free()
         self._set_places()
 
@@ -197,7 +203,7 @@ class LlamaEngine:
         self._free += places
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers: llama.cpp's build, the file, and settings.
+        """Return what decides the answers, by name: llama.cpp's build, the file, and settings.
 
         The file is named by its commit on the hub, or else by its SHA-256 digest.
         """

@@ -17,7 +17,10 @@ _errors: list[str] = []
 
 @c.llama_log_callback  # type: ignore[untyped-decorator]
 def keep_errors(level: int, text: bytes, _: Any) -> None:
-    """Keep llama.cpp's error messages for `last_error`, and drop its other log messages."""
+    """Keep llama.cpp's error messages for `last_error`, and drop its other log messages.
+
+    It is the library's log callback: `level` is llama.cpp's log level, and `text` the message.
+    """
     if level == _ERROR:
         _errors.append(text.decode(errors="replace").strip())
 
@@ -32,7 +35,10 @@ def last_error() -> str:
 
 
 class LlamaModel:
-    """Hold a GGUF file loaded by llama.cpp, perhaps with a LoRA adapter; also its `Tokenizer`."""
+    """Hold a GGUF file loaded by llama.cpp, perhaps with a LoRA adapter.
+
+    It is also the model's `Tokenizer`.
+    """
 
     def __init__(
         self, name: str, file: Path, device: str | None, adapter: Path | None = None

@@ -25,11 +25,11 @@ MOST_TOKENS = 1 << 16  # most tokens of a picture whose processor has no limit
 
 
 class Run(NamedTuple):
-    """Hold tokens of one text or picture, which llama.cpp reads in one call.
+    """Hold consecutive tokens of one text or picture, which llama.cpp reads in one call.
 
     `inputs` are n token ids, (n,) int32, or embeddings, (n, width) float32. `places`, (1, n), or
-    (4, n) for a picture with M-RoPE, are their positions in the prompt from that of the first, and
-    `span` is how many positions they take.
+    (4, n) for a picture with M-RoPE (positions by time, height and width), are their positions in
+    the prompt counted from that of the first, and `span` is how many positions they take.
     """
 
     inputs: NDArray[Any]  # token ids, (n,) int32, or embeddings, (n, width) float32
@@ -37,7 +37,7 @@ class Run(NamedTuple):
     span: int  # number of positions that they take; a picture may take fewer than it has tokens
 
     def at(self, start: int) -> NDArray[np.int32]:
-        """Return the positions of the tokens in the prompt if the first is at `start`.
+        """Return the positions of the tokens in the prompt if the first is at position `start`.
 
         The shape is that of `places`. The fourth row, with M-RoPE, is no position and stays 0.
         """
@@ -46,13 +46,17 @@ class Run(NamedTuple):
         return shifted
 
     def ends(self, start: int) -> Sequence[int]:
-        """Return the position after each token; for a picture's, that after the whole picture."""
+        """Return, for each token, how many positions of the prompt are taken after it.
+
+        `start` is the position of the first; for each token of a picture it is that after the whole
+        picture.
+        """
         n = len(self.inputs)
         return range(start + 1, start + n + 1) if self.inputs.ndim == 1 else [start + self.span] * n
 
 
 def text_run(ids: Sequence[int]) -> Run:
-    """Return the run of a text's token ids."""
+    """Return the `Run` of a text's token ids, of one position each."""
     return Run(np.array(ids, dtype=np.int32), np.arange(len(ids), dtype=np.int32)[None], len(ids))
 
 

@@ -37,9 +37,9 @@ _CLOSED_S = 5.0  # longest wait for connections to close
 def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
     """Return the backend of the model behind the servers that a model card names.
 
-    Each server gets at most `batch_size` requests at a time; other options of engines are ignored.
-    Raises UserError if the servers' models differ, Unanswered if none answers or one refuses the
-    key.
+    `card` is what a model's TOML file states. Each server gets at most `batch_size` requests at a
+    time; options for models in this process are ignored. Raises UserError if the servers' models
+    differ, Unanswered if none answers or one refuses the key.
     """
     return OpenAIBackend(card, batch_size)
 
@@ -94,9 +94,9 @@ class OpenAIBackend:
         ]
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides answers, as far as the servers state it of their model.
+        """Return what decides answers, by name, as far as the servers state it of their model.
 
-        If any of several servers may answer, their URLs are not part of it: they are `several`.
+        If any of several servers may answer, their URLs are not part of it: `several` has them.
         """
         model = self._pool.model
         version = {} if model.version is None else {"version": model.version}

@@ -35,11 +35,12 @@ class _Listed(NamedTuple):
 
 
 def served_card(text: str) -> Card:
-    """Return the model card of a model at `URL`, `URL#NAME` or `openai:NAME`, by asking its server.
+    """Return a model card (a description of a model) after asking a server what it serves.
 
-    The key in `OPENAI_API_KEY`, if there is one, goes to that server. Raises UserError if the text
-    is no base URL or does not say which of several models is meant, Unanswered if no server answers
-    or it refuses the key.
+    `text` is a base `URL`, `URL#NAME` for one of several models, or `openai:NAME` for the server at
+    `OPENAI_BASE_URL` or OpenAI's own. The key in `OPENAI_API_KEY`, if there is one, goes to that
+    server. Raises UserError if the text is no base URL or does not say which of several models is
+    meant, Unanswered if no server answers or it refuses the key.
     """
     address, _, name = text.partition("#")
     if address.startswith("openai:"):

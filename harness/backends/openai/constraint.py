@@ -38,9 +38,10 @@ _SHOWN = 40  # characters of an answer that an error shows
 
 @lru_cache
 def constraint(kind: Kind, shape: Shape) -> Mapping[str, Any]:
-    """Return the request fields by which a kind of server constrains answers to a form.
+    """Return the request fields by which a kind of server makes the model keep to an answer's form.
 
-    Depending on the kind they hold a regular expression, a grammar or a JSON Schema.
+    `kind` is the server program, such as `vllm`, and `shape` says what the answer's JSON must look
+    like. Depending on the kind the fields hold a regular expression, a grammar or a JSON Schema.
     """
     schema = constrained_schema(shape)
     match _BY_PATTERN.get(kind):
@@ -55,8 +56,9 @@ def constraint(kind: Kind, shape: Shape) -> Mapping[str, Any]:
 def broken(kind: Kind, request: Request, text: str, ended: bool) -> str | None:
     """Return where an answer breaks the constraint that was sent, in words; None if nowhere.
 
-    `text` is without a thought that the server took out. If the model has not `ended` it, it need
-    only be the beginning of what fits.
+    `kind` is the server program, such as `vllm`, `request` the question, and `text` the answer
+    without a thought that the server took out. If the model has not `ended` it, it need only be the
+    beginning of what fits.
     """
     reader = _Reader(text, compact=kind in _BY_PATTERN)
     try:

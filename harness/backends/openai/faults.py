@@ -34,7 +34,10 @@ def may_pass(status: int) -> bool:
 
 
 def error_words(payload: Any) -> str:
-    """Return the words in an error's JSON, at `error`, `error.message`, `message` or `detail`."""
+    """Return the words in an error's decoded JSON, where servers put them.
+
+    That is at `error`, `error.message`, `message` or `detail`.
+    """
     reason = None
     try:
         while isinstance(payload, dict):
@@ -48,10 +51,10 @@ def error_words(payload: Any) -> str:
 
 
 def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:
-    """Return the error in JSON that came with HTTP 200, or in a stream's event; else None.
+    """Return the error in JSON that came with HTTP 200, or in a stream's event; None if none.
 
-    With `of_chat`, where a chat completion is expected, a bare text, or words without any choice,
-    are an error as well.
+    `payload` is the decoded JSON. With `of_chat`, where a chat completion is expected, a bare text,
+    or words without any choice, are an error as well.
     """
     if of_chat and isinstance(payload, str) and payload.strip():
         return Fault(payload)

@@ -59,7 +59,7 @@ class Reply(Struct, frozen=True):
     retries: int = 0  # earlier failed attempts at the server that gave this reply
     begun_s: float = 0.0  # when the first attempt began, by `time.perf_counter`
     alone: bool = False  # whether the server had no other request of this program at the time
-    url: str = ""
+    url: str = ""  # address of the server that replied
 
 
 class Client:
@@ -90,10 +90,10 @@ class Client:
         await self._session.close()
 
     async def get(self, base: str, url: str, content: bytes | None = None) -> Reply:
-        """Return the reply to a GET of a URL, or to a POST of JSON if `content` is given.
+        """Return the reply to a GET of `url`, or to a POST of the JSON `content` if it is given.
 
-        For what a server states of itself, within `CONNECT_S` seconds. `base` is the server's base
-        URL.
+        It is for what a server states of itself, within `CONNECT_S` seconds. `base` is the server's
+        base URL, whose key is sent.
         """
         method = "GET" if content is None else "POST"
         return await self._once(method, base, url, content, min(CONNECT_S, self._server.timeout_s))

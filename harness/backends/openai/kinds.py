@@ -16,7 +16,7 @@ SWITCH = "enable_thinking"  # name of the thinking switch in chat templates
 
 
 class ServerKind:
-    """Describe how a kind of server is recognised, and what it can tell of its model.
+    """Describe how a server program (vLLM, Ollama, ...) is recognised, and what it can tell.
 
     This base class is of a server that has nothing but a list of models.
     """
@@ -24,15 +24,26 @@ class ServerKind:
     path = ""  # where it tells that it is one; empty if nowhere
 
     def is_one(self, payload: Mapping[str, Any]) -> bool:
-        """Return whether a server is of this kind, by the decoded JSON that it has at `path`."""
+        """Return whether a server is of this kind.
+
+        `payload` is the decoded JSON object that the server returns for `path`.
+        """
         return False
 
     async def states(self, model: str, ask: Ask) -> Statement:
-        """Return the server's version, or None, and what it states of the model by that name."""
+        """Return the server's version, None if unknown, and a dict of what it states of a model.
+
+        `model` is the model's name there. `ask` requests a path of the server, given the path
+        beside `/v1` and JSON to post (None for a GET), and returns its reply.
+        """
         return None, {}
 
     async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
-        """Return the model's chat template, empty if unknown, and how the model thinks."""
+        """Return a model's chat template, empty if unknown, and how the model thinks.
+
+        That is `switch` if a request can turn it on and off, `none` else or if unknown. `model` is
+        the model's name there; `ask` requests a path of the server, as in `states`.
+        """
         return "", "none"
 
 
@@ -121,9 +132,10 @@ class VLLM(ServerKind):
         return fields_of(await ask("/version", None)).get("version"), {}
 
     async def reads(self, model: str, ask: Ask) -> tuple[str, Thinking]:
-        """Return no template, and `switch` if a request's switch changes the prompt's length.
+        """Return no template, and `switch` if a request can turn thinking on and off, else `none`.
 
-        The server's `/tokenize` counts the same messages with thinking on and off.
+        It can if that changes how many tokens `/tokenize` counts in the same messages. `model` is
+        the model's name there; `ask` requests a path of the server.
         """
         chat = {"model": model, "messages": [{"role": "user", "content": "?"}]}
         counts = []
@@ -145,7 +157,10 @@ SERVER_KINDS: Mapping[Kind, ServerKind] = {
 
 
 async def kind_of(ask: Ask) -> Kind:
-    """Return the kind of a server, by what it answers at each kind's `path`; or `generic`."""
+    """Return the kind of a server (its program), by what it answers at each kind's `path`.
+
+    `ask` requests a path of the server. It is `generic` if none fits.
+    """
     probed_kinds = {kind: server for kind, server in SERVER_KINDS.items() if server.path}
     replies = await asyncio.gather(*(ask(server.path, None) for server in probed_kinds.values()))
     for (kind, server), reply in zip(probed_kinds.items(), replies, strict=True):
@@ -160,10 +175,10 @@ def fields_of(reply: Reply) -> dict[str, Any]:
 
 
 def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
-    """Return the entry of a model in the list that a server states at `key`; None if there is none.
+    """Return the entry of a model in a list of models that a server states; None if there is none.
 
-    `payload` is the decoded JSON that holds the list. An only entry is the model's by whatever
-    name.
+    `payload` is the decoded JSON, which has the list at `key`, and `model` the model's name. A
+    list's only entry is taken whatever its name.
     """
     listed = payload.get(key) if isinstance(payload, dict) else None
     entries = (

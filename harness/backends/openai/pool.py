@@ -59,7 +59,10 @@ class _Pending:
 
 
 def pause_s(times: int) -> float:
-    """Return the seconds to wait before the next attempt, after `times` waits in a row."""
+    """Return the seconds to wait before the next attempt at a server, after `times` waits in a row.
+
+    They double with each wait, up to `LONGEST_WAIT_S`.
+    """
     return float(min(FIRST_WAIT_S * 2 ** min(times, 32), LONGEST_WAIT_S))
 
 
@@ -115,11 +118,11 @@ class ServerPool:
     async def post(self, key: str, build: Callable[[], Mapping[str, Any]]) -> Reply:
         """Return a server's reply to a request, after retries if they are needed.
 
-        `key` ranks the servers, so that requests with one key share a prompt cache; `build` makes
-        the body when it is sent. If a server is busy (429), breaks down (5xx), is not reached or
-        takes too long, the request is tried again: at once at another server, or at the same one
-        after the wait that it asks for, or else a doubling one. Raises UserError if one has come
-        back with another model, Unanswered if no server is left.
+        `key` ranks the servers, so that requests with one key share a prompt cache; `build` returns
+        the request's JSON body when it is sent. If a server is busy (429), breaks down (5xx), is
+        not reached or takes too long, the request is tried again: at once at another server, or at
+        the same one after the wait that it asks for, or else a doubling one. Raises UserError if
+        one has come back with another model, Unanswered if no server is left.
         """
         if self._refused:
             raise self._refused

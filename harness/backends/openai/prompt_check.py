@@ -19,11 +19,12 @@ LONGER = 1.5  # times as many characters have more tokens
 
 
 class PromptCheck:
-    """Check that a served model reads every message, before the first answer of each role.
+    """Check that a served model reads every message, before its first answer.
 
-    llama-server renders messages (`/apply-template`), and vLLM counts them (`/tokenize`), without
-    an answer. Of another server only the token counts of its answers are known: `fault` says if
-    they do not grow with the prompts. Prompts with pictures are not checked.
+    It is checked once for the ego's prompt and once for the helpers'. llama-server renders messages
+    (`/apply-template`), and vLLM counts their tokens (`/tokenize`), without an answer. Of another
+    server only the token counts of its answers are known: `fault` says if they do not grow with the
+    prompts. Prompts with pictures are not checked.
     """
 
     def __init__(self, client: Client, card: Card, server: Server) -> None:
@@ -34,7 +35,7 @@ class PromptCheck:
         self._alone = asyncio.Lock()
 
     async def check(self, requests: Sequence[Request]) -> None:
-        """Ask the servers about the first request of each role.
+        """Ask the servers about the first request of each role, `ego` and `helper`.
 
         Raises UserError if the chat template leaves out a message's text.
         """
@@ -48,9 +49,10 @@ class PromptCheck:
                     self._asked.add(request.role)
 
     def fault(self, request: Request, tokens: int | None) -> str | None:
-        """Return why a prompt may have been cut, by the server's count of its tokens; else None.
+        """Return why a server may have cut a prompt, by its token count; None if it has not.
 
-        Some servers cut long prompts to their context in silence, as Ollama does.
+        `tokens` is how many prompt tokens it states for `request`. Some servers cut long prompts to
+        their context in silence, as Ollama does.
         """
         if (
             tokens is None

@@ -25,7 +25,7 @@ class NoText(TypeError):
 
 
 def in_texts(message: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a server's message with its content as one text, also if it came in parts.
+    """Return a server's chat message with its `content` as one text, also if it came in parts.
 
     Parts with thoughts and refusals go to their own fields. Raises NoText for other parts.
     """
@@ -56,7 +56,10 @@ def _text(part: Mapping[str, Any], kind: str) -> str:
 
 
 def thought(message: Mapping[str, Any]) -> str | None:
-    """Return the thought that a server took out of an answer; None if it has no such field."""
+    """Return the thought that a server took out of an answer; None if it has no such field.
+
+    `message` is the message of its reply, as `in_texts` returns it.
+    """
     values = [message.get(name) for name in THOUGHTS]
     texts = [value for value in values if isinstance(value, str)]
     written = [text for text in texts if text]
@@ -64,6 +67,9 @@ def thought(message: Mapping[str, Any]) -> str | None:
 
 
 def refusal(message: Mapping[str, Any]) -> str | None:
-    """Return the words in which a model refuses to answer; None if it does not."""
+    """Return the words in which a model refuses to answer; None if it does not.
+
+    `message` is the message of the server's reply, as `in_texts` returns it.
+    """
     words = message.get(REFUSAL)
     return words if isinstance(words, str) and words.strip() else None

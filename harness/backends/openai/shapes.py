@@ -54,8 +54,9 @@ def body(
 ) -> dict[str, Any]:
     """Return the JSON body of one chat completion request, not streamed.
 
-    `url` makes the URL of its picture. Raises UserError if the request has a temperature and the
-    card sends none.
+    `card` is the model card, the TOML file that describes a model, and `server` its `[server]`
+    table; `url` makes the URL that stands for the request's picture. Raises UserError if the
+    request has a temperature and the card sends none.
     """
     picture = request.image and {"type": "image_url", "image_url": {"url": url(request.image)}}
     messages: list[Any] = []
@@ -99,9 +100,10 @@ def body(
 def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
     """Return the completion in a server's reply to a chat completion request, without its time.
 
-    `payload` is the reply's decoded JSON, and `kind` the kind of server. A malformed reply, or one
-    that breaks the constraint that this kind of server was sent, gives an error in one sentence.
-    The text of a refusal is that of the model that refuses.
+    `payload` is the reply's decoded JSON, and `kind` the kind of server (its program, such as
+    `vllm`). A malformed reply, or one that breaks the constraint that this kind of server was sent,
+    gives a completion with an error in one sentence. The text of a refusal is that of the model
+    that refuses.
     """
     try:
         choice = payload["choices"][0]
@@ -197,15 +199,19 @@ def _read_out(
 
 
 def answering_model(payload: Any) -> str | None:
-    """Return the model that a server names in its reply; None if it names none."""
+    """Return the model that a server names in its reply; None if it names none.
+
+    `payload` is the reply's decoded JSON.
+    """
     model = payload.get("model") if isinstance(payload, dict) else None
     return model if isinstance(model, str) else None
 
 
 def tokens_in(value: Any, characters: int = 0) -> int | None:
-    """Return a token count that a server states of a text of so many characters, or None.
+    """Return a token count that a server states, or None if it cannot be one.
 
-    None if it is no count, or too small or large for the text: latency and energy follow from it.
+    `value` is what it states of a text of so many characters, 0 if unknown. None if it is no whole
+    number, or too small or large for the text: latency and energy are computed from it.
     """
     is_count = type(value) is int and least_tokens(characters) <= value <= MOST_TOKENS
     return value if is_count else None

@@ -65,10 +65,9 @@ class Model(NamedTuple):
         return any(name.rpartition(".")[2] in _WEIGHTS for name in self.states)
 
     def covers(self, earlier: "Model") -> bool:
-        """Return whether it states all that `earlier` did.
+        """Return whether it states all that `earlier`, an earlier statement on the same model, did.
 
-        A server that is still loading states less. `earlier` is what a server stated of the same
-        model before.
+        A server that is still loading states less.
         """
         lists = earlier.listed is None or self.listed is not None
         tells_version = earlier.version is None or self.version is not None
@@ -76,10 +75,15 @@ class Model(NamedTuple):
 
 
 async def read_statement(kind: Kind, weights: str, models: Any, ask: Ask) -> Model:
-    """Return what a server of a kind states of a model that it calls `weights`.
+    """Return what a server states of its model, by which models are told apart.
 
-    `models` is its reply at `/v1/models`, `ask` requests its other paths. A server with one model
-    accepts any name for it. Empty if the model is not in the list.
+    Args:
+        kind: the server program, such as `vllm`.
+        weights: the model's name at the server. One with a single model accepts any name.
+        models: the decoded JSON of its reply at `/v1/models`.
+        ask: requests another path of the server, given the path and JSON to post, or None.
+
+    It is empty if the model is not in the list.
     """
     entry = entry_of(models, "data", weights)
     if entry is None:

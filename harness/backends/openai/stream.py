@@ -20,7 +20,10 @@ _CUT_OFF = "the stream ends before the answer does"
 
 
 class Stream:
-    """Assemble one streamed chat completion from received bytes."""
+    """Assemble one streamed chat completion from the bytes of a server's reply.
+
+    The bytes are server-sent events.
+    """
 
     def __init__(self) -> None:
         # Why it is no completion, with text of the server of any length; None once it is one.
@@ -39,7 +42,10 @@ class Stream:
         self._last_at_s: float | None = None
 
     def take(self, data: bytes, at_s: float) -> None:
-        """Add received bytes, cut anywhere; `at_s` is when they came, by `time.perf_counter`."""
+        """Add bytes of the reply, cut anywhere.
+
+        `at_s` is when they came, in seconds of `time.perf_counter`.
+        """
         *lines, self._rest = (self._rest + data).split(b"\n")
         for line in lines:
             if not self._begun:
@@ -100,6 +106,9 @@ class Stream:
         return None if self._first_at_s == self._last_at_s else self._first_at_s
 
     def payload(self) -> dict[str, Any]:
-        """Return the completion as the JSON value that a server sends without streaming."""
+        """Return the completion as the JSON value that a server sends without streaming.
+
+        It is complete once `fault` is None.
+        """
         choice = {"message": {"content": "", **self._texts}, "finish_reason": self._finish}
         return {"choices": [choice], "usage": self._usage, "model": self._model}

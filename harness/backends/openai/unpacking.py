@@ -26,9 +26,9 @@ class Unpacker:
             )
 
     def take(self, data: bytes, most: int) -> bytes:
-        """Return at most `most` bytes that further packed bytes hold.
+        """Unpack further bytes of the reply, and return at most `most` bytes of what they hold.
 
-        Raises Packed if these are damaged.
+        Raises Packed if they are damaged.
         """
         if self._zlib is None:
             return data

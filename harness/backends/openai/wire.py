@@ -18,9 +18,11 @@ from harness.core.image import Image
 class Wire(NamedTuple):
     """Describe one API of servers: the path, how a request is written, how a reply is read.
 
-    `engine` is the engine of cards whose servers speak it. `body` makes the JSON of a request,
-    `read` the completion of a reply, and `remedy` says what to do about a fault. `decides` says
-    that decision models are asked, which give options probabilities and write no text.
+    `engine` is what a model card (a model's TOML file) names as engine for servers that speak it.
+    `body(card, server, request, url)` makes the JSON of a request, where `url` turns a picture into
+    a URL; `read(payload, request, kind)` makes the completion of a reply's JSON from a kind of
+    server, and `remedy(reply)` says what to do about a fault. `decides` says that decision models
+    are asked, which give options probabilities and write no text.
     """
 
     engine: str  # the engine whose servers speak it
@@ -33,9 +35,10 @@ class Wire(NamedTuple):
     decides: bool  # whether decision models are asked, which write nothing and render no chat
 
     def misfit(self, states: Mapping[str, Fact]) -> str | None:
-        """Return why this API does not suit a model, by what its server states; None if it does.
+        """Return why this API does not suit a model; None if it does, or nothing is known.
 
-        A decision model writes no text, and other models answer no typed questions.
+        `states` has what the model's server states of it, by dotted names. A decision model writes
+        no text, and other models answer no typed questions.
         """
         outputs = str(
             states.get("architecture.output_modalities", states.get("output_modalities", ""))

@@ -37,7 +37,10 @@ def open(
 ) -> LanguageModel:
     """Return the backend of a model card's checkpoint, loaded by the package transformers.
 
-    Raises UserError if the weights are not found, do not load, or an option is not allowed.
+    `card` is the model card, the TOML file that describes a model. `device` is `cpu`, `cuda` or
+    `cuda:N`, None for CUDA if there is any; `dtype` a number format instead of the card's;
+    `batch_size` the most requests computed together. Raises UserError if the weights are not found,
+    do not load, or an option is not allowed.
     """
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
@@ -51,9 +54,10 @@ def open(
 
 
 def checkpoint(card: Card) -> Path:
-    """Return the directory of a model card's checkpoint; a GGUF file is first unpacked into one.
+    """Return the directory of the checkpoint that a model card names, a model's TOML file.
 
-    Raises UserError if it is not found, not complete, or not of the card's digest.
+    A GGUF file that it names is first unpacked into one. Raises UserError if it is not found, not
+    complete, or not of the card's digest.
     """
     if not is_gguf(card):
         where = find_checkpoint(card)
@@ -216,7 +220,7 @@ class TransformersEngine:
         self._reader.forget()
 
     def identity(self) -> dict[str, Any]:
-        """Return what decides the answers: versions, weights, number format and device.
+        """Return what decides the answers, by name: versions, weights, number format and device.
 
         A hub checkpoint is named by its commit, others by a digest of their files.
         """

@@ -23,9 +23,10 @@ from harness.core.image import Image
 
 
 class Processor:
-    """Prepare pictures by a checkpoint's image processor.
+    """Prepare pictures for a vision model by its checkpoint's image processor.
 
-    `tokens` is how many tokens a picture of the model card's size has.
+    `tokens` is how many tokens the model reads for one picture of the size that its model card
+    (TOML file) states.
     """
 
     def __init__(self, name: str, where: Path, vision: Vision) -> None:
@@ -67,7 +68,8 @@ class Processor:
     def measured(self, pixels: Pixels) -> tuple[int, Any]:
         """Return the number of tokens of a picture of this shape, and its grid of patches.
 
-        The grid is `image_grid_thw`, `(1, 3)`, or None if the model has none.
+        `pixels` is RGB, (height, width, 3). The grid is the processor's `image_grid_thw`, `(1, 3)`:
+        patches in time, height and width; None if the model has none.
         """
         if pixels.shape not in self._of_size:
             inputs, config = self([pixels]), self._config.vision_config
@@ -84,7 +86,7 @@ class Processor:
 class Eyes:
     """Encode pictures by the image processor and vision encoder of a loaded transformers model.
 
-    A picture is `image_token` in the chat template.
+    A picture stands as the text `image_token` in the chat template.
     """
 
     def __init__(self, name: str, where: Path, vision: Vision, tokenizer: Any, model: Any) -> None:
@@ -111,10 +113,10 @@ class Eyes:
         return [*self._before, *tokens, *self._after]
 
     def encode(self, tokens: Iterable[int]) -> None:
-        """Encode all pictures of a prompt in one batch, and keep the results.
+        """Encode all pictures of a prompt in one batch, and keep the results for reading them.
 
-        `tokens` are the prompt's. Nothing happens where they are more than are kept: each is
-        encoded when it is read.
+        `tokens` are the prompt's token ids. If they have more pictures than are kept, nothing is
+        done now: each is encoded when it is read.
         """
         numbers = list(dict.fromkeys(pictures_in(tokens)))
         if len(numbers) <= KEPT:
@@ -122,7 +124,10 @@ class Eyes:
                 self._pictures.encodings(numbers)
 
     def inputs(self, ids: torch.Tensor) -> dict[str, Any]:
-        """Return the model's inputs for token ids `(n, width)`: ids and encoded pictures."""
+        """Return the keyword arguments by which the model reads token ids `(n, width)`.
+
+        They are the ids, with those of pictures replaced by the model's own, and encoded pictures.
+        """
         numbers = pictures_in(ids.flatten().tolist())
         token_ids = torch.where(ids < 0, self._filled, ids).to(self._model.device)
         inputs: dict[str, Any] = {"input_ids": token_ids}
@@ -176,9 +181,10 @@ def _markers(tokenizer: Any, written: bool) -> tuple[list[int], list[int]]:
 
 
 def count_tokens(card: Card) -> int:
-    """Return how many tokens a model card's processor makes of a picture of the card's size.
+    """Return how many tokens a model's image processor makes of one picture.
 
-    Raises ValueError if the card takes no pictures, UserError if there is no processor.
+    `card` is its model card (TOML file), which states the picture's size. Raises ValueError if the
+    card takes no pictures, UserError if there is no processor.
     """
     if card.vision is None:
         raise ValueError(f"card {card.name} takes no pictures")

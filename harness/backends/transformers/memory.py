@@ -20,8 +20,8 @@ MOST_TOKENS = 2048  # most tokens kept in total: 0.3 GB for a 4B model with grou
 def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
     """Return one key-value cache with the rows (sequences) of several, which are emptied.
 
-    `order` has indices into the rows of all caches, one cache after the other: row n of the result
-    is row `order[n]`. Short rows end in zeros.
+    `order` has indices into the rows of all caches, counted one cache after the other: row n of the
+    result is row `order[n]`. Short rows are padded by zeros at their end.
     """
     columns = max(cache.get_seq_length() for cache in caches)
     for layers in zip(*(cache.layers for cache in caches), strict=True):
@@ -37,11 +37,11 @@ def join_caches(caches: Sequence[Cache], order: Any) -> Cache:
 class Prefix(NamedTuple):
     """Hold the beginning of a prompt that was read: its token ids, and their keys and values.
 
-    `layers` has each layer's keys and values, `(1, heads, tokens, dim)`.
+    `layers` has each layer's pair of keys and values, each `(1, heads, tokens, dim)`.
     """
 
-    ids: list[int]
-    layers: list[tuple[Any, Any]]
+    ids: list[int]  # token ids
+    layers: list[tuple[Any, Any]]  # keys and values of each layer, (1, heads, tokens, dim) each
 
 
 NOTHING = Prefix([], [])
@@ -50,7 +50,7 @@ NOTHING = Prefix([], [])
 class Prefixes:
     """Keep the keys and values of a few recently read beginnings of prompts.
 
-    At most `MOST_TOKENS` in total; the least recently used is dropped first.
+    At most `MOST_TOKENS` tokens in total; the least recently used is dropped first.
     """
 
     def __init__(self) -> None:

@@ -40,7 +40,8 @@ CPU_TOKENS = 1024
 class Reader:
     """Read prompts with a transformers model, and keep beginnings for later prompts.
 
-    `together` says whether sequences can be padded, and so be read in one batch.
+    `together` says whether several sequences can be padded to one length and read in one batch,
+    which recurrent models and sliding windows do not allow.
     """
 
     def __init__(self, model: Any, eyes: Eyes | None = None) -> None:
@@ -161,15 +162,16 @@ class Reader:
         return None if places[0] is None else places
 
     def forward(self, cache: Cache, ids: Any, mask: Any, columns: Any, places: Any) -> Any:
-        """Read tokens, and return the logits after some columns, `(n, columns, vocabulary)`.
+        """Read tokens of n sequences; return logits after some columns, `(n, columns, vocabulary)`.
 
         Args:
             cache: keys and values so far, to which the new ones are added.
             ids: token ids, (n, width), on the CPU.
             mask: 1 for a token and 0 for a pad, (n, cached + width),
                 or what each token sees, (n, 1, width, cached + width), on the CPU.
-            columns: after how many of the last columns, or after which.
-            places: positions, (n, width) or (3, n, width); None if they are consecutive.
+            columns: how many of the last columns of `ids`, or the indices of columns.
+            places: positions of the tokens in their prompt, (n, width), or (3, n, width) for time,
+                height and width; None if they are consecutive.
         """
         device = self._model.device
         # added to what attention weighs: not every kind of it takes truth values
@@ -192,7 +194,7 @@ class Reader:
 
 
 class Rows:
-    """Advance sequences that are rows of one padded batch of a transformers model."""
+    """Advance sequences that are rows of one padded batch of a transformers model: a `Session`."""
 
     def __init__(self, reader: Reader, cache: Cache, mask: Any, logits: Any, places: Any) -> None:
         """Hold a batch that was read, and the logits after each sequence, `(n, vocabulary)`.
@@ -209,7 +211,8 @@ class Rows:
     ) -> "Rows":
         """Return a session that has read prompts, which all begin with `prefix` and are longer.
 
-        `places` has the positions of each prompt's tokens; None if they are consecutive.
+        `reader` has the model, and `prompts` the token ids. `places` has the positions of each
+        prompt's tokens, `(3, tokens)` for time, height and width; None if they are consecutive.
         """
         n, n_known, cache = len(prompts), len(prefix.ids), reader.cache()
         for i, (keys, values) in enumerate(prefix.layers):
@@ -222,9 +225,9 @@ class Rows:
     def join(cls, parts: Sequence[tuple[Sequence[int], "Rows"]], positions: Any) -> "Rows":
         """Return the sequences of several sessions as one session.
 
-        A part has the indices of its sequences in the whole, and its session. `positions` has the
-        positions of each prompt's tokens, in the order of the whole; None if they are
-        consecutive.
+        Each of `parts` is a pair: the indices of its sequences in the whole, and its session.
+        `positions` has the positions of each prompt's tokens, `(3, tokens)`, in the order of the
+        whole; None if they are consecutive.
         """
         if len(parts) == 1:
             return parts[0][1]
@@ -360,7 +363,7 @@ def _log_probs(logits: Any, tokens: Sequence[int] | None) -> Floats:
 
 
 class Apart(Session):
-    """Advance sequences of a transformers model that are each read on their own.
+    """Advance sequences of a transformers model that are each read on their own: a `Session`.
 
     It is for models with a sliding window or a recurrent state, which padding would change.
     """

@@ -27,9 +27,10 @@ _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 
 
 def unpack_checkpoint(card: Card, file: Path) -> Path:
-    """Return a float32 checkpoint of a GGUF file, made once and kept in the cache folder.
+    """Return the folder of a float32 checkpoint with the weights of a GGUF file.
 
-    Raises UserError if it cannot be made or written.
+    It is made once and kept in the cache folder. `card` is the model card, which names the model in
+    messages. Raises UserError if it cannot be made or written.
     """
     from transformers import __version__
 
