@@ -23,10 +23,12 @@ FIRST: Mapping[str, int] = MappingProxyType({})  # the choice of the first alter
 
 
 class Mark(NamedTuple):
-    """Describe a mark in a template: alternatives to choose from, or parts to put in some order.
+    """Describe a mark in a prompt template: alternatives to choose from, or parts to put in order.
 
-    `start` and `end` are its span in the text, and `parts` the texts. It is written `{% either name
-    %}A{% or %}B{% endeither %}`, or with `order`.
+    A search for better wordings chooses among them. A mark is written `{% either name %}A{% or
+    %}B{% endeither %}`, or with `order`. `start` and `end` are its span in the template's text, as
+    indices of characters; `order` is true where its parts are ordered, and not chosen from; marks
+    of one `name` in both templates are one choice; `parts` are the texts between its tags.
     """
 
     start: int  # where it begins in the template's text
@@ -68,7 +70,8 @@ def _marks(text: str) -> Iterator[Mark]:
 def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
     """Return a template's text with each mark replaced by one of its alternatives.
 
-    `choice` has the number of the alternative, from 0, by the mark's name; others take the first.
+    A mark (see `Mark`) names alternatives in the text. `choice` has the number of the alternative,
+    from 0, by the mark's name; marks that it lacks take the first.
     """
     pieces, place = [], 0
     for mark in _marks(text):
@@ -80,8 +83,9 @@ def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
 def counts(texts: Iterable[str]) -> dict[str, int]:
     """Return the number of alternatives of each mark in some templates, by the mark's name.
 
-    Raises ValueError if a mark has one alternative, too many parts, a reserved name, or other
-    numbers of alternatives elsewhere, and if there are more than `MOST_MARKS` marks.
+    A mark (see `Mark`) names alternatives in a template; `texts` are the templates' texts. Raises
+    ValueError if a mark has one alternative, too many parts, a reserved name, or another number of
+    alternatives elsewhere, and if there are more than `MOST_MARKS` marks.
     """
     sizes: dict[str, int] = {}
     for text in texts:

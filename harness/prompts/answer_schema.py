@@ -25,11 +25,12 @@ EVIDENCE_CHARS = 200
 class Shape(NamedTuple):
     """Describe what an answer's JSON must look like; it decides the schema and the parser.
 
-    A meta-action is what the ego can do in one decision, such as to go slower.
-
-    `role` is `ego` or `helper`, `actions` are the names of meta-actions in order, and `form` is one
-    of the role's `FORMS`, None for any of them. `extension` has the schemas of further members as
-    JSON, empty for none; `placeholders` are what the prompt shows in place of values.
+    `role` is who answers: `ego`, the vehicle that decides, or `helper`, one that sees what the ego
+    cannot. `actions` are the names of meta-actions in order: what the ego can do in one decision,
+    such as to go slower. `form` is `distribution` over the actions, or one action with a
+    confidence: `maneuver` of the ego and `recommendation` of a helper; None for either. `extension`
+    has the JSON Schemas of further members, by name, as JSON text, empty for none; `placeholders`
+    are texts that the prompt shows in place of values, such as `max 12 words`.
     """
 
     role: str  # `ego` or `helper`
@@ -47,7 +48,7 @@ class Shape(NamedTuple):
 
     @property
     def named(self) -> str | None:
-        """Return the key of the action that the answer names; None for a distribution."""
+        """Return the key under which an answer names an action; None if a distribution is asked."""
         return None if self.form == "distribution" else NAMED[self.role]
 
     @property
@@ -63,11 +64,19 @@ def answer_schema(
     extension: str = "",
     placeholders: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of one role's answer; the arguments are a `Shape`'s.
+    """Return the JSON Schema (draft 2020-12) of one role's answer.
 
-    A role is `ego` or `helper`. An answer has one of two forms: a distribution over the actions, or
-    one action with a confidence. `scenario` is in the title only, and `placeholders` nowhere.
-    Raises UserError for an unknown role.
+    Args:
+        role: `ego` or `helper`, who answers.
+        actions: names of the meta-actions, in order.
+        scenario: a name for the schema's title.
+        form: `distribution` over the actions, or one action with a confidence: `maneuver` of the
+            ego, `recommendation` of a helper; None for either.
+        extension: JSON Schemas of further members by name, as JSON text; empty for none.
+        placeholders: not used; it stands here so that all fields of a `Shape` can be passed.
+
+    Raises:
+        UserError: the role is unknown.
     """
     if role not in ROLES:
         raise errors.unknown("role", role, ROLES)
@@ -109,7 +118,8 @@ def closed(properties: Mapping[str, Any]) -> dict[str, Any]:
 def constrained_schema(shape: Shape) -> Mapping[str, Any]:
     """Return the JSON Schema by which decoding is constrained: a model can write nothing else.
 
-    The `form` of `shape` must be set. A helper's evidence is an empty text in it.
+    `shape` says what the answer must look like; its `form` must be set. A helper's evidence is an
+    empty text in it.
     """
     schema = answer_schema(shape.role, shape.actions, form=shape.form, extension=shape.extension)
     schema = {key: value for key, value in schema.items() if key not in ("$schema", "title")}
@@ -122,10 +132,11 @@ def constrained_schema(shape: Shape) -> Mapping[str, Any]:
 
 
 def number_texts(schema: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the texts of numbers among which a constrained answer chooses, for a number's schema.
+    """Return the texts of numbers among which a model may choose in a constrained answer.
 
-    They are steps of a power of ten between `minimum` and `maximum`: 100 to 1000 for type `number`,
-    such as hundredths between 0 and 1; whole numbers for `integer`.
+    `schema` is the number's JSON Schema. The numbers are steps of a power of ten from `minimum` to
+    `maximum`: 100 to 1000 of them for type `number`, such as hundredths between 0 and 1; all whole
+    numbers for `integer`.
     """
     least, most = schema["minimum"], schema["maximum"]
     decimals = 0 if schema["type"] == "integer" else 2 - math.floor(math.log10(most - least))
@@ -135,9 +146,9 @@ def number_texts(schema: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def longest(schema: Mapping[str, Any]) -> int:
-    """Return the greatest number of characters of a value's compact JSON, without escapes.
+    """Return the most characters that a value's compact JSON can have, escapes not counted.
 
-    `schema` is one that `harness.prompts.extension` allows.
+    `schema` is the value's JSON Schema, one that a prompt version may ask for.
     """
     if "enum" in schema:
         return max(len(json.dumps(choice, ensure_ascii=False)) for choice in schema["enum"])
@@ -156,7 +167,10 @@ def longest(schema: Mapping[str, Any]) -> int:
 
 
 def plainest(schema: Mapping[str, Any]) -> Any:
-    """Return a minimal value that fits a JSON Schema: an empty text, the first choice, 0."""
+    """Return a minimal value that fits a JSON Schema: an empty text, the first choice, 0.
+
+    It stands for a further member of an answer that a rule writes, which has nothing to say.
+    """
     if "enum" in schema:
         return schema["enum"][0]
     match schema["type"]:

@@ -15,8 +15,9 @@ REPAIR = "repair"  # any call with the turn that follows an answer that cannot b
 class Outside(NamedTuple):
     """Describe a rendered prompt that has more or fewer tokens than its prompt version allows.
 
-    `messages` counts those of helpers in it, `call` is a role, `FUSION` or `REPAIR`, and `tokens`
-    its size. `scene` and `viewer` are ids; the viewer is the vehicle that is asked.
+    `scene` is the scene's id and `viewer` that of the vehicle that is asked. `messages` counts the
+    helpers' messages in the prompt, and `tokens` is its size. `call` says what it asks: `ego` or
+    `helper` for their own views, `FUSION` for the ego with messages, `REPAIR` to answer again.
     """
 
     scene: str  # its id
@@ -51,10 +52,16 @@ def measure(
 ) -> Sizes:
     """Render every prompt that some scenes can give, and return their sizes in tokens.
 
-    These are the prompt of every viewer, and that of the ego with the longest possible messages of
-    one helper, of two, and so on. `data` is the dataset of the scenes. `count` returns the tokens
-    of a chat's messages; None renders and counts nothing. A picture beside a text costs `picture`
-    tokens. `progress` is called with 1 after each scene.
+    These are the prompt of every vehicle that is asked, and that of the ego with the longest
+    possible messages of one helper, of two, and so on.
+
+    Args:
+        prompt: the prompt version: its templates and settings.
+        data: the dataset of the scenes.
+        scenes: the scenes whose prompts are rendered.
+        count: returns the number of tokens of a chat's messages; None renders and counts nothing.
+        picture: tokens that a picture beside a text costs.
+        progress: called with 1 after each scene.
     """
     words, (least, most) = data.scenario.prompt_words, prompt.token_budget
     turns = {role: densest_repair(prompt, role, data.actions, words) for role in prompt.repair_turn}

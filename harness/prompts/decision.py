@@ -35,12 +35,11 @@ CARE = {
 
 @dataclass(frozen=True)
 class Question:
-    """State a choice between actions, or between other options that a client of a server gives.
+    """State a choice between actions, or other options.
 
-    A decision model gives each option a probability.
-
-    `state` is what the prompt says of the scene, `instructions` what is asked, and `meanings` what
-    each option means, None where nobody says.
+    A decision model gives each option a probability. `state` is what the prompt says of the scene,
+    `instructions` what is asked, and `meanings` what each option means, by its name, None where
+    nobody says. `kind` is the question's type in the API of servers of such models.
     """
 
     state: str  # what the prompt says of the scene
@@ -65,10 +64,15 @@ def question(
     actions: Sequence[str],
     words: Mapping[str, str],
 ) -> Question:
-    """Return the question that a decision model is asked about a scene graph, for its viewer.
+    """Return the question that a decision model is asked about what one vehicle sees.
 
-    The state is the text of the last of `messages`, a prompt's chat about the graph. `words` are
-    the scenario's (`Scenario.prompt_words`).
+    A decision model gives each of the actions a probability, and writes no text.
+
+    Args:
+        messages: the prompt's chat about the scene; the text of the last is the question's state.
+        graph: the scene graph of the vehicle that is asked: what it sees.
+        actions: names of the meta-actions, which are the options.
+        words: texts by which the scenario describes itself, by name, such as `task`.
     """
     ego, task, hiding = graph.ego.id, words.get("task", "drive on"), words.get("hiding")
     care = CARE[graph.role]
@@ -94,10 +98,9 @@ def _meaning(action: str, words: Mapping[str, str]) -> str | None:
 def letter_chat(
     question: Question, messages: Sequence[Mapping[str, str]], order: Sequence[str]
 ) -> tuple[Mapping[str, str], ...]:
-    """Return the chat messages that ask a chat model a decision model's question, by one letter.
+    """Return the chat messages that put a typed question to a chat model, which answers one letter.
 
-    A decision model gives each option of a question a probability; a chat model does so by the
-    letter before it. The actions are listed in `order`, after the state, which all orders share.
+    The options are listed by letter in `order`, after the question's state, which all orders share.
     `messages` are the prompt's chat about the same scene; a picture stays with the last of them.
     """
     meant = (question.meanings[action] for action in order)

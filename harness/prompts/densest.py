@@ -21,7 +21,7 @@ EVIDENCE = dense(EVIDENCE_CHARS)
 
 
 def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Return a message of each sender, for `Prompt.render`, that takes the most tokens.
+    """Return for each sender the message that takes the most tokens, as `Prompt.render` takes it.
 
     `senders` are helpers' ids, `actions` the names of meta-actions. The messages serve to find the
     longest prompt.
@@ -41,10 +41,10 @@ def densest_messages(senders: Sequence[str], actions: Sequence[str]) -> list[Map
 
 
 def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mapping[str, Any]]:
-    """Return a plan of each sender, for `Prompt.render`, that takes the most tokens.
+    """Return for each sender the plan that takes the most tokens, as `Prompt.render` takes it.
 
     A plan is what a vehicle that decides for itself says it will do. `senders` are vehicles' ids,
-    `actions` the names of meta-actions.
+    `actions` the names of meta-actions. The plans serve to find the longest prompt.
     """
     share = round(1 / len(actions), 2)
     return [
@@ -62,10 +62,11 @@ def densest_plans(senders: Sequence[str], actions: Sequence[str]) -> list[Mappin
 def densest_repair(
     prompt: Prompt, role: str, actions: tuple[str, ...], words: Mapping[str, str]
 ) -> tuple[Mapping[str, str], ...]:
-    """Return the longest two messages that a repair turn adds to a chat.
+    """Return the longest two messages that a repair turn adds to a chat of a prompt version.
 
-    A repair turn asks again after an answer that could not be parsed. They are an answer of the
-    greatest length, and the request to write it again.
+    A repair turn asks again after an answer that could not be parsed: the two are an answer of the
+    greatest length, and the request to write it again. `role` is `ego` or `helper`, `actions` are
+    the names of meta-actions, and `words` texts by which the scenario describes itself.
     """
     request = prompt.repair(role, dense(ERROR_CHARS), actions, words)
     answer = dense(prompt.most_answer_tokens(role))

@@ -42,8 +42,8 @@ SETTINGS = (
 class Hunk:
     """Describe one change between two texts A and B, with the words around it.
 
-    It begins in line `line_a` of A and `line_b` of B, from 1; `pieces` are what both have, what
-    only A has and what only B has, in reading order.
+    It begins in line `line_a` of A and `line_b` of B, from 1; `pieces` are pairs in reading order:
+    `same` (in both texts), `removed` (in A only) or `added` (in B only), and the words.
     """
 
     line_a: int  # line of A in which it begins, from 1
@@ -54,7 +54,11 @@ class Hunk:
 
 @dataclass(frozen=True)
 class TextChange:
-    """Hold the word-by-word differences between two texts A and B."""
+    """Hold the word-by-word differences between two texts A and B.
+
+    `hunks` are the changes in order, none if the texts are the same; `removed` counts the words
+    that only A has and `added` those that only B has.
+    """
 
     hunks: tuple[Hunk, ...]  # changes in order; empty if the texts are the same
     removed: int  # number of words that only A has
@@ -65,8 +69,9 @@ class TextChange:
 class PromptChange:
     """Hold the differences between two prompt versions A and B; true if there are any.
 
-    `settings` has name, A's value and B's of each that differs, and `texts` each template's change
-    by the name of its file.
+    A prompt version is a folder of templates and settings. `settings` has, for each setting that
+    differs, its name, A's value and B's, and `texts` the change of each template by the name of its
+    file.
     """
 
     # name, A's value and B's value of each setting that differs; descriptions are left out
@@ -81,9 +86,10 @@ class PromptChange:
 class Sent:
     """Compare the messages about one scene that prompt versions A and B send to a model.
 
-    `words` and `tokens` count A's and B's, None for tokens without a tokenizer; `parts` are the
-    differences by part, such as the system message. The comparison is before any chat template of a
-    model.
+    `viewer` is the id of the vehicle that is asked, and `role` is `ego`, `helper`, or `fusion` for
+    the ego with helpers' messages. `words` and `tokens` count A's and B's, None for tokens without
+    a tokenizer; `parts` has the differences of each part, such as the system message. The
+    comparison is before any chat template of a model.
     """
 
     viewer: str  # id of the vehicle that is asked
@@ -95,7 +101,10 @@ class Sent:
 
 
 def change(a: Prompt, b: Prompt) -> PromptChange:
-    """Compare the settings and the template texts of version A with those of version B."""
+    """Compare the settings and the template texts of prompt version A with those of B.
+
+    A prompt version is a folder of templates and settings.
+    """
     before, after = (dict(_settings(side)) for side in (a, b))
     return PromptChange(
         tuple((name, value, after[name]) for name, value in before.items() if value != after[name]),
@@ -106,7 +115,8 @@ def change(a: Prompt, b: Prompt) -> PromptChange:
 def of_swarm(ego: Prompt, helper: Prompt) -> Prompt:
     """Return a prompt version with the ego's part of `ego` and the helper's part of `helper`.
 
-    It is for a run whose ego and helpers have prompts of different versions.
+    A prompt version is a folder of templates, one for each of the two roles, and settings. It is
+    for a run whose ego and helpers have prompts of different versions.
     """
     of_ego, of_helper = (prompt.examples or Examples("") for prompt in (ego, helper))
     examples = Examples(of_ego.scenario or of_helper.scenario, of_ego.ego, of_helper.helper)
@@ -143,11 +153,12 @@ def sent(
     scenario: Scenario,
     count: Callable[[Iterable[Mapping[str, str]]], int] | None = None,
 ) -> list[Sent]:
-    """Render what prompt versions A and B ask about a scene, and compare it call by call.
+    """Render what prompt versions A and B ask about a scene, and compare it question by question.
 
-    The calls are that of the ego, of its first helper, and of the ego with a message of every
-    helper. `scenario` gives the actions and words of the prompts. `count` counts the tokens of chat
-    messages; None leaves them uncounted.
+    A prompt version is a folder of templates and settings. The questions are that to the ego, that
+    to its first helper, and that to the ego with a message of every helper. `scenario` gives the
+    actions and words of the prompts. `count` returns the number of tokens of chat messages; None
+    leaves them uncounted.
     """
     ego, *helpers = scene.viewers
     questions: list[tuple[str, str, Sequence[str]]] = [(ego, "ego", ())]
@@ -209,9 +220,10 @@ def _count(tokens: Iterable[str]) -> int:
 
 
 def marked(hunk: Hunk) -> list[tuple[Kind, str]]:
-    """Return a hunk's pieces with marks, safe to print: `[-removed-]` and `{+added+}`.
+    """Return the pieces of a change as they are printed, with marks around what differs.
 
-    A line break in a change is shown as ↵.
+    Each is a pair: `same`, `removed` or `added`, and the words. Marks are `[-removed-]` and
+    `{+added+}`. A line break in a change is shown as ↵.
     """
     pieces: list[tuple[Kind, str]] = []
     for kind, text in hunk.pieces:

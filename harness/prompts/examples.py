@@ -22,8 +22,8 @@ EXAMPLES = "examples.json"
 class Example(Struct, frozen=True):
     """Hold one few-shot example: an earlier turn of the chat with the right answer.
 
-    `layout_seed` is the seed of the start situation that it comes from, `graph` what the vehicle
-    that is asked sees there, and `answer` the text that the model should have given.
+    `layout_seed` is the seed of the drawn start situation that it comes from, `graph` what the
+    vehicle that is asked sees there, and `answer` the text that the model should have given.
     """
 
     layout_seed: int  # seed of the layout that it comes from
@@ -35,8 +35,8 @@ class Examples(Struct, frozen=True):
     """Hold the few-shot examples of a prompt version by role, in the order they are shown in.
 
     A few-shot example is an earlier turn of the chat with the right answer; those of `ego` ask the
-    ego, those of `helper` a helper. `scenario` is the one that they come from, and may be shown in,
-    unless `everywhere` is true.
+    ego, those of `helper` a helper. `scenario` names the kind of traffic situation that they come
+    from, the only one in which they may be shown, unless `everywhere` is true.
     """
 
     # the scenario that they come from, and the only one in which they may be shown, unless
@@ -52,7 +52,7 @@ class Examples(Struct, frozen=True):
         return self.ego if role == "ego" else self.helper
 
     def only(self, numbers: Sequence[int]) -> "Examples | None":
-        """Return the examples with these numbers, from 1, of each role in this order.
+        """Return the examples with these numbers, counted from 1, of each role, in this order.
 
         None if `numbers` is empty.
         """
@@ -77,10 +77,11 @@ class Examples(Struct, frozen=True):
 
 
 def read(text: str, where: str) -> Examples:
-    """Parse the JSON text of the file `examples.json` of a prompt version.
+    """Parse the JSON text of the file `examples.json` of a prompt version (a folder of templates).
 
     `where` names the file in messages. Raises UserError if it is no JSON or lacks something, or an
-    example is of another role, or of a layout seed that is not for training.
+    example asks another role than it is listed under, or comes from a start situation that is not
+    for training.
     """
     table = json_loads(text, where)
     if not isinstance(table, dict):

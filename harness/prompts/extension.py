@@ -34,11 +34,12 @@ _CHOICE = re.compile(r'[^"\\]{1,80}')
 
 
 def read(text: str, where: str) -> dict[str, str]:
-    """Return what a prompt version asks for beside the decision, by role, such as a reason.
+    """Return what a prompt version asks for beside the decision, such as a reason, by role.
 
-    `text` is that of its `answer.json`, which has JSON Schemas of such further members; those
-    returned are JSON texts as `Shape.extension` takes them. `where` names the file in messages.
-    Raises UserError if the text is no JSON, or has something that cannot be constrained.
+    A prompt version is a folder of templates; roles are `ego` and `helper`. `text` is that of its
+    `answer.json`, which has JSON Schemas of such further members; those returned are JSON texts as
+    `Shape.extension` takes them. `where` names the file in messages. Raises UserError if the text
+    is no JSON, or has something that cannot be constrained.
     """
     table = json_loads(text, where)
     if not isinstance(table, dict) or not table:

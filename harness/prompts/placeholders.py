@@ -11,9 +11,10 @@ _MEMBER = re.compile(r'"[^"\n]*"\s*:\s*("[^"\n]*"(?=\s*[,}\n])|[^,{}\n]+)')
 
 
 def placeholders(template: str) -> tuple[str, ...]:
-    """Return what a template writes in place of values in the JSON answer that it shows.
+    """Return the texts that a template shows in place of values in the JSON that it asks for.
 
-    It is such as `max 12 words`. A value ends where Jinja fills something in.
+    Such as `max 12 words`; they tell an answer that repeats the prompt from one that has evidence.
+    `template` is the template's text. A value ends where Jinja fills something in.
     """
     text = _JINJA.sub(_FILLED, template)
     values = [

@@ -21,7 +21,7 @@ _BLANKS = " \t\r\n\u2581\u0120\u010a"
 
 
 def letters(actions: Sequence[str]) -> str:
-    """Return one letter for each action, in order: `ABC` for three.
+    """Return one letter for each action, in order, as one text: `ABC` for three.
 
     Raises UserError if there are more actions than letters.
     """
@@ -33,12 +33,18 @@ def letters(actions: Sequence[str]) -> str:
 
 
 def cyclic(actions: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the A cyclic orders of A actions, in which each action has each letter once."""
+    """Return the A cyclic orders of A actions: each begins with another action and goes round.
+
+    In these orders of a list each action has each letter once.
+    """
     return [(*actions[start:], *actions[:start]) for start in range(len(actions))]
 
 
 def spelt(token: str) -> str:
-    """Return a token's text without blanks and their signs around it, so that ` A` becomes `A`."""
+    """Return a token's text without blanks around it, or signs that stand for them.
+
+    So the token ` A` becomes `A`.
+    """
     return token.strip(_BLANKS)
 
 
@@ -55,8 +61,9 @@ def letter_chat(
 ) -> tuple[Mapping[str, str], ...]:
     """Return a chat in which every question asks for the letter of an action.
 
-    Letters are those of `actions`, in order. `answered` has the likeliest action of each earlier
-    answer of the chat `messages`, whose letter replaces the answer.
+    The answer is then read from the letters' probabilities. `messages` are the prompt's chat, with
+    earlier answers if it has examples. Letters are those of `actions`, in order. `answered` has the
+    likeliest action of each earlier answer, whose letter replaces the answer.
     """
     letter, earlier = dict(zip(actions, letters(actions), strict=True)), iter(answered)
 
@@ -69,9 +76,10 @@ def letter_chat(
 
 
 def answer_json(actions: Sequence[str], shares: Sequence[float]) -> str:
-    """Return the JSON of an answer whose probabilities are these shares of the actions.
+    """Return the JSON text of an answer that gives each of the actions its share as probability.
 
-    `shares` has one for each action, of any sum: they are divided by it and rounded to millionths.
+    `shares` has one number for each action, of any sum: they are divided by it and rounded to
+    millionths.
     """
     total = math.fsum(shares)
     p = rounded([share / total for share in shares], parts=10**6)

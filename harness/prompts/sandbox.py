@@ -55,9 +55,10 @@ LONGEST_CHAIN = 3  # filters one after another that need not pay
 
 
 class Code(templates.Code):
-    """Generate shorter code for what prompts do most, with the same result as Jinja's generator.
+    """Generate Python code of a prompt template, shorter than Jinja's, with the same result.
 
-    `_at` is a variable of the generated code, which no template can name.
+    It is shorter for what prompts do most. `_at` is a variable of the generated code, which no
+    template can name.
     """
 
     @optimizeconst
@@ -192,7 +193,11 @@ class Sandbox(templates.Sandbox):
         super()._put_steps_into(source)
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Return whether an expression is known to cost nothing to read, as a number does."""
+        """Return whether an expression of a template is known to cost nothing to read.
+
+        Such is a number. The rendering's budget of steps, which limits its work, is charged for all
+        others.
+        """
         number = (
             isinstance(node, nodes.Filter) and node.name.removeprefix(templates.FREE) in NUMBERS
         )
@@ -202,9 +207,10 @@ class Sandbox(templates.Sandbox):
         return self.filters["int"](self.filters["round"](value))
 
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
-        """Compute an operator; `*`, `**` and `%` are for numbers only, and powers must be small.
+        """Compute a binary operator of the values `left` and `right` in a prompt template.
 
-        Raises jinja2's SecurityError otherwise.
+        `*`, `**` and `%` are for numbers only, and powers must be small; raises jinja2's
+        SecurityError otherwise.
         """
         if type(left) is float and operator in ("+", "-", "*") and type(right) in (float, int):
             # costs nothing; the rest takes a microsecond

@@ -35,9 +35,10 @@ class Template:
         self.blocks = tuple(compiled.blocks)
 
     def render(self, variables: Mapping[str, Any], blocks: Sequence[str]) -> list[str]:
-        """Render some blocks of the template, one text each.
+        """Render some blocks (named parts) of the template, and return their texts in that order.
 
-        May raise any exception, since a template is a program.
+        `variables` has the values that the template can read, by name. May raise any exception,
+        since a template is a program.
         """
         templates.begin()
         # `Template.new_context` takes a quarter of a prompt's time

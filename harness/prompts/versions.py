@@ -50,15 +50,19 @@ OF_A_CROSSING = frozenset({"v1", "v2", "v3", "v6", "paper"})
 class Prompt:
     """Hold one prompt version, which turns scene graphs into chats: its templates and settings.
 
-    A version is a folder of templates, one for each role: `ego` or `helper`. A scene graph is what
-    one vehicle, the viewer, sees of a scene. `version` is the folder's name, `released` whether it
-    may no longer change.
+    A version is a folder of templates, one for each role: `ego`, the vehicle that decides, or
+    `helper`. A scene graph is what one vehicle, the viewer, sees of a scene. `version` is the
+    folder's name, `sha256` the digest of its files, and `released` whether it may no longer change.
 
     `texts` has the templates by role, and `max_answer_tokens` the most tokens of an answer by role;
-    `token_budget` bounds those of a rendered prompt. `helper_answer` and `ego_answer` are the forms
-    of answers that are asked for. `max_objects` and `max_conflicts` (None for all) limit what is
-    listed. `examples` are earlier turns with the right answers, `extension` the schemas of further
-    members of an answer by role, and `image` what picture there is; None for none.
+    `token_budget` has the least and most of a rendered prompt. `helper_answer` and `ego_answer` are
+    the forms of answers that are asked for: a distribution over the actions, or one action with a
+    confidence. `max_objects` limits the vehicles that are listed, and `max_conflicts` the points
+    where their paths meet the ego's (None for all). `examples` are earlier turns with the right
+    answers, `extension` has the JSON Schemas of further members of an answer by role, and `image`
+    says what picture there is; None for none. `reasons_first` are the roles asked for reasons
+    before the answer; `shows_words` and `shows_plans` say which messages the ego's template can
+    show.
     """
 
     version: str  # name of its folder
@@ -131,9 +135,9 @@ class Prompt:
 
     @cached_property
     def repair_turn(self) -> tuple[str, ...]:
-        """Return the roles whose unreadable answers are asked for again.
+        """Return the roles (`ego`, `helper`) whose unreadable answers are asked for again.
 
-        Their template has a block `repair`.
+        Their template has a block `repair`, which asks.
         """
         return tuple(role for role in ROLES if "repair" in self._templates[role].blocks)
 
@@ -146,15 +150,16 @@ class Prompt:
 
     @cached_property
     def placeholders(self) -> Mapping[str, tuple[str, ...]]:
-        """Return what templates write in place of values in the JSON answer that they show.
+        """Return the texts that templates show in place of values in the JSON answer, by role.
 
-        It is such as `max 12 words`, by role.
+        Such as `max 12 words`; they tell an answer that repeats the prompt from one that has
+        evidence.
         """
         texts = self.texts if self._templates else {}  # which raises what is wrong with a text
         return {role: placeholders(resolved(text)) for role, text in texts.items()}
 
     def most_answer_tokens(self, role: str) -> int:
-        """Return the most tokens that a role's answer may have.
+        """Return the most tokens that the answer of a role, `ego` or `helper`, may have.
 
         It is `max_answer_tokens`, and one per character of the further members that are asked for.
         """
@@ -164,10 +169,11 @@ class Prompt:
     def repair(
         self, role: str, error: str, actions: tuple[str, ...], words: Mapping[str, str]
     ) -> str:
-        """Render the message that asks a viewer again, since its answer could not be parsed.
+        """Render the message that asks a vehicle again, since its answer could not be parsed.
 
-        `error` is the reason, and `words` are texts by which the scenario describes itself. Raises
-        UserError if the template fails.
+        `role` is `ego` or `helper`, `error` the reason, `actions` are the names of meta-actions,
+        and `words` texts by which the scenario describes itself, by name. Raises UserError if the
+        template fails.
         """
         variables = {"error": error, "actions": actions, "words": words}
         [text] = self._rendered(
@@ -183,15 +189,24 @@ class Prompt:
         words: Mapping[str, str] = NO_WORDS,
         letter: bool = False,
     ) -> tuple[dict[str, str], ...]:
-        """Render the chat messages for one viewer's scene graph, exactly as a model is sent them.
+        """Render the chat messages that ask one vehicle, exactly as a model is sent them.
 
-        The graph's `role` chooses the template. Examples follow the system message as earlier
-        turns. A message with the key `image` has a picture before its text. `messages` are those of
-        helpers to the ego, with `sender`, `evidence`, `risk`, `intent`, `recommended_maneuver` and
-        `confidence`; or with `sender` and `evidence` alone if the version `shows_words`; or agents'
-        plans if it `shows_plans` (`fusion.messages_of`). `words` are texts by which the scenario
-        describes itself. If `letter` is true, a letter is asked for (`readout.letter_chat`) in
-        place of the block `question`. Raises UserError if the template fails.
+        Examples follow the system message as earlier turns. A message with the key `image` has a
+        picture before its text.
+
+        Args:
+            graph: the scene graph of the vehicle that is asked: what it sees. Its `role` chooses
+                the template.
+            actions: names of the meta-actions.
+            messages: those of helpers to the ego, with `sender`, `evidence`, `risk`, `intent`,
+                `recommended_maneuver` and `confidence`; with `sender` and `evidence` alone if the
+                version `shows_words`; vehicles' plans if it `shows_plans` (`fusion.messages_of`).
+            words: texts by which the scenario describes itself, by name.
+            letter: whether one letter is asked for (`readout.letter_chat`) in place of the block
+                `question`.
+
+        Raises:
+            UserError: the template fails.
         """
         system, user = self._render_graph(graph, actions, messages, words, letter, "system", "user")
         turns = self._turns(graph.role, actions, words, letter)
@@ -278,8 +293,8 @@ class Prompt:
 def listed(graph: "SceneGraph", most: int) -> list[int]:
     """Return the indices of the nodes of a scene graph that a prompt lists, at most `most` of them.
 
-    A node is a vehicle that the viewer knows of. Those in conflict with the ego come first, then
-    the nearest to the viewer.
+    A node is a vehicle that the viewer knows of. Those whose paths meet that of the ego come first,
+    then the nearest to the viewer.
     """
     meets = {conflict.vehicle for conflict in graph.conflicts}
     order = [(node.id not in meets, node.forward_m**2 + node.left_m**2) for node in graph.nodes]
@@ -300,13 +315,21 @@ def soonest(conflicts: Sequence["Conflict"]) -> list[int]:
 
 
 def names(where: Path | None = None) -> list[str]:
-    """List the prompt versions that ship and the project's, or those in a folder, sorted."""
+    """List the names of prompt versions (folders of templates), sorted.
+
+    They are those that ship and the project's, or those in the folder `where`.
+    """
     files = where.glob("*/prompt.toml") if where else entries("prompts", "*/prompt.toml")
     return sorted({file.parent.name for file in files})
 
 
 def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
-    """Return why a prompt version may not be used in a scenario, as a phrase; None if it may."""
+    """Return why a prompt version may not be used in a scenario, as a phrase; None if it may.
+
+    A prompt version is a folder of templates, and a scenario a kind of traffic situation. It may
+    not if it speaks of a crossing and there is none, has examples of another scenario, or asks for
+    a member of an answer that has the name of an action.
+    """
     if prompt.version in OF_A_CROSSING and scenario.prompt not in OF_A_CROSSING:
         return f"speaks of a crossing, which {scenario.name} is not"
     if (
@@ -327,10 +350,10 @@ def unfit(prompt: Prompt, scenario: "Scenario") -> str | None:
 
 
 def load(version: str, where: Path | None = None) -> Prompt:
-    """Load a prompt version by name, from the folder `where` if one is given.
+    """Load a prompt version by name, from the folder `where`, or else what ships and the project's.
 
-    Raises UserError if there is no such version, its files are wrong, or it was released and has
-    changed.
+    A prompt version is a folder of templates and settings. Raises UserError if there is no such
+    version, its files are wrong, or it was released and has changed.
     """
     if version not in names(where):
         raise unknown("prompt", version, names(where))
@@ -351,9 +374,11 @@ def load(version: str, where: Path | None = None) -> Prompt:
 
 
 def made(version: str, texts: Mapping[str, str], released: bool = False) -> Prompt:
-    """Return a prompt version made of the texts of its files, by file name in the order of `FILES`.
+    """Return a prompt version made of the texts of its files.
 
-    Raises UserError if one is wrong.
+    A prompt version is a folder of templates and settings. `version` is its name, `texts` has the
+    files' texts by name, in the order of `FILES`, and `released` says whether it may no longer
+    change. Raises UserError if a text is wrong.
     """
     what, sha256 = f"prompt {version} prompt.toml", digest(texts)
     table = {"reasons_first": REASONS_FIRST.get(sha256, ()), **loads(texts["prompt.toml"], what)}
@@ -388,7 +413,12 @@ def made(version: str, texts: Mapping[str, str], released: bool = False) -> Prom
 
 
 def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | None:
-    """Load a prompt version if its files have this digest; None if not, or if it does not load."""
+    """Load a prompt version if its files still have the digest `sha256` that a run states.
+
+    A prompt version is a folder of templates and settings. None if its files have another digest,
+    or if it does not load. `where` is the folder of versions; None for those that ship and the
+    project's.
+    """
     try:
         prompt = load(version, where)
     except UserError:
@@ -397,9 +427,10 @@ def as_it_was(version: str, sha256: str, where: Path | None = None) -> Prompt | 
 
 
 def lock(version: str, where: Path | None = None) -> str:
-    """Release a prompt version, so that it may not change: pin its digest in `released.toml`.
+    """Release a prompt version, so that it may not change, and return the digest of its files.
 
-    The digest is returned.
+    A prompt version is a folder of templates and settings. The digest is pinned in `released.toml`.
+    `where` is the folder of versions; None for those that ship and the project's.
     """
     prompt = load(version, where)
     base = _base(version, where)
@@ -420,7 +451,7 @@ def _base(version: str, where: Path | None) -> Path:
 
 
 def digest(texts: Mapping[str, str]) -> str:
-    """Return the hex digest of a prompt version's files.
+    """Return the hex digest of the files of a prompt version, a folder of templates.
 
     `texts` has their text by name, in the order of `FILES`; files beside those of `FILES` come
     last.
