@@ -26,8 +26,9 @@ class Answer(Struct, frozen=True):
     correction without which the text could not be read.
 
     `intent` has the probabilities in the order of the actions, and `mass` their sum as stated; None
-    without any. `message` is a helper's evidence, risk, maneuver and confidence, None of the ego;
-    `extension` has the further members that the prompt asked for, None without.
+    if the answer names one action. `message` is a helper's evidence, risk, maneuver and confidence
+    by key, None of the ego; `extension` has the further members that the prompt asked for, None
+    without.
     """
 
     intent: values.Intent  # probabilities in the order of the actions
@@ -47,11 +48,17 @@ class Answer(Struct, frozen=True):
 def read(
     members: dict[str, Any], so_far: frozenset[Repair], shape: Shape, divides: bool = False
 ) -> Answer:
-    """Read an answer of this shape from the members of a JSON object.
+    """Read an answer from the members of a JSON object that a model wrote.
 
-    `shape` says which members the prompt asked for. With `divides`, probabilities of any sum above
-    0 are divided by it. `so_far` are the repairs that finding the object took. Raises Failure, with
-    all statuses that apply, if the members give no intent.
+    Args:
+        members: the object's values by key.
+        so_far: the repairs (corrections of the text) that finding the object took.
+        shape: which members the prompt asked for, and the actions.
+        divides: whether probabilities of any sum above 0 are divided by it.
+
+    Raises:
+        Failure: the members give no intent (probabilities of the actions); it has all statuses that
+            apply.
     """
     if values.is_schema(members):
         raise Failure(Status.SCHEMA_ECHO, "the JSON Schema came back instead of an answer")
@@ -176,8 +183,8 @@ def _judgement(
 def recommended(maneuver: str, confidence: float, actions: Sequence[str]) -> values.Intent:
     """Return the intent of an answer that names one action, the rest spread evenly over others.
 
-    `maneuver` is that action and `confidence` its probability. The result has the probabilities of
-    all `actions`, in their order.
+    An intent is the probabilities of the actions. `maneuver` is that action and `confidence` its
+    probability. The result has the probabilities of all `actions`, in their order.
     """
     if len(actions) == 1:
         return (1.0,)

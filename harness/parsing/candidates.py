@@ -30,8 +30,9 @@ _STRAY = frozenset("[](){},;:.\"'`*\\")
 class Candidate:
     """Hold an object in a completion (a model's text) that is shaped like an answer.
 
-    `repairs` are those that reading its `members` took. `lost` are repairs to drop later: they
-    would report as missing what merely could not be read.
+    `repairs` are the corrections that reading its `members` took. `lost` are repairs that would say
+    that a member is missing; they are dropped later, since the text has the member and it merely
+    could not be read.
     """
 
     members: dict[str, Any]  # what it holds
@@ -52,12 +53,19 @@ class _Objects:
 def candidates(
     text: str, role: str, actions: tuple[str, ...], cut: bool, reasons_first: bool = False
 ) -> list[Candidate]:
-    """Return all objects in a text that could be the answer, in the order of the text.
+    """Return all objects in a model's text that could be the answer, in the order of the text.
 
-    The text is a model's, without thought and special tokens; `role` is `ego` or `helper`. `cut`
-    says that the token limit ended it; then an open bracket is not closed. With `reasons_first` the
-    prompt asked for reasons before the answer, and prose there is no repair. Raises Failure
-    (no_json, label_only, truncated_json, syntax or missing_action) if there is no candidate.
+    Args:
+        text: the text without thought and special tokens.
+        role: `ego` or `helper`, who was asked.
+        actions: names of the meta-actions.
+        cut: whether the token limit ended the text; then an open bracket is not closed.
+        reasons_first: whether the prompt asked for reasons before the answer; if not, such text is
+            counted as a repair.
+
+    Raises:
+        Failure: there is no candidate; its status is no_json, label_only, truncated_json, syntax or
+            missing_action.
     """
     escapes: frozenset[Repair] = frozenset()
     objects = _objects(text, cut)
@@ -106,9 +114,10 @@ def candidates(
 
 
 def spans(text: str, role: str, actions: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Return where each object that could be the answer stands in a text, as start and end.
+    """Return where each object that could be the answer stands in a text, as start and end index.
 
-    Empty if `candidates` must change the text to find any.
+    `role` is `ego` or `helper`, and `actions` are the names of meta-actions. Empty if `candidates`
+    must change the text to find any.
     """
     try:
         objects = _objects(text, cut=False)

@@ -23,16 +23,19 @@ _NUMBER = re.compile(r"(?<![\w.])-?(?:\d+(?:\.\d+)?|\.\d+)(?:[eE][-+]?\d+)?(?![\
 
 
 def unreadable() -> Failure:
-    """Build the Failure (syntax) of a text in which json_repair finds no reliable answer."""
+    """Build the Failure (of status syntax) of a text in which json_repair finds no reliable answer.
+
+    Json_repair is a package that repairs broken JSON.
+    """
     return Failure(Status.SYNTAX, "a JSON object was begun but cannot be read without guessing")
 
 
 def mended(text: str, names: Sequence[str], cut: bool) -> tuple[Any, str]:
     """Return the broken object at the start of `text`, repaired, and the text after it.
 
-    It counts only if it holds nothing ambiguous, each of `names` is a key at most once, and the
-    numbers read are the numbers written, in the same order. A text that the token limit `cut` is
-    not repaired. Raises Failure (syntax).
+    It counts only if it holds nothing ambiguous, each of `names`, the keys of an answer, is a key
+    at most once, and the numbers read are the numbers written, in the same order. A text that the
+    token limit ended (`cut`) is not repaired. Raises Failure of status syntax.
     """
     import json_repair
 
@@ -57,11 +60,11 @@ def around(
 ) -> tuple[dict[str, Any], str, str]:
     """Repair a broken object at the start of `text` around one of its values, which can be read.
 
-    The value stands from `at` to `end`, with its numbers as they are written, so the text of other
-    members may hold anything. The object counts only if it has no other members than `fields`, and
-    each text in it stands in `text`. Returned are the other members, the key of the value, and the
-    text after the object. A text that the token limit `cut` is not repaired. Raises Failure
-    (syntax).
+    The value stands from index `at` to `end`, with its numbers as they are written, so the text of
+    other members may hold anything. The object counts only if it has no other members than
+    `fields`, and each text in it stands in `text`. Returned are the other members, the key of the
+    value, and the text after the object. A text that the token limit ended (`cut`) is not repaired.
+    Raises Failure of status syntax.
     """
     import json_repair
 

@@ -94,18 +94,19 @@ def parse(
     finish_reason: str = "stop",
     error: str | None = None,
 ) -> Parsed:
-    """Parse one completion into a status and an intent. Never raises for any text.
+    """Parse one completion (a model's text) into a status and an intent. Never raises for any text.
 
-    A closed thought is what a thinking model should write, and an empty one is what a template
-    adds, so neither is a repair. A closed thought with content is one if the model was not asked to
-    think.
+    An intent is the probabilities of the actions. A closed thought is what a thinking model should
+    write, and an empty one is what a template adds, so neither is a repair (a correction). A closed
+    thought with content is one if the model was not asked to think.
 
     Args:
         text: the completion as it came; of a refusal, the words of the model or none.
         role: `ego` or `helper`; with the next four, the `Shape` of the answer that was asked for.
         actions: meta-action names, in the environment's order.
-        form: one of the role's `FORMS`; None if any of them will do.
-        extension: schemas of further members; empty for none.
+        form: `distribution` over the actions, or one action with a confidence: `maneuver` of the
+            ego, `recommendation` of a helper; None if either will do.
+        extension: JSON Schemas of further members by name, as JSON text; empty for none.
         placeholders: what the prompt shows in place of values, which is no evidence.
         thinking: whether the text must hold a closed thought: the model was asked to think, and the
             engine did not take the thought out of the text.
@@ -174,9 +175,11 @@ def _failed(failure: Failure, thought: str | None) -> Parsed:
 def spans(
     text: str, role: str, actions: Sequence[str], thinking: bool = False
 ) -> list[tuple[int, int]]:
-    """Return the start and end of each answer that `parse` finds in a completion, for display.
+    """Return the start and end index of each answer that `parse` finds in a completion.
 
-    Empty if there is no answer, or if the text had to be rewritten before one was found.
+    They are for display. `role` is `ego` or `helper`, `actions` are the names of meta-actions, and
+    `thinking` says whether the model was asked to think first. Empty if there is no answer, or if
+    the text had to be rewritten before one was found.
     """
     try:
         rest = reasoning.split(text, thinking)[1] if text.strip() else ""

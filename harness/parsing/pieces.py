@@ -22,9 +22,10 @@ Found = tuple[dict[str, Any], frozenset[Repair]]  # members, and the repairs tha
 
 
 def decoded(value: object) -> tuple[Any, frozenset[Repair]]:
-    """Return the JSON object that a text holds, and the repairs; any other value as it is.
+    """Return the JSON object that a text value holds, with the repairs that this took.
 
-    Nearly valid JSON counts, too.
+    A repair is one correction of the text. A model may have written an object in quotes. Nearly
+    valid JSON counts, too. Any other value is returned as it is, without repairs.
     """
     if not isinstance(value, str) or "{" not in value:
         return value, frozenset()
@@ -47,7 +48,8 @@ def decoded(value: object) -> tuple[Any, frozenset[Repair]]:
 def fields_of(members: dict[str, Any], role: str, actions: Sequence[str]) -> set[str]:
     """Return the names of the answer's fields that an object has, whatever their spelling.
 
-    `role` is `ego` or `helper`. Keys that are actions count as `action_distribution`.
+    `members` are the object's values by key, and `actions` the names of meta-actions. `role` is
+    `ego` or `helper`. Keys that are actions count as `action_distribution`.
     """
     names = {match(key, FIELDS[role]) for key in members}
     if any(match(key, actions) for key in members):
@@ -56,18 +58,21 @@ def fields_of(members: dict[str, Any], role: str, actions: Sequence[str]) -> set
 
 
 def decides(fields: set[str], role: str) -> bool:
-    """Return whether an answer with these fields has what decides: an action or a distribution.
+    """Return whether an answer has what decides: an action or a distribution over actions.
 
-    `role` is `ego` or `helper`.
+    `fields` are the names of its members, as `fields_of` returns them, and `role` is `ego` or
+    `helper`.
     """
     return not fields.isdisjoint((_DISTRIBUTION, NAMED[role]))
 
 
 def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list[Found]:
-    """Return the answers that a model wrote into a JSON Schema that it was shown.
+    """Return the answers that a model wrote into a JSON Schema, in place of an answer to it.
 
-    Each comes with the repairs that it took. They stand beside the schema's keywords, or under
-    `properties` in place of types.
+    `schema` is the object that it wrote. Each answer is a pair: its members, and the repairs
+    (corrections) that finding it took. Answers stand beside the schema's keywords, or under
+    `properties` in place of types. `role` is `ego` or `helper`, and `actions` are the names of
+    meta-actions.
     """
     answers: list[Found] = []
     outer = {key: value for key, value in schema.items() if key not in _OF_A_SCHEMA}
@@ -81,9 +86,10 @@ def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list
 
 
 def distribution_in(value: object, actions: Sequence[str]) -> tuple[Any, frozenset[Repair]]:
-    """Return the distribution over actions that stands in a text, and the repairs that it took.
+    """Return the distribution over actions that a value holds, and the repairs that this took.
 
-    It may stand under a schema's `properties`, too. Any other value is returned as it is.
+    A repair is one correction of the text. The distribution may stand in a text, or under a
+    schema's `properties`. Any other value is returned as it is.
     """
     value, repairs = decoded(value)
     inner = _properties(value)
@@ -114,10 +120,12 @@ def _states(members: dict[str, Any], role: str, actions: Sequence[str]) -> bool:
 def gathered(
     members: dict[str, Any], role: str, actions: Sequence[str], apart: Sequence[str]
 ) -> Found:
-    """Return an answer's members, with its fields moved up from one level deeper, and the repairs.
+    """Return an answer's members with its fields moved up from one level deeper, and the repairs.
 
-    Members named in `apart` are left alone. Raises Failure (conflicting_answers) if two members
-    have the same field.
+    A repair is one correction of the text. `members` are the answer's values by key. `role` is
+    `ego` or `helper`, and `actions` are the names of meta-actions. Members whose keys are in
+    `apart` are left alone. Raises Failure (of status conflicting_answers) if two members have the
+    same field.
     """
     given = fields_of(members, role, actions)
     repairs: frozenset[Repair] = frozenset()
@@ -148,7 +156,8 @@ def _two_forms(fields: set[str], role: str) -> bool:
 def are_one(pieces: Sequence[dict[str, Any]], role: str, actions: Sequence[str]) -> bool:
     """Return whether several objects are pieces of one answer of a role, `ego` or `helper`.
 
-    That is so if exactly one of them names an action or a distribution, and no field is in two.
+    `pieces` are the objects' values by key, and `actions` the names of meta-actions. That is so if
+    exactly one of them names an action or a distribution, and no field is in two.
     """
     if len(pieces) < 2 or any(isinstance(piece, relaxed.Repeated) for piece in pieces):
         return False

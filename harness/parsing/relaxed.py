@@ -52,9 +52,9 @@ class Repeated(dict[str, Any]):
 
 
 class Broken(Exception):
-    """Report that the text at a brace cannot be read as an object.
+    """Report that the text at an opening brace cannot be read as an object.
 
-    `meant` is true for broken JSON, and false for a brace in prose.
+    `meant` is true for broken JSON, and false for a brace in prose, which meant none.
     """
 
     def __init__(self, meant: bool) -> None:
@@ -63,16 +63,15 @@ class Broken(Exception):
 
 
 class Unfinished(Exception):
-    """Report that the text ends inside the value."""
+    """Report that the text ends inside the value that is being read."""
 
 
 @dataclass
 class Reading:
-    """Hold a value that was read from almost-JSON, with the repairs that it took.
+    """Hold a value that was read from almost-JSON, with the repairs (corrections) that it took.
 
-    Almost-JSON is JSON with the slips of models, such as comments or bare keys.
-
-    `end` is where it ends in the text; `closed_by_end` is true if brackets were still open there.
+    Almost-JSON is JSON with the slips of models, such as comments or bare keys. `end` is the index
+    where the value ends in the text; `closed_by_end` is true if brackets were still open there.
     """
 
     value: Any = None  # the value, as Python has it
@@ -99,8 +98,10 @@ DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
 class Token:
     """Describe a token of almost-JSON: JSON with the slips of models, such as comments.
 
-    `text` is as written, with full-width numbers and marks as ASCII; `end` is where the next token
-    may begin, and `repairs` are those that reading it takes.
+    `kind` is such as `string`, `number`, `word` or `mark`; `other` for a character that begins no
+    token, and `end` at the text's end. `text` is as written, with full-width numbers and marks as
+    ASCII; `end` is the index where the next token may begin, and `repairs` are the corrections that
+    reading it takes.
     """
 
     # a group of the pattern; `other` for a character that begins no token, `end` at the text's end

@@ -12,10 +12,10 @@ from harness.prompts.answer_schema import Shape, closed
 
 
 def further(members: dict[str, Any], shape: Shape) -> dict[str, Any] | None:
-    """Return the members that a prompt asks for beside the decision, if they fit its schemas.
+    """Return the members that a prompt asks for beside the decision, such as a reason.
 
-    `members` are those of an answer, and `shape` has the schemas. None if one does not fit. Lone
-    surrogates in them are replaced.
+    `members` are those of an answer, and `shape` has the JSON Schemas of further ones. None if one
+    does not fit its schema. Lone surrogates in them are replaced.
     """
     if not is_json(members) or not _validator(shape).is_valid(members):
         return None

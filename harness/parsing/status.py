@@ -77,7 +77,7 @@ class Status(_Documented):
 
 
 class Repair(_Documented):
-    """Name a correction that was needed to read an answer."""
+    """Name a correction that was needed to read a model's answer."""
 
     THINK_BLOCK = (
         "think_block",
@@ -150,9 +150,9 @@ class Repair(_Documented):
 
 
 class Failure(Exception):
-    """Report that a completion gives no intent; `parse` turns it into a `Parsed`.
+    """Report that a completion gives no intent, the probabilities of the actions.
 
-    It is data about the model, not a bug.
+    `parse` turns it into a `Parsed`: it is data about the model, not a bug.
 
     Attributes:
         status: the reason.
@@ -177,9 +177,9 @@ class Failure(Exception):
 
 @contextmanager
 def noted(failures: list[Failure]) -> Iterator[None]:
-    """Run code, and append a Failure that it raises to `failures` instead of passing it on.
+    """Enter a context that catches a Failure and appends it to `failures`.
 
-    So all parts of an answer are read.
+    So the other parts of an answer are read as well, and all its faults are known.
     """
     try:
         yield
@@ -188,9 +188,10 @@ def noted(failures: list[Failure]) -> Iterator[None]:
 
 
 def joined(failures: Sequence[Failure]) -> Failure:
-    """Return one failure with the faults (statuses that apply) of all `failures`.
+    """Return one failure with the faults (all statuses that apply) of several `failures`.
 
-    Its status is the first one's, but an echo of the prompt goes first: it was never meant.
+    Its status is the first one's; but if one is an echo of the prompt, that goes first, since such
+    a text was never meant as an answer.
     """
     first = min(failures, key=lambda failure: failure.status is not Status.SCHEMA_ECHO)
     faults = dict.fromkeys(

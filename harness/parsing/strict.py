@@ -18,9 +18,10 @@ Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 def fitting(text: str, shape: Shape) -> Answer | None:
-    """Return the answer if a text is exactly JSON of this shape, and its probabilities sum to 1.
+    """Return the answer if a text is exactly the JSON that was asked for, with a sum of 1.
 
-    None for any other text, which then takes repairs or fails.
+    `shape` says what was asked for. The probabilities must sum to 1 within 0.001. None for any
+    other text, which then takes corrections or fails.
     """
     try:
         value = DECODER.decode(text)

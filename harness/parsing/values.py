@@ -63,10 +63,10 @@ def _plain(name: str) -> str:
 def sort_fields(
     members: dict[str, Any], names: Sequence[str], repairs: set[Repair]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split members into those with a known name, under that name, and the rest.
+    """Split an object's members into those with a known key, under that key, and the rest.
 
-    Spellings that differ are added to `repairs`. Raises Failure (duplicate_key) if one is given
-    twice, also in two spellings.
+    `names` are the known keys. Corrections of spelling are added to `repairs`. Raises Failure (of
+    status duplicate_key) if one is given twice, also in two spellings.
     """
     if isinstance(members, Repeated):
         raise Failure(Status.DUPLICATE_KEY, "an object has the same key twice")
@@ -90,9 +90,9 @@ def distribution(
 ) -> tuple[Intent, float]:
     """Return the probabilities in the order of `actions`, summing to 1, and their sum as stated.
 
-    `value` is what the answer gives for the distribution. Repairs (corrections) that it took are
-    added to `repairs`; with `divides` any sum above 0 is divided out. Raises Failure, with all
-    statuses that apply, if `value` is no such distribution.
+    `value` is what the model's answer gives for the distribution. Repairs (corrections) that it
+    took are added to `repairs`; with `divides` any sum above 0 is divided out. Raises Failure, with
+    all statuses that apply, if `value` is no such distribution.
     """
     if not isinstance(value, dict):
         raise _no_distribution(value, actions)
@@ -146,9 +146,10 @@ def _check_sum(mass: float, repairs: set[Repair], divides: bool) -> None:
 
 
 def number(name: str, value: object, repairs: set[Repair]) -> tuple[float, bool]:
-    """Return a finite number, and whether a percent sign followed it; `name` is for messages.
+    """Return a finite number that a model wrote, and whether a percent sign followed it.
 
-    Repairs that it took are added to `repairs`. Raises Failure for any other value.
+    `name` names it in messages. Corrections that reading it took are added to `repairs`. Raises
+    Failure for any other value.
     """
     percent = False
     if isinstance(value, str):
@@ -194,9 +195,9 @@ def check_range(name: str, value: float) -> None:
 
 
 def in_percent(value: object, rest: Sequence[object]) -> object:
-    """Return a number as a text with a percent sign, if a member beside it names that unit.
+    """Return a number as a text with a percent sign, if another value of its object says percent.
 
-    `rest` are the values of the members beside it. Any other value is returned as it is.
+    `rest` are the other values of that object. Any other value is returned as it is.
     """
     has_unit = any(
         isinstance(each, str) and each.strip().casefold() in _PERCENT_WORDS for each in rest
@@ -213,7 +214,7 @@ def is_placeholder_text(text: str, shape: Shape) -> bool:
     """Return whether a text is a placeholder of a prompt: max 12 words, <text>, low|medium.
 
     A placeholder is what a prompt shows in place of a value. It is one of the prompt that asked
-    (`shape.placeholders`), one that any prompt may use, or several choices of such.
+    (`shape.placeholders`), one that any prompt may use, or several choices in one text.
     """
     if _WORDS.fullmatch(text.strip().strip(".").strip() or text.strip()):
         return True
