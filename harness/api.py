@@ -39,22 +39,22 @@ HEADLINE = {  # metrics of a run's own table, by their heads
 
 
 class Run(Tables):
-    """A finished run, with its tables as data frames, such as `decisions`, `answers` and `summary`.
+    """Hold a finished run, with its tables as data frames: `decisions`, `answers`, `summary`, etc.
 
-    `path` is its folder, `config` the content of its `run.json`. A notebook shows its headline and
-    a row for each condition.
+    `path` is its folder, `config` the content of its `run.json` as a dict. A notebook shows its
+    outcome in a sentence and a row for each condition (set of settings that is scored).
     """
 
     def decision(self, scene: str, viewer: str | None = None) -> "DecisionPoint":
-        """Return a decision point of the run.
+        """Return a decision point of the run: a scene in which the ego must choose an action.
 
         Args:
             scene: its id, as in the column `scene` of `decisions`.
-            viewer: whose view the picture shows; None for the ego's.
+            viewer: id of the vehicle whose view the picture shows; None for the ego's.
 
         Raises:
             UserError: the run has no such decision point, its dataset is not found,
-                or nobody of that name answers there.
+                or no vehicle of that id answers there.
         """
         if scene not in self.source.decisions.scenes:
             raise unknown("decision point", scene, list(self.source.decisions.scenes))
@@ -103,9 +103,11 @@ class Run(Tables):
 
 @dataclass(frozen=True)
 class DecisionPoint:
-    """One decision point of a run: its scene, and the answers and decisions there.
+    """Hold one decision point of a run: a scene in which the ego must choose an action.
 
-    A notebook shows its picture, the answers and the decisions.
+    `scene` says who is where and what each vehicle sees; `viewer` is the id of the vehicle whose
+    view the picture shows, None for the ego. A notebook shows the picture, the models' answers and
+    the decisions there.
     """
 
     run: Run  # the run
@@ -114,17 +116,20 @@ class DecisionPoint:
 
     @property
     def answers(self) -> "pd.DataFrame":
-        """The models' answers at this decision point, as rows of `Run.answers`."""
+        """Return the models' answers at this decision point, as rows of `Run.answers`."""
         return self.run.answers[self.run.answers.scene == self.scene.id]
 
     @property
     def decisions(self) -> "pd.DataFrame":
-        """The decisions at this point, one a condition and seed, as rows of `Run.decisions`."""
+        """Return the decisions at this point, as rows of `Run.decisions`.
+
+        There is one for each condition (set of settings that is scored) and channel seed.
+        """
         return self.run.decisions[self.run.decisions.scene == self.scene.id]
 
     @cached_property
     def svg(self) -> str:
-        """An SVG picture of the scene from above, with what `viewer` sees."""
+        """Return an SVG picture of the scene from above, with what `viewer` sees."""
         from harness.report.drawing.scene import draw
 
         picture = BytesIO()
@@ -149,9 +154,11 @@ class DecisionPoint:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The comparison of run B with run A, on what both have.
+    """Hold the comparison of run B with run A, on what both have.
 
-    A notebook shows how success changed, how many answers, and the differences.
+    `report` is what `harness compare --json` prints, as a dict; `findings` says in sentences how
+    success changed in each condition (set of settings that is scored); `held` has what both runs
+    answered to the same questions. A notebook shows these, and the differences.
     """
 
     report: Mapping[str, Any] = field(repr=False)  # what `harness compare --json` prints
@@ -160,7 +167,10 @@ class Comparison:
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
-        """One row for each answer to the same question that changed, with texts and verdicts."""
+        """Return a row for each answer to the same question that changed.
+
+        Its columns have both texts, and what the parser made of them.
+        """
         import pandas as pd
 
         from harness.report.compare.text import ANSWERS, changed_answers
@@ -174,7 +184,10 @@ class Comparison:
 
     @cached_property
     def differences(self) -> "pd.DataFrame":
-        """One row for each condition and metric: both means, B - A and its 95 % interval."""
+        """Return a row for each condition and metric: both means, B - A and its 95 % interval.
+
+        A condition is a named set of settings of radio channel, asking of helpers and fusion.
+        """
         import pandas as pd
 
         return pd.DataFrame(
@@ -197,9 +210,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Study:
-    """A finished study: its outcome in sentences, and its data.
+    """Hold a finished study (an evaluation of several settings): its outcome and its data.
 
-    A notebook shows its outcome and its figures.
+    `path` is its folder, `headline` its outcome in sentences, `about` says what they are
+    conditional on, and `tables` has its data frames by the name of the file. A notebook shows the
+    outcome and its figures.
     """
 
     path: Path  # its folder, with `index.html`
@@ -320,9 +335,9 @@ def ls(folder: str | PathLike[str] = "reports") -> "pd.DataFrame":
 
 
 def compare(a: str | PathLike[str] | Run, b: str | PathLike[str] | Run) -> Comparison:
-    """Return the comparison of run B with run A.
+    """Return the comparison of run B with run A, on the episodes, conditions and seeds of both.
 
-    It is on the episodes, conditions and seeds that both have.
+    A condition is a set of settings that a run is scored under; a seed fixes its lost messages.
 
     Args:
         a: the run that is compared with: its folder, or a loaded run.
@@ -357,12 +372,15 @@ def sweep(
 ) -> Study:
     """Score a run's stored answers at other operating points; write the study and return it.
 
+    An operating point is a set of settings of radio channel, asking of helpers and fusion.
+
     Args:
         run: the run. Its model is asked only where it has no answer.
         over: settings to vary, as `harness study sweep --over` takes them; several are crossed.
-        grid: the values of each, such as `0:1:0.25`.
-        condition: operating points that are varied.
-        seeds: channel seeds, such as `0:5`. Default: the run's.
+        grid: the values of each, such as `0:1:0.25` (first, last, step).
+        condition: names of the operating points whose settings are varied.
+        seeds: channel seeds, which fix the messages that get lost, such as `0:5`. Default: the
+            run's.
         out: the study's folder. Default: the command line's, in the run's folder.
         quiet: whether progress is left out.
 
