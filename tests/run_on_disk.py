@@ -13,7 +13,9 @@ import pyarrow as pa
 from harness.coordination.named_points import POINTS
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.versions import FIGURES
+from harness.radio.profiles import CHANNELS
 from harness.runs import folder, formats, writer
+from harness.runs.answer_times import times
 from harness.runs.decisions import Decisions, schema
 from harness.runs.metrics import Grid, World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
@@ -88,7 +90,9 @@ def made_up(
         "tags": [], "model": {"name": "made-up", "engine": "proxy"},
         "prompt": {"version": "v2", "sha256": "0" * 64, "released": True},
         "world": msgspec.to_builtins(world), "actions": ACTIONS,
-        "conditions": [point.record() for point in points], "seeds": seeds, "thinking": False,
+        "conditions": [point.record() for point in points],
+        "channels": {name: CHANNELS.record(name) for p in points if (name := p.radio.profile)},
+        "seeds": seeds, "thinking": False,
         "answer": "json", "batch_size": 8, "dtype": None, "latency_source": None,
         "latency": Latency("card", "made up", 0.145, 0.145, 0.145), "identity": {"engine": "proxy"},
         "cached_answers": 0, "engine_errors": 0, "versions": {"harness": "0", "figures": str(FIGURES)},
@@ -176,6 +180,13 @@ def _write(
     episodes = counted(grid, decisions, _all(ends, Episode))
     world: World = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
     summary = Figures.of(world, grid, decisions, episodes, answers).scores()
+    manifest = msgspec.structs.replace(
+        manifest,
+        answer_times=times(answers),
+        cached_answers=sum(answer.cached for answer in answers),
+        engine_errors=sum(answer.error is not None for answer in answers),
+        retries=sum(answer.retries for answer in answers),
+    )
     writer.write(out, manifest, decisions, episodes, [writer.lines(answers)], summary)
     return out
 

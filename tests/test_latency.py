@@ -29,11 +29,12 @@ from harness.dataset.load import Dataset
 from harness.evaluate import run as evaluation
 from harness.evaluate import timing
 from harness.evaluate.agent import Agent
-from harness.evaluate.latency import PAPER, as_declared, chosen_latency, declared, times
+from harness.evaluate.latency import PAPER, as_declared, chosen_latency, declared
 from harness.evaluate.timing import IDLE, measured
 from harness.prompts import versions
 from harness.report.notes import pace
 from harness.runs import folder
+from harness.runs.answer_times import times
 from harness.runs.records import Latency, Times
 
 pytestmark = pytest.mark.usefixtures("svg_alone")

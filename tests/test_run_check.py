@@ -89,7 +89,8 @@ def won(row: Row) -> None:
 SOME = (
     "a figure", "success of episodes", "latency of decisions", "older rules", "a radio's name",
     "rules in another spelling", "a figure that is left out", "which layouts", "a dataset's name",
-    "a latency's source", "settings beside it", "an answer that is missing",
+    "a latency's source", "settings beside it", "an answer that is missing", "errors of an engine",
+    "a radio's limits",
 )  # fmt: skip
 IN_TABLES = {
     "a figure": (
@@ -262,6 +263,21 @@ def sooner(run: Path) -> None:
     configure(run, model=card)
 
 
+def overpaid(run: Path) -> None:
+    """State a price, and an amount that the tokens do not make by it."""
+    stated = json.loads((run / "run.json").read_text())
+    price = {"currency": "EUR", "input": 1.0, "output": 1.0}
+    cost = {"currency": "EUR", "amount": 1e-3, "asked": 1, "uncounted": 0, "read_tokens": 1}
+    model = {**stated["model"], "price": price}
+    configure(run, model=model, cost={"proxy": {**cost, "written_tokens": 1}})
+
+
+def unlimited(run: Path) -> None:
+    """State that a radio's model holds for any loss."""
+    channels = json.loads((run / "run.json").read_text())["channels"]
+    configure(run, channels={**channels, "6g": {**channels["6g"], "limits": {"loss": [0, 1]}}})
+
+
 OF_THE_RUN = {
     "older rules": (older, "success_rate, low, 0.9 in 6g"),
     "older rules, without a row": (
@@ -315,6 +331,26 @@ OF_THE_RUN = {
     "an answer that is missing": (
         unanswered, "answers.jsonl has no answer to 00001-",
     ),
+    "errors of an engine": (
+        lambda run: configure(run, engine_errors=3),
+        "run.json has engine_errors 3, and answers.jsonl has 0",
+    ),
+    "times of answers": (
+        lambda run: configure(run, answer_times={"ego": {"n": 9, "median_s": 1e-4, "p5_s": 1e-4, "p95_s": 1e-4}}),
+        "run.json has another answer_times than its answers took",
+    ),
+    "a cost without a price": (
+        lambda run: configure(run, cost={"x": {
+            "currency": "EUR", "amount": 1e-3, "asked": 1, "uncounted": 0, "read_tokens": 1, "written_tokens": 1,
+        }}),
+        "run.json has a cost of x in EUR, and no model of it has such a price",
+    ),
+    "another cost than tokens make": (overpaid, "run.json has another cost of proxy than its tokens make"),
+    "a radio without a record": (
+        lambda run: configure(run, channels={}),
+        "run.json lacks channel profile 6g, which a condition names",
+    ),
+    "a radio's limits": (unlimited, "run.json has the limits of channel profile 6g otherwise than here"),
     "a dataset's name": (called, "run.json has another name of its scenes than the dataset"),
 }  # fmt: skip
 
@@ -442,6 +478,42 @@ def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
         assert f"episodes.csv has {found}" in words
     assert "summary.csv" not in words
     assert harness("report", drive)[0] == 0
+
+
+def test_an_engine_that_is_not_here_is_one_line_that_names_the_run(
+    run: Path, harness: Harness
+) -> None:
+    model = json.loads((run / "run.json").read_text())["model"]
+    configure(run, model={**model, "engine": "zork"})
+    code, out, error = harness("run", "check", run)
+    assert (code, out) == (2, "")
+    assert error.startswith(f"harness: unknown engine of {run}: its model 'zork'; known: ")
+
+
+def test_more_errors_than_a_result_can_have_are_a_difference(run: Path, harness: Harness) -> None:
+    scenes = sorted(read(run).decisions.scenes)
+    last = {scene.partition("-")[0]: scene for scene in scenes}.values()
+
+    def failed(row: Row) -> None:
+        if row["viewer"] != "v1" and row["scene"] in last:
+            row |= {"error": "busy", "raw": "", "intent": None, "verdict": "failed"}
+            row |= {"status": "engine_error", "finish_reason": "error", "message": None}
+
+    change(run, answer=failed)
+    model = json.loads((run / "run.json").read_text())["model"]
+    configure(run, model={**model, "engine": "transformers", "weights": "none.safetensors"})
+    code, out, error = harness("run", "check", run)
+    assert (code, error) == (1, "")
+    assert "questions to helpers: too many for a result" in " ".join(out.split())
+
+
+@pytest.mark.slow
+def test_a_driven_run_is_held_against_what_drives_here(drive: Path, harness: Harness) -> None:
+    model = json.loads((drive / "run.json").read_text())["model"]
+    configure(drive, model={**model, "name": "full-view", "engine": "driver", "privileged": False})
+    code, out, _ = harness("run", "check", drive)
+    assert code == 1
+    assert "run.json says of a driver that it sees other than it does" in " ".join(out.split())
 
 
 @pytest.mark.slow

@@ -169,14 +169,14 @@ class Engines(Plugins[Registration]):
 ENGINES = Engines("swarmdrive.backends", Registration, BUILT_IN)
 
 
-def registration(engine: str) -> Registration:
+def registration(engine: str, where: str = "") -> Registration:
     """Return the registration of an engine by name.
 
     Raises UserError if there is none, or a package's engine does not load.
     """
     entry = ENGINES.get(engine)
     if entry is None:
-        raise unknown("engine", engine, ENGINES)
+        raise unknown(f"engine of {where}" if where else "engine", engine, ENGINES)
     return entry
 
 

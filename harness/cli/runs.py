@@ -96,6 +96,7 @@ def _runs_in(folders: list[Path]) -> list[Path]:
 
 def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
     """Check a run, print the result, and return it."""
+    from harness.evaluate.of_run import points_of
     from harness.evaluate.recompute import (
         AGAIN,
         differences,
@@ -119,6 +120,7 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
         open_points += lacking
         how = "computed again from its answers"
     else:
+        points_of(run)
         wrong = list(contradictions(run))
         open_points.append("Whether its answers make its decisions is not checked.")
         how = "whose tables were held against each other, since it was driven"

@@ -5,8 +5,7 @@ They come from the paper, a card or the user, or are measured, or an extension t
 rows. The times that its answers took are recorded beside them.
 """
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import cycle, islice
 from typing import cast
 
@@ -18,8 +17,7 @@ from harness.core.arrays import Floats
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
 from harness.evaluate.agent import Agent
-from harness.runs import percentiles
-from harness.runs.records import Answer, AnswerFacts, Latency, Times
+from harness.runs.records import Answer, Latency
 from harness.runs.timers import options
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
@@ -157,37 +155,3 @@ def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int])
     by_place = [latency.fusion_s, *islice(cycle(latency.helper_times_s()), max(places, default=0))]
     seconds = [cast("float", by_place[n]) for n in places]
     return np.array([s * a.turns + a.slow_s for s, a in zip(seconds, answers, strict=True)])
-
-
-def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
-    """Return for each role the percentiles of the seconds that answers took, with intervals.
-
-    Only answers that were timed and came at the first attempt count.
-    """
-    by_role: dict[str, list[Answer | AnswerFacts]] = {}
-    for answer in answers:
-        if answer.seconds is not None and answer.error is None and not answer.retries:
-            by_role.setdefault(answer.role, []).append(answer)
-    times_of_role = {}
-    for role, role_answers in by_role.items():
-        details = {
-            "first_token": _times(role_answers, "first_token_s"),
-            "token": _times(role_answers, "token_s"),
-        }
-        times_of_role[role] = replace(cast("Times", _times(role_answers, "seconds")), **details)
-    return times_of_role
-
-
-def _times(answers: Sequence[Answer | AnswerFacts], which: str) -> Times | None:
-    """Return percentiles of the answers' time in the field `which`; None if no answer has it."""
-    timed = [answer for answer in answers if getattr(answer, which) is not None]
-    if not timed:
-        return None
-    values = np.array([getattr(answer, which) for answer in timed])
-    episodes = [answer.scene.partition("-")[0] for answer in timed]
-    intervals = {
-        percent: None if math.isnan(low) else (round(low, 6), round(high, 6))
-        for percent, (low, high) in percentiles.intervals(values, episodes).items()
-    }
-    median, low, high = np.percentile(values, (50, 5, 95)).round(6).tolist()
-    return Times(len(timed), median, low, high, intervals[50], intervals[95])

@@ -1,6 +1,6 @@
 """The evaluation that a finished run is; prompts, channels and networks must be as they were."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any, cast
@@ -11,6 +11,7 @@ from msgspec import structs
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Letters, Sums
 from harness.backends.card import Card
+from harness.backends.registry import registration
 from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.parts import Kept
 from harness.coordination.schedules import SCHEDULES
@@ -23,6 +24,7 @@ from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
+from harness.runs.contradictions import current
 from harness.runs.folder import Run
 from harness.runs.settings import deciding
 from harness.runs.sources import PROMPTS, prompt_of
@@ -70,6 +72,8 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
     for folder, recorded_there in manifest.kept.items():
         is_kept = partial(_is_kept, kept.get(folder, {}))
         records_by_kind[printable(folder.removesuffix("s"))] = recorded_there, is_kept
+    if current(run):
+        _check_recorded(run, points, kept)
     for what, (by_name, unchanged) in records_by_kind.items():
         for name, recorded in by_name.items():
             if not unchanged(name, recorded):
@@ -78,6 +82,39 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
                     "it or run again"
                 )
     return points
+
+
+def _check_recorded(
+    run: Run, points: Mapping[str, OperatingPoint], kept: Mapping[str, Mapping[str, Kept]]
+) -> None:
+    """Raise UserError if a run does not state what its conditions' schedules and parts open."""
+    schedules = {point.ask.schedule for point in points.values()}
+    places = [("schedules", name) for name in schedules if SCHEDULES.file(name)]
+    for folder, by_name in kept.items():
+        places += [(folder, name) for name in by_name]
+    for folder, name in places:
+        recorded = run.manifest.kept.get(folder, {})
+        if name not in (run.manifest.schedules if folder == "schedules" else recorded):
+            raise UserError(
+                f"{printable(run.path)}: run.json has no record of {printable(name)} of its "
+                f"{printable(folder)}, which a condition names; make the run again"
+            )
+
+
+def records_otherwise(run: Run) -> Iterator[str]:
+    """Yield which channel profiles are described otherwise in run.json than here.
+
+    That is, what they are held against, from where, and within which limits; `points_of` compares
+    what they do.
+    """
+    for name, recorded in run.manifest.channels.items():
+        if name not in CHANNELS:
+            continue
+        here, there = CHANNELS.record(name), msgspec.to_builtins(recorded)
+        for key in ("description", "source", "status", "limits"):
+            if here[key] != _plain(there[key]):
+                what = f"{key} of channel profile {printable(name)}"
+                yield f"run.json has the {what} otherwise than here"
 
 
 def check_prompts(run: Run, spec: Spec) -> None:
@@ -99,11 +136,27 @@ def _is_kept(kept: Mapping[str, Kept], name: str, recorded: Any) -> bool:
 
 
 def _same(now: Any, recorded: Any) -> bool:
-    return bool(now == msgspec.json.decode(msgspec.json.encode(recorded)))
+    return bool(now == _plain(recorded))
+
+
+def _plain(recorded: Any) -> Any:
+    return msgspec.json.decode(msgspec.json.encode(recorded))
+
+
+def model_of(run: Run, agent_record: Mapping[str, Any]) -> Card:
+    """Return the card of an agent's model, as a run states it in `agent_record`.
+
+    A card is what a file says of a model, such as its engine. Raises UserError if the record is
+    none, or the engine is not installed.
+    """
+    where = f"{printable(run.path)}: its model"
+    card = convert(agent_record["model"], Card, where)
+    registration(card.engine, where)
+    return card
 
 
 def _agent(run: Run, agent_record: Mapping[str, Any]) -> Agent:
-    card = convert(agent_record["model"], Card, f"{printable(run.path)}: its model")
+    card = model_of(run, agent_record)
     if (version := agent_record["prompt"]["version"]) not in versions.names():
         raise UserError(
             f"{printable(run.path)}: prompt {printable(version)} is not here; "

@@ -17,7 +17,7 @@ from harness.backends.registry import open_backend
 from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
 from harness.core.config import convert
-from harness.core.errors import UserError, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.extensions import part_of
 from harness.core.figures import amount
 from harness.core.files import sha256_file
@@ -26,7 +26,15 @@ from harness.dataset.load import Dataset
 from harness.dataset.select import Choice, spot_check
 from harness.evaluate import latency as latencies
 from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.of_run import DRIVER, card_here, check_prompts, points_of, spec_of
+from harness.evaluate.of_run import (
+    DRIVER,
+    card_here,
+    check_prompts,
+    model_of,
+    points_of,
+    records_otherwise,
+    spec_of,
+)
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import OF_TEXTS, others, same
@@ -34,6 +42,7 @@ from harness.runs.contradictions import close, contradictions, current, differin
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
 from harness.runs.stopping import looked_otherwise
+from harness.runs.unanswered import Tally
 
 AGAIN = 3  # episodes of a driven run that are driven again
 OF_ENDS = (  # what an episode's row says of how it ended
@@ -146,6 +155,8 @@ def differences(
     spec = replace(stored_spec, ego=ego, points=points, timer=timer, settings=settings)
     try:
         ours, otherwise = computed(run, spec, out, progress)
+    except Unanswered:
+        return [*contradictions(run), _unanswered(run)], []
     except LacksAnswer as lack:
         lacks = f"answers.jsonl has no answer to {lack.question}, asked by what run.json states"
         return [*contradictions(run), *_of_rule(lack.otherwise), lacks], []
@@ -196,6 +207,8 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
                 ours, otherwise = computed(run, stays, Path(folder) / "run", lambda done: None)
             except LacksAnswer as lack:
                 wrong = [f"answers.jsonl has no answer to {lack.question}"]
+            except Unanswered:
+                wrong = [_unanswered(run)]
             else:
                 wrong = [
                     *_of_manifest(run, ours, spec.ego.card, ("path", "interim_looks")),
@@ -208,6 +221,10 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
         wrong += looked_otherwise(spec.stopping_rule, looks, run.grid, run.episodes)
     if wrong:
         raise UserError(f"{printable(run.path)}: {wrong[0]}; delete that folder, and type it again")
+
+
+def _unanswered(run: Run) -> str:
+    return f"answers.jsonl has no answer to {Tally(run.answers).counts()}: too many for a result"
 
 
 def _of_rule(otherwise: int) -> Iterator[str]:
@@ -264,6 +281,8 @@ def driven_otherwise(run: Run) -> Iterator[str]:
     from harness.evaluate.replay import driven_again, played
 
     yield from _of_latency(run)
+    yield from _of_agents(run)
+    yield from records_otherwise(run)
     world = run.manifest.world
     selected = None if select.lacking(world.selection) else select.recorded(world.selection)
     if selected:
@@ -293,8 +312,23 @@ def _of_manifest(
             yield f"run.json has another {name} of its scenes than the dataset"
     yield from _of_card(run, card)
     yield from _of_latency(run)
-    if run.manifest.model.get("privileged") != ours.manifest.model.get("privileged"):
-        yield "run.json says of a driver that it sees other than it does"
+    yield from _of_agents(run)
+    yield from records_otherwise(run)
+
+
+def _of_agents(run: Run) -> Iterator[str]:
+    """Yield what run.json says otherwise of what its models see, and of what they cost."""
+    manifest = run.manifest
+    models = [model_of(run, record) for record in (manifest.agent(0), *manifest.helpers)]
+    for card in models:
+        if card.engine == DRIVER and card.privileged != card_here(card).privileged:
+            yield "run.json says of a driver that it sees other than it does"
+    for card in models:
+        cost = (manifest.cost or {}).get(card.name)
+        if cost and card.price:
+            amount_here = card.price.of(cost.read_tokens, cost.written_tokens)
+            if not close(cost.amount, amount_here):
+                yield f"run.json has another cost of {printable(card.name)} than its tokens make"
 
 
 def _of_card(run: Run, card: Card) -> Iterator[str]:

@@ -10,8 +10,9 @@ from itertools import zip_longest
 import numpy as np
 from msgspec.structs import replace
 
-from harness.backends.registry import capabilities
+from harness.backends.registry import registration
 from harness.coordination.named_points import POINTS
+from harness.core.errors import printable
 from harness.dataset.load import Scene
 from harness.evaluate.branches import Course, Trajectory
 from harness.evaluate.live_world import ended, looks
@@ -85,7 +86,8 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
         for world, _, acting in due:
             act(world, acting)
     lockstep.advance(worlds, due_frames)
-    alone = not capabilities(run.manifest.model["engine"]).asks_helpers
+    where = f"{printable(run.path)}: its model"
+    alone = not registration(run.manifest.model["engine"], where).capabilities.asks_helpers
     scenes = dict[int, Scene]()
     for step in {decision.step for decision in decisions}:
         at = [n for n, decision in enumerate(decisions) if decision.step == step]

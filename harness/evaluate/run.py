@@ -54,7 +54,7 @@ from harness.evaluate.spec import Spec
 from harness.evaluate.table import of_all_seeds, table
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import walk
-from harness.runs import folder, run_parts, stopping, writer
+from harness.runs import answer_times, folder, run_parts, stopping, writer
 from harness.runs import sources as kept_sources
 from harness.runs.contradictions import sound
 from harness.runs.decisions import Decisions
@@ -630,7 +630,7 @@ def _gather(
                 **settings,
                 "settings": typed,
                 "latency": msgspec.to_builtins(run_start.latency),
-                "answer_times": msgspec.to_builtins(latencies.times(answers)),
+                "answer_times": msgspec.to_builtins(answer_times.times(answers)),
                 "identity": run_start.identity,
                 "cached_answers": sum(answer.cached for answer in answers),
                 "engine_errors": sum(answer.error is not None for answer in answers),

@@ -10,9 +10,10 @@ from harness.backends.base import Backend
 from harness.core.errors import Unanswered, UserError, printable
 from harness.dataset.load import Scene
 from harness.evaluate.answers import answer_of
-from harness.evaluate.latency import EXAMPLE, MEASURED, times
+from harness.evaluate.latency import EXAMPLE, MEASURED
 from harness.evaluate.requests import fusion_request, requests
 from harness.evaluate.spec import Spec
+from harness.runs.answer_times import times
 from harness.runs.records import Latency
 from harness.runs.unanswered import Tally
 

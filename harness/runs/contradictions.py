@@ -19,6 +19,7 @@ from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run, read
 from harness.runs.headline import PAIRED
+from harness.runs.manifest_contradictions import of_manifest
 from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
 from harness.runs.records import Episode, FrozenScenes, Score
 from harness.runs.reliability import SAME
@@ -84,6 +85,7 @@ def contradictions(run: Run) -> Iterator[str]:
     yield from _of_conditions(run)
     yield from _of_episodes(run)
     answers, reached = list(run.answers), run.decisions.scenes
+    yield from of_manifest(run, answers, current=current(run))
     undecided = (answer.scene for answer in answers if answer.scene not in reached)
     if (scene := next(undecided, None)) is not None:
         yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"

@@ -102,7 +102,6 @@ def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
         dtype=mine,
         latency_source=mine,
         latency=Latency("card", mine, 0.1, 0.1, 0.1, {mine: Times(1, 0.1, 0.1, 0.1)}),
-        answer_times={mine: Times(1, 0.1, 0.1, 0.1)},
         versions={"harness": mine, mine: mine},
     )
     configure(folder, answer=mine)
