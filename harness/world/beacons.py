@@ -58,7 +58,9 @@ ROUNDING_S = 1e-9
 def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
     """Return the newest beacon of `sender` that `receiver` has at the state's time.
 
-    None if there is none, as under perfect knowledge or of the receiver itself.
+    `sender` and `receiver` are ids of vehicles. A beacon is what a vehicle broadcasts about itself:
+    pose and speed, with an age and errors. None if there is no such beacon: nobody sends any under
+    perfect knowledge, and no vehicle hears itself.
     """
     heard = [b for b in state.beacons if b.sender == sender and receiver in b.heard_by]
     return max(
@@ -69,7 +71,9 @@ def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
 def state_by_beacon(state: WorldState, sender: str, receiver: str) -> VehicleState:
     """Return the sender's state as the receiver estimates it from the last beacon that it has.
 
-    The true state if it has none, as under perfect knowledge or of itself.
+    `sender` and `receiver` are ids of vehicles. A beacon, the sender's broadcast about itself, is
+    extrapolated to the state's time at constant speed. It is the true state if the receiver has
+    none, as under perfect knowledge or of itself.
     """
     return estimated(state.vehicle(sender), last_heard(state, sender, receiver), state.time_s)
 
@@ -77,7 +81,9 @@ def state_by_beacon(state: WorldState, sender: str, receiver: str) -> VehicleSta
 def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> VehicleState:
     """Return a vehicle's state, extrapolated from its beacon to `time_s` at constant speed.
 
-    The true state if `beacon` is None.
+    A beacon is what a vehicle broadcasts about itself; `time_s` is in s from the start of the
+    episode. What a beacon does not say, such as the class of vehicle, is as in `vehicle`, its true
+    state, which is returned unchanged if `beacon` is None.
     """
     if beacon is None:
         return vehicle
@@ -92,10 +98,11 @@ def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> Ve
 
 
 def lead_in(p: Parameters, poses: Floats) -> Floats:
-    """Extrapolate poses at the start back in time at constant speed, to when beacons begin.
+    """Extrapolate poses at the start of an episode back in time, to when its beacons begin.
 
-    `poses` are x and y (m), heading (rad) and speed (m/s) of V vehicles, (V, 4); the result is (F,
-    V, 4) for F frames, the start last.
+    `poses` are x and y (m), heading (rad) and speed (m/s) of V vehicles, (V, 4), which have driven
+    at constant speed until then. The result is (F, V, 4) for F frames, the start last. `p` has the
+    rate and the delay of beacons and the frames a second.
     """
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz
@@ -113,13 +120,22 @@ def broadcast(
     first_frame: int,
     loss: Callable[[int], Floats],
 ) -> tuple[Beacon, ...]:
-    """Return the beacons of the ego and its helpers that are still needed after some frames.
+    """Return the beacons of the ego and its helpers that are still needed after F more frames.
 
-    These are the last one that each receiver has, and those on the air. `before` are those needed
-    until now. The ego is the first of the ids `radios`; it and each helper hear each other. `poses`
-    are x, y, heading and speed, (F, V, 4), from `first_frame` on; the episode starts with frame 0.
-    `loss` returns, for one of these F frames, the probability to lose a beacon on the link to each
-    helper, (H,).
+    These are the last one that each receiver has, and those on the air. The ego and each helper
+    hear each other.
+
+    Args:
+        p: the scenario's parameters, with the rate, the delay and the errors of beacons.
+        seed: seed of the episode's layout, which keys all draws.
+        before: the beacons that were needed until now.
+        radios: ids of the ego, which is first, and of the H helpers.
+        target_mps: the ego's target speed, m/s, which its beacons tell.
+        poses: x and y (m), heading (rad) and speed (m/s) of these 1+H vehicles in each frame,
+            (F, 1+H, 4).
+        first_frame: number of the first of these frames; the episode starts with frame 0.
+        loss: returns, for the index from 0 of one of these frames, the probability to lose a beacon
+            on the link of the ego and each helper, (H,).
     """
     kept: list[Beacon] = []
     for place, sender in enumerate(radios):
@@ -143,10 +159,22 @@ def announced(
     first_frame: int,
     loss: Callable[[int], Floats],
 ) -> tuple[Beacon, ...]:
-    """Return the beacons of one sender that are still needed after some frames: see `broadcast`.
+    """Return the beacons of one sender that are still needed after F more frames.
 
-    All `receivers` hear it; `poses` are (F, 4). `loss` returns, for one of these F frames, the
-    probability to lose a beacon on the link to each receiver.
+    These are the last one that each receiver has, and those on the air. It is for a vehicle that
+    all R `receivers` hear; `broadcast` is for the ego and its helpers.
+
+    Args:
+        p: the scenario's parameters, with the rate, the delay and the errors of beacons.
+        seed: seed of the episode's layout, which keys all draws.
+        before: the beacons, of any sender, that were needed until now.
+        sender: id of the vehicle that sends.
+        receivers: ids of the vehicles that hear it.
+        target_mps: target speed that its beacons tell, m/s; None if they tell none.
+        poses: its x and y (m), heading (rad) and speed (m/s) in each frame, (F, 4).
+        first_frame: number of the first of these frames; the episode starts with frame 0.
+        loss: returns, for the index from 0 of one of these frames, the probability to lose a beacon
+            on the link to each receiver, (R,).
     """
     every, heard_by = slice(None), tuple(receivers)
     return tuple(
@@ -283,9 +311,10 @@ def losses(
 ) -> Callable[[int], Floats]:
     """Return a function from a frame to the probability to lose a beacon on each of H links, (H,).
 
-    A link is from the first of the ids `radios` to each other one. `world` returns the present
-    state; `poses` are x, y, heading and speed of all V vehicles in F frames, (F, V, 4). Frames
-    count from 0.
+    Its argument is the index from 0 of one of the F frames of `poses`: x and y (m), heading (rad)
+    and speed (m/s) of all V vehicles, (F, V, 4). `radios` are 1+H ids of vehicles; a link is from
+    the first of them to each other one. `world` returns the present state, and is called only if
+    the parameters `p` name a physical radio; else all links lose `p.beacon_loss`.
     """
     radio = beacon_radio(p.beacon_channel)
     if radio is None:

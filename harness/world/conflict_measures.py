@@ -45,7 +45,9 @@ DECIMALS = 3  # decimals of both, s
 class Conflicts:
     """Hold how near in time others came to an agent since a decision, and poses still needed.
 
-    An agent is a vehicle that decides for itself; there are V vehicles, the agent among them.
+    An agent is a vehicle that decides for itself; there are V vehicles, the agent first among them.
+    `ttc_s` and `pet_s` are the least time to collision and post-encroachment time, s, as the module
+    defines them. `trail` and `box` are where vehicles have been: what `observe` needs to go on.
     """
 
     ttc_s: float = np.inf  # least time to collision, s; inf if nobody came near
@@ -59,17 +61,17 @@ class Conflicts:
     box: Floats = field(default_factory=lambda: np.empty((4, 0)))
 
     def anew(self) -> "Conflicts":
-        """Return these records with the measures reset, to count from a decision on."""
+        """Return a copy with both times inf, to measure from a decision on; past poses are kept."""
         return replace(self, ttc_s=np.inf, pet_s=np.inf)
 
     def collided(self) -> "Conflicts":
         return replace(self, ttc_s=0.0, pet_s=0.0)
 
     def recast(self, places: Sequence[int]) -> "Conflicts":
-        """Return these records for a changed list of vehicles.
+        """Return a copy for another list of vehicles, as when one has come or gone.
 
-        `places` has for each vehicle now its index in the list before, -1 for a new one. The past
-        poses of a vehicle that has left are dropped.
+        `places` has, for each vehicle of the list now, its index in the list before, -1 for a new
+        one. The past poses of a vehicle that has left are dropped.
         """
         at = np.array(places)
         trail = (
@@ -82,17 +84,17 @@ class Conflicts:
 
 
 def rounded(measure_s: float) -> float | None:
-    """Return a time of conflict (s), such as TTC, rounded for a record; None if not finite."""
+    """Return a time of conflict (s), such as TTC, rounded for a file; None if not finite."""
     return round(measure_s, DECIMALS) if np.isfinite(measure_s) else None
 
 
 def columns(ttc_s: Floats, pet_s: Floats) -> dict[str, Floats]:
-    """Return the conflict times of n decisions as table columns, and whether each is short.
+    """Return the conflict times of n decisions as columns of a table, and whether each is short.
 
-    The columns are `ttc_s` (time to collision), `pet_s` (post-encroachment time), `short_ttc` and
-    `short_pet`, (n,). The first two are NaN where no vehicle came near. The `short_` ones are 1
-    below `SHORT_TTC_S` and `SHORT_PET_S`, else 0. The arguments, (n,), are inf where no vehicle
-    came near in time, and NaN where nothing was measured; then all four are NaN.
+    The columns, each (n,), are by name `ttc_s` (time to collision, s), `pet_s` (post-encroachment
+    time, s), `short_ttc` and `short_pet`. The first two are NaN where no vehicle came near. The
+    `short_` ones are 1 below `SHORT_TTC_S` and `SHORT_PET_S`, else 0. The arguments, (n,), are inf
+    where no vehicle came near in time, and NaN where nothing was measured; then all four are NaN.
     """
     ttc_s, pet_s = ttc_s.round(DECIMALS), pet_s.round(DECIMALS)
     return {
@@ -106,12 +108,15 @@ def columns(ttc_s: Floats, pet_s: Floats) -> dict[str, Floats]:
 def observe(
     before: Sequence[Conflicts], poses: Floats, sizes_m: Floats, first_frame: Ints, hz: int
 ) -> list[Conflicts]:
-    """Return the conflicts of each of W worlds, updated by some more frames.
+    """Return the conflict times of each of W simulated episodes, after F more frames.
 
-    `before` has each world's until then. `poses` are x and y, m, heading, radians, and speed, m/s,
-    (W, frames, vehicles, 4), the ego first, NaN where there is no vehicle, and `sizes_m` length and
-    width, (W, vehicles, 2). `first_frame`, (W,), is the number of each world's first frame here,
-    and `hz` is frames a second.
+    Args:
+        before: each episode's record until then, of its agent, the vehicle that decides.
+        poses: x and y (m), heading (rad) and speed (m/s) of V vehicles in each frame, (W, F, V, 4),
+            the agent first; NaN where there is no vehicle.
+        sizes_m: length and width of each vehicle, m, (W, V, 2).
+        first_frame: number of each episode's first frame here, (W,).
+        hz: frames a second.
     """
     every = max(1, round(hz / MOMENTS_HZ))
     numbers = first_frame[:, None] + np.arange(poses.shape[1])
@@ -174,9 +179,9 @@ def times_to_collision(
 ) -> Floats:
     """Return the time to collision of n pairs of vehicles that drive straight on, (n,) s.
 
-    It is inf for never. `poses` and `others` are x and y, m, heading, radians, and speed, m/s, of
-    the one and the other of each pair, (n, 4), and the sizes length and width, m, (n, 2). The
-    rectangles touch when their extents overlap on all four of their axes.
+    It is inf for never. `poses` and `others` are x and y (m), heading (rad) and speed (m/s) of the
+    one and the other of each pair, (n, 4), and the sizes their lengths and widths, m, (n, 2).
+    Vehicles are rectangles, which touch when their extents overlap along all four of their axes.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     its_cos, its_sin = np.cos(others[:, 2]), np.sin(others[:, 2])

@@ -35,7 +35,8 @@ PRIORITY = {"straight": (1, 3), "left": (0, 2)}
 def road(arm: int = 0, form: Literal[1, 2] = 1) -> Road:
     """Return the four-way intersection as a `Road`, for an ego from an arm that goes straight.
 
-    Arms are numbered 0 to 3: south, west, north, east. `form` is the version of the scene graphs.
+    Arms are numbered 0 to 3: south, west, north, east. Under `form` 1 scene graphs, what a vehicle
+    knows of a scene, list only paths that cross the ego's; under 2 also who is in the ego's lane.
     The conflict zone is the centroid of three conflict points: with straight traffic from the left
     and the right, and with oncoming traffic that turns left.
     """
@@ -65,7 +66,11 @@ def road(arm: int = 0, form: Literal[1, 2] = 1) -> Road:
 
 @cache
 def paths(arm: int = 0) -> dict[PathKey, Path]:
-    """Return every path by (approach, route), under the names that an ego from this arm uses."""
+    """Return every path over the intersection by its key, as an ego from an arm names it.
+
+    A key is (approach, route): where the path comes from (`own`, `left`, `oncoming` or `right`),
+    and what it does (`straight` or `left`). `arm` is 0 to 3: south, west, north, east.
+    """
     built = {}
     for corner in range(len(APPROACHES)):
         approach = seen_from(arm, corner)
@@ -126,7 +131,7 @@ def _approach(path: Path) -> Floats:
 
 @cache
 def network() -> Any:
-    """Return the road network of highway-env's `IntersectionEnv`.
+    """Return the road network of highway-env's `IntersectionEnv`, always the same object.
 
     It is a `highway_env.road.road.RoadNetwork`.
     """
@@ -139,7 +144,11 @@ def network() -> Any:
 
 
 def ground(far_m: float) -> Ground:
-    """Return the drawn ground of both roads up to `far_m` from the centre, with its markings."""
+    """Return what pictures show of both roads: their surface, centre lines and stop lines.
+
+    They reach `far_m` from the centre of the crossing; positions are in m to the east and the
+    north.
+    """
     half = LANE_WIDTH_M
     # One corner of the junction, from the north arm to the east arm; a quarter turn gives the next.
     angle = np.linspace(np.pi, 1.5 * np.pi, 9)

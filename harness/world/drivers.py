@@ -36,10 +36,13 @@ OPEN_LOOPS = Path(__file__).with_name("open_loop.csv")
 def choose(
     scenario: Scenario, driver: str, graph: SceneGraph | None, truth: SceneGraph | None
 ) -> str:
-    """Return the meta-action that the reference driver named `driver` takes for the ego.
+    """Return the meta-action, such as `SLOWER`, that a reference driver takes for the ego.
 
-    `graph` is the ego's scene graph, and `truth` the graph with everything in view and no noise,
-    which only `full-view` reads. Drivers that read neither accept None.
+    `driver` is `cruise`, `brake`, `local-view` or `full-view`, a rule of the road (`right-hand`,
+    `first-come`), or an action that is always taken. `graph` is the ego's scene graph, what its
+    sensors and beacons tell; `truth` is the graph with everything in view and no noise, which only
+    `full-view` reads. Drivers that read neither accept None. Raises ValueError if the driver's
+    graph is missing.
     """
     [action] = choices(scenario, [(driver, graph, truth)])
     return action
@@ -48,10 +51,12 @@ def choose(
 def choices(
     scenario: Scenario, requests: Sequence[tuple[str, SceneGraph | None, SceneGraph | None]]
 ) -> list[str]:
-    """Return the meta-action of each driver that is asked, as `choose` does for one.
+    """Return the meta-action that the driver of each request takes for its ego.
 
-    Each of `requests` has a driver's name, or that of an action that is always taken, the ego's
-    graph and the true graph. Raises ValueError if a driver was not given the graph that it reads.
+    A request is what `choose` takes beside the scenario: a driver's name, or that of an action that
+    is always taken, then the ego's scene graph by its sensors, and the graph with everything in
+    view, which only `full-view` reads. Raises ValueError if a driver was not given the graph that
+    it reads.
     """
     always = {**{action: action for action in scenario.actions}, **ALWAYS}
     planned = iter(
@@ -63,9 +68,8 @@ def choices(
 def constant(scenario: Scenario) -> str | None:
     """Return the action that driver `constant` always takes in a scenario, or None if not measured.
 
-    It is the single action that succeeds most on tune layouts (`constants.csv`).
-
-    Tune layouts are those on which settings are chosen; results are reported on others.
+    It is the single action that succeeds most on tune layouts (`constants.csv`): start situations
+    on which settings are chosen, while results are reported on others.
     """
     return _constants().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 
@@ -73,9 +77,9 @@ def constant(scenario: Scenario) -> str | None:
 def open_loop(scenario: Scenario) -> tuple[str, ...] | None:
     """Return the fixed actions of driver `open-loop` in a scenario, or None if not measured.
 
-    It is the sequence that succeeds most on tune layouts (`open_loop.csv`).
-
-    Tune layouts are those on which settings are chosen; results are reported on others.
+    There is one for each decision. It is the sequence that succeeds most on tune layouts
+    (`open_loop.csv`): start situations on which settings are chosen, while results are reported on
+    others.
     """
     return _open_loops().get((scenario.name.partition(":")[0], scenario.parameters.limits))
 

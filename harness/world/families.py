@@ -16,37 +16,46 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Family(Protocol):
-    """Read the names of scenarios that an extension makes by name, such as `env:merge-v0`."""
+    """Make scenarios by name: an extension's reader of names such as `env:merge-v0`.
 
-    heading: str  # above its options in the help of commands
-    # options of commands that take a scenario, which name one of the family instead, and their
-    # help; the first is needed where another is typed
+    What stands before the colon is the family's own name. `heading` stands above the family's
+    `options` in the help of commands; `options` has each option's name and help, such as that of a
+    module to import.
+    """
+
+    heading: str  # text above the family's options in the help of commands
+    # name and help of each option by which commands that take a scenario name one of the family
+    # instead; the first is needed where another is typed
     options: Mapping[str, str]
 
     def named(self, typed: Mapping[str, str]) -> str:
-        """Return the scenario's name by what is typed for some of the options.
+        """Return the name of the scenario that options of a command describe.
 
-        Raises UserError for what names none.
+        `typed` has the options of `options` that a user typed, by name, with their values. Raises
+        UserError if they name none.
         """
         ...
 
     def scenario(self, name: str) -> "Scenario":
-        """Return the scenario of a name. Raises UserError if there is none."""
+        """Make the scenario of a name such as `env:merge-v0`. Raises UserError if there is none."""
         ...
 
     def split(self, text: str) -> tuple[str, str | None]:
-        """Split a text into the name and settings such as `decisions=5`; None without any."""
+        """Split the text of a scenario into its name and its settings, such as `decisions=5`.
+
+        The settings are one text, None without any.
+        """
         ...
 
     def joined(self, name: str, settings: Sequence[str]) -> str:
-        """Add settings to a name; the inverse of `split`."""
+        """Return a name with settings, each such as `decisions=5`, added: `split`'s inverse."""
         ...
 
     def allow(self, name: str) -> str | None:
-        """Let a name that the user typed open what it needs, such as a module.
+        """Let a scenario that the user typed open what its name needs, such as a module.
 
-        A name from a file is never given to this function. Returns what other commands need for
-        it, as a sentence; None if that is nothing.
+        It is called before `scenario`, and never with a name from a file, which must open nothing.
+        Returns a sentence on what other commands need for this scenario; None if that is nothing.
         """
         ...
 
@@ -55,9 +64,9 @@ FAMILIES = Shipped[Family]("swarmdrive.families", Family, {})  # of none but ext
 
 
 def family_of(text: str) -> Family | None:
-    """Return the family of a scenario's name; None for a scenario of no family.
+    """Return the family that a scenario's name begins with, as in `env:merge-v0`; None without.
 
-    Raises UserError if its extension is not installed.
+    Raises UserError if the family is of an extension that is not installed.
     """
     name, colon, _ = text.partition(":")
     if not colon:

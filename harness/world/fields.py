@@ -19,7 +19,7 @@ VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
 
 
 class Closed(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of msgspec records that refuse unknown members when they are decoded from a file.
+    """Refuse unknown members when a record is decoded from a file; a base class of msgspec records.
 
     The bounds of `Annotated` field types are checked at decoding, too.
     """

@@ -37,7 +37,10 @@ AT_ONCE = 128  # more worlds do not fit into the processor's cache
 
 
 def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
-    """Simulate worlds of one scenario, each until its frame in `until_frames` or its own end."""
+    """Simulate several episodes of one scenario together, in place.
+
+    Each goes on until its frame number in `until_frames`, or until all of its outcomes are decided.
+    """
     pairs = [
         (world, until)
         for world, until in zip(worlds, until_frames, strict=True)
@@ -126,9 +129,10 @@ def _measure(
 class Lanes:
     """Hold the L lanes of a road network as arrays, so that many vehicles are located at once.
 
-    Lanes are numbered from 0. A lane is known by highway-env's index: the two nodes of its road,
-    and its number from the left. Lanes that are neither straight nor an arc are left to
-    highway-env.
+    A lane has a number from 0, its index in the arrays, and a name, highway-env's index of it: the
+    two nodes of its road, and its place from the left. It is straight (`base`, `along`, `across`,
+    `heading`) or an arc (`base`, `radius`, `phase`, `sign`); any other kind is in `others`, and
+    left to highway-env. Lengths are in m and angles in rad.
     """
 
     number: dict[Lane, int]  # number of each lane by highway-env's index
@@ -149,8 +153,8 @@ class Lanes:
     def coordinates(self, xy: Floats, lane: Ints) -> tuple[Floats, Floats]:
         """Return how far positions are along lanes, and how far to the right of their middle, m.
 
-        Both are (...). `xy` are positions, (..., 2) m, and `lane` is the number of each one's lane,
-        (...).
+        `xy` are positions in highway-env's frame, (..., 2) m, and `lane` is the number of each
+        one's lane, (...). Both results are (...).
         """
         away = xy - self.base[lane]
         along, lateral = np.vecdot(away, self.along[lane]), np.vecdot(away, self.across[lane])
@@ -171,7 +175,7 @@ class Lanes:
             yield from zip(*np.nonzero(np.isin(lane, list(self.others))), strict=True)
 
     def heading_at(self, along: Floats, lane: Ints) -> Floats:
-        """Return the heading of lanes at distances along them, radians, (...).
+        """Return the heading of lanes at distances along them, rad from +x towards +y, (...).
 
         `along` are the distances, m, (...), and `lane` the lanes' numbers, (...).
         """
@@ -219,9 +223,11 @@ def _lanes(road: Callable[[], Road]) -> Lanes:
 
 
 class Fleet:
-    """Hold the vehicles of B worlds, at most V each, as arrays (B, V) that are simulated together.
+    """Hold the vehicles of B episodes, at most V each, as arrays that are simulated together.
 
-    Positions and collision impacts are (B, V, 2).
+    Arrays are (B, V), the ego first in each episode. Positions `xy`, collision impacts and sizes
+    are (B, V, 2) m, headings are in rad and speeds in m/s; `frame`, (B,), counts each episode's
+    frames. Where an episode has fewer than V vehicles, `there` is false.
     """
 
     def __init__(self, worlds: "Sequence[World]") -> None:
@@ -292,7 +298,7 @@ class Fleet:
         self.section[at] = v.route.index(v.target_lane_index)
 
     def keep(self, rows: Bools) -> None:
-        """Drop the worlds, B rows of all arrays, whose entry in the mask `rows`, (B,), is false."""
+        """Drop the episodes, rows of all arrays, for which the mask `rows`, (B,), is false."""
         self.worlds = [
             world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept
         ]
@@ -302,10 +308,10 @@ class Fleet:
         self._index()
 
     def write(self, row: int, world: "World") -> set[str]:
-        """Copy the vehicles of one row of the arrays back into its world.
+        """Copy the vehicles of one row of the arrays back into the episode's `World`.
 
-        `row` is the world's index among the B. Returns the ids of vehicles that had crashed before
-        the last frame.
+        `row` is the episode's index among the B. Returns the ids of vehicles that had crashed
+        before the last frame.
         """
         world.frame = int(self.frame[row])
         names = self.lanes.names
@@ -328,9 +334,9 @@ class Fleet:
         return {v.spawn.id for n, v in enumerate(world.vehicles) if self.stood[row, n]}
 
     def step(self) -> Bools:
-        """Simulate one frame; return the worlds in which something may decide an outcome, (B,).
+        """Simulate one frame; return in which episodes something may decide an outcome, (B,).
 
-        These are the worlds with a crash, an arrival, an agent off the road, or the time limit.
+        These are those with a new crash, an agent at its goal or off the road, or the time limit.
         """
         self.stood = self.crashed.copy()
         self._act()

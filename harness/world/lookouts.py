@@ -35,11 +35,12 @@ class Draft:
     """Hold one random draw of an episode's start, not yet checked for who sees the danger.
 
     A danger is the vehicle that would meet an ego which keeps its speed; a sector is a direction
-    that it may come from. Lookouts are helpers that see it wherever it comes from, and blind seats
-    places from which it cannot be seen.
+    that it may come from. `layout` is the start situation, with the lookouts as helpers: they see a
+    danger wherever it comes from. `phantoms` has the danger that each sector would have, and
+    `seats` are cars in blind seats, places from which it cannot be seen.
     """
 
-    layout: Layout  # with the lookouts as helpers, and nobody in the blind seats
+    layout: Layout  # start situation, with lookouts as helpers and nobody in the blind seats
     # for each sector, the vehicle that would be its danger; it replaces the one with the same id
     phantoms: tuple[Spawn, ...]
     seats: tuple[Spawn, ...]  # cars that cannot see the danger; empty if the draws name none
@@ -50,8 +51,9 @@ def placed(
 ) -> Layout:
     """Return the layout of a seed, with the witnesses and radios that the parameters declare.
 
-    A witness is a helper that has the danger in sight at the first decision. `draft` makes one
-    random draw; draws are repeated until the vehicles meant to see the danger do, and no others.
+    A layout is the start situation of an episode, and a witness a helper that has the danger in
+    sight at the first decision. `draft` makes one random draw of it from the `Draws` and the
+    parameters; it is called again until the vehicles meant to see the danger do, and no others.
     Raises UserError if none of `MOST_ATTEMPTS` draws fits.
     """
     if parameters.witnesses == "any":
@@ -70,11 +72,11 @@ def placed(
 
 
 def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
-    """Return how many witnesses the layout of a seed has; None if the parameters say `any`.
+    """Return how many witnesses, 0 to 3, a layout has; None if the parameters say `any`.
 
-    A witness is a helper that has the danger in sight at the first decision. For `each` it is the
-    seed modulo 4, so that consecutive seeds are balanced; for `drawn` it is a random draw keyed by
-    the seed.
+    A layout is the start situation that `seed` draws, and a witness a helper that has the danger in
+    sight at the first decision. For `each` the number is the seed modulo 4, so that consecutive
+    seeds are balanced; for `drawn` it is a random draw keyed by the seed. `scenario` is the name.
     """
     counts = len(LOOKOUTS) + 1
     if parameters.witnesses == "any":
@@ -89,8 +91,9 @@ def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
 def radios(scenario: Scenario, seed: int, danger: str | None) -> dict[str, Any]:
     """Return the columns `witnesses` (a count) and `danger_radio` (a bool) of a layout's table row.
 
-    `danger` is the sector of the layout's danger. A value is None where the parameters declare
-    none.
+    They say how many helpers have the danger in sight at the first decision, and whether the danger
+    itself sends beacons. `danger` is the sector (direction) that the danger comes from, None
+    without one. A value is None where the scenario's parameters declare none.
     """
     p = scenario.parameters
     radio = has_radio(scenario.name, p, seed) if danger and p.radio_share else None
@@ -106,9 +109,12 @@ def queue(
 ) -> tuple[Spawn, ...]:
     """Return helper cars lined up behind the ego, from where they cannot see the danger.
 
-    `gaps_m` bounds each uniform gap between centres, from the ego backwards, and `speed_mps` their
-    common speed. `ids` maps the names of `draws.seats` to vehicle ids. Empty if `draws` has no such
-    seats.
+    Args:
+        draws: the layout's draws; one car is made for each of its `seats`, none if it has none.
+        ids: id of the vehicle for each name in `draws.seats`.
+        ego: the ego's start, whose path they share.
+        gaps_m: bounds of the uniform gap between centres, m, for each car from the ego backwards.
+        speed_mps: bounds of the speed that they have in common, m/s.
     """
     mps, arc_m, cars = draws.between("seats_speed", speed_mps), ego.arc_m, []
     for name, bounds in zip(draws.seats, gaps_m, strict=False):
@@ -118,9 +124,10 @@ def queue(
 
 
 def has_radio(scenario: str, parameters: Parameters, seed: int, vehicle: str = DANGER) -> bool:
-    """Return whether a vehicle that is no helper sends beacons; drawn with `radio_share`.
+    """Return whether a vehicle that is no helper sends beacons.
 
-    `vehicle` is its id; by default it is the layout's danger.
+    It is drawn by the layout seed, with probability `parameters.radio_share`. `scenario` is the
+    scenario's name, and `vehicle` the vehicle's id, or `DANGER` for the layout's danger.
     """
     draw = noise.uniforms((1,), scenario, seed, "radio", vehicle)[0]
     return bool(draw < parameters.radio_share)

@@ -31,7 +31,10 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 class Outcome:
     """Describe how an episode ended for one agent (usually the ego), or that it still runs.
 
-    What is said of a collision is None without one.
+    An agent is a vehicle that decides. `result` says how, and `time_s` when, in s from the start.
+    `partner`, `striker` and `fault` describe a collision, and are None without one. `least_gap_m`
+    is the nearest that another vehicle's outline came, m, and `other_crashes` counts vehicles that
+    crashed without the ego.
     """
 
     # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure:
@@ -58,11 +61,11 @@ class Outcome:
         return self.result == "cleared"
 
     def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":
-        """Return this outcome, as `late` if the ego came too long after the full-view driver.
+        """Return this outcome, changed to `late` if the ego reached its goal too late.
 
-        That is the reference driver that sees everything, and `reference` its outcome in the same
-        layout. The allowed delay depends on whether the layout has a `danger`
-        (`Parameters.allowance_s`).
+        That is later, by more than `parameters.allowance_s(danger)`, than the full-view driver: the
+        reference driver that sees everything, whose outcome in the same layout is `reference`.
+        `danger` is the sector that the layout's danger comes from, None without one.
         """
         if (
             not self.success
@@ -80,37 +83,43 @@ class Outcome:
 
 
 class End(Struct, frozen=True, array_like=True):
-    """Describe how one agent's drive in an episode ended.
+    """Describe how one agent's drive in an episode ended; an agent is a vehicle that decides.
 
-    `result` is `cleared` at the goal, else how the drive failed, decided at `time_s`. `lost_s` is
-    how much later than on an empty road it arrived; None unless it did. `partner` is the id of the
-    vehicle that it collided with, None without one, and `met` whether that is an agent, too.
+    `result` is `cleared` at the goal, else how the drive failed, decided at `time_s`, s from the
+    start. `lost_s` is how many s later than on an empty road it arrived; None unless it did.
+    `partner` is the id of the vehicle that it collided with, None without one, and `met` whether
+    that is an agent, too.
     """
 
     agent: str  # the agent's vehicle id
     result: str  # `cleared` if it reached its goal, else how it failed
-    time_s: float | None  # when that was decided
-    lost_s: float | None  # how much later than alone on the road it arrived; None unless it did
-    partner: str | None  # the vehicle that it collided with
+    time_s: float | None  # when that was decided, s from the start
+    # how many s later than alone on the road it arrived; None unless it did
+    lost_s: float | None
+    partner: str | None  # id of the vehicle that it collided with; None without one
     met: bool  # whether `partner` is another agent
 
 
 def rating(failure: str, parameters: Parameters) -> Rating | None:
     """Return `success`, `late`, `unsafe` or `stuck` for the result of an ended episode.
 
-    `failure` is a failed result such as `collision`, or empty for a success. None if the parameter
-    `limits` is 1, under which outcomes are not put into these words.
+    `failure` is empty for a success, else `late`, `collision`, `off_road` (both unsafe) or
+    `time_out` (stuck). None if the parameter `limits` is 1, under which outcomes are not put into
+    these words.
     """
     return None if parameters.limits == 1 else RATINGS[failure or "cleared"]
 
 
 def outline(v: VehicleState) -> Polygon:
-    """Return a vehicle's outline as a shapely polygon, in metres."""
+    """Return a vehicle's outline as a shapely polygon, in m to the east and the south."""
     return Polygon(v.corners())
 
 
 def striker(ego: VehicleState, other: VehicleState) -> str:
-    """Return whose front bumper made contact: `ego`, `other`, `both` or `neither`."""
+    """Return whose front bumper hit the other vehicle: `ego`, `other`, `both` or `neither`.
+
+    The states are those at the moment of the collision.
+    """
     contact = nearest_points(outline(ego), outline(other))[0]
     overlap = outline(ego).intersection(outline(other))
     if not overlap.is_empty:
@@ -129,7 +138,8 @@ def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path])
     """Return who is at fault in a collision, `ego` or `other`.
 
     In a rear-end collision (headings within 45°) it is the one behind, else the one whose path has
-    the lower right of way.
+    the lower right of way. The states are those at the moment of the collision, and `paths` are the
+    road's, by approach and route.
     """
     if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
         dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m

@@ -13,20 +13,20 @@ class OwnWorld(World):
     """Play an episode elsewhere, from its seed and the actions so far; a base class.
 
     Something beside the harness's simulator plays it, such as a gymnasium environment. A scenario
-    of such worlds names the class (`Scenario.world`). The harness knows neither its layout, where
-    vehicles start, nor a danger.
+    of such episodes names the class (`Scenario.world`). The harness then knows neither its layout,
+    where vehicles start, nor a danger, the vehicle that would meet a cruising ego.
     """
 
     @classmethod
     @abstractmethod
     def begun(cls, scenario: Scenario, seed: int) -> "World":
-        """Start the episode of a layout seed."""
+        """Start the scenario's episode of a layout seed, before its first decision."""
 
     @classmethod
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> World:
-        """Restore the world of a state: play its episode again with the actions taken.
+        """Restore the episode of a state: play it again from its seed with the actions taken.
 
-        `snapshot` is what `snapshot` returned for it, an `ActionsTaken`.
+        `snapshot` is the `ActionsTaken` that the method `snapshot` returned then.
         """
         world = cls.begun(scenario, state.episode_seed)
         for frame, action in snapshot.taken:
@@ -38,7 +38,7 @@ class OwnWorld(World):
 
     @abstractmethod
     def snapshot(self) -> ActionsTaken:
-        """Return the actions so far, since equal actions from the start lead to equal worlds."""
+        """Return the actions so far and their frames, which lead here from the seed again."""
 
     @classmethod
     def examine(cls, scenario: Scenario, seed: int) -> None:
@@ -49,7 +49,9 @@ class OwnWorld(World):
 
     @classmethod
     def configuration(cls, scenario: Scenario) -> Mapping[str, Any] | None:
-        """Return what a dataset's manifest holds of how such worlds are made, as plain values;
-        None for nothing.
+        """Return how such episodes are made, for a dataset's manifest to state; None for nothing.
+
+        Keys and values are the class's own: plain ones, which JSON can hold, such as an
+        environment's settings.
         """
         return None

@@ -31,7 +31,7 @@ ROUNDING_FRAMES = 1e-6  # a latency of 0.14 s is 7 frames and not 7.000000000000
 
 
 def frames(latency_s: float, simulation_hz: int) -> int:
-    """Return a latency in whole frames of the simulation, rounded up.
+    """Return a latency, `latency_s`, in whole frames of the simulation, rounded up.
 
     `simulation_hz` is the number of frames a second.
     """
@@ -42,7 +42,10 @@ def frames(latency_s: float, simulation_hz: int) -> int:
 class Parameters:
     """Hold the parameters that every scenario has; a scenario adds its own in a subclass.
 
-    Raises UserError if a value is out of bounds.
+    A unit ends a name where there is one: `_s`, `_m`, `_mps` (m/s), `_mps2` (m/s2), `_rad` or
+    `_hz`; a `_share` is a probability. A beacon is what a vehicle broadcasts about itself. `limits`
+    and `perception` are versions of the rules by which an arrival is late, and by which a vehicle
+    that no sensor reports hides others. Raises UserError if a value is out of bounds.
     """
 
     # speeds that SLOWER, IDLE and FASTER step through, m/s
@@ -143,28 +146,32 @@ class Parameters:
         return AMBIENTS[self.ambient]
 
     def stated(self) -> dict[str, Any]:
-        """Return the parameters by name for a manifest, without those at their value in `LATER`.
+        """Return the parameters by name, as the manifest of a dataset or run states them.
 
-        `LATER` has parameters that were added later, each with the value of the earlier behaviour.
+        Some were added to the harness later (`LATER`). One of these is left out while it has the
+        value under which all is as before it was added.
         """
         return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
 
     @property
     def lag_frames(self) -> int:
-        """Return `decision_lag_s`, the time from seeing to acting, in whole frames."""
+        """Return `decision_lag_s`, the time from seeing to acting, in frames of the simulation."""
         return frames(self.decision_lag_s, self.simulation_hz)
 
     def allowance_s(self, danger: str | None) -> float:
-        """Return how much later (s) than the full-view driver an ego may arrive and still succeed.
+        """Return how many s later than the full-view driver an ego may arrive and still succeed.
 
-        `danger` is the sector of the layout's danger, or None; less delay is allowed without one.
+        The full-view driver is the reference that sees everything. `danger` is the direction that
+        the layout's danger comes from, None without one: then, where `limits` is 2, less delay is
+        allowed.
         """
         return self.delay_allowance_s if danger or self.limits == 1 else self.harmless_allowance_s
 
     def due_frame(self, step: int) -> int:
-        """Return the frame in which decision `step` (from 0) is to be made.
+        """Return the number of the frame in which a decision is to be made, counted from the start.
 
-        From `decisions` on, it is the frame of the time limit.
+        `step` is the decision's index from 0. From `decisions` on, it is the frame of the time
+        limit.
         """
         due_s = self.time_limit_s if step >= self.decisions else step * self.decision_period_s
         return round(due_s * self.simulation_hz)
@@ -174,8 +181,11 @@ class Parameters:
 class Witnessed(Parameters):
     """Hold the parameters of a scenario in which the number of witnesses can be declared.
 
-    A witness is a helper that has the danger in sight at the first decision. The defaults are those
-    of the suite `v2v-safety-2`. Raises UserError if a value is out of bounds.
+    A witness is a helper that has the danger in sight at the first decision: `each` is 0 to 3 of
+    them in turn. `radio_share` is the probability that a vehicle which does not help broadcasts its
+    place, too; `limits` and `perception` are versions of rules (`Parameters`). The defaults are
+    those of the suite `v2v-safety-2`, a set of datasets. Raises UserError if a value is out of
+    bounds.
     """
 
     witnesses: str = "each"
@@ -188,7 +198,10 @@ class Witnessed(Parameters):
 class Shared(Parameters):
     """Hold the parameters of a scenario whose helpers may be agents, with goals of their own.
 
-    An agent decides for itself (`Scenario.seats`). Raises UserError if a value is out of bounds.
+    An agent is a vehicle that decides for itself (`Scenario.seats`). `agent_share` is the
+    probability that one which could does; under `clock` `apart` each decides at times of its own.
+    The other fields are those of `Parameters`, with other defaults. Raises UserError if a value is
+    out of bounds.
     """
 
     # probability that a vehicle which could decide does so, the ego aside: 1 makes all of them
@@ -225,7 +238,9 @@ LATER = (
 def beacon_radio(text: str) -> Physical | None:
     """Return the radio that the parameter `beacon_channel` names; None if it is empty.
 
-    Raises UserError if there is no such radio or setting, or it has one loss for all links.
+    `text` is the name of a physical radio with settings, each behind `+`:
+    `NAME+density_per_km=120`. Raises UserError if there is no such radio or setting, or if it has
+    one loss for all links.
     """
     if not text:
         return None

@@ -45,8 +45,11 @@ Point = tuple[Floats, Floats]
 class Sequences:
     """Hold n sequences of meta-actions that the planner tries, with what each does to the ego.
 
-    A way is one of the ego's paths that lie side by side, as lanes do. A step is `STEP_S` seconds
-    of the motion.
+    A way is one of the ego's paths that lie side by side, as lanes do. `levels` are changes of
+    target speed, in steps of the scenario's speeds, and `ends` the way on which a sequence ends,
+    counted to the right from the present one; `right_m` is where the ego is across, after each step
+    of `STEP_S` seconds. `calm` ranks sequences, to choose among equals, and `shift` numbers lateral
+    motions.
     """
 
     first: Sequence[str]  # name of each one's first action, (n,)
@@ -62,7 +65,9 @@ class Sequences:
 class Rollouts:
     """Hold the ego's predicted motions, each shared by all action sequences that lead to it.
 
-    A way is one of the ego's paths that lie side by side, as lanes do. A step is `STEP_S` seconds.
+    Positions are m along the ego's way and to its right after each step of `STEP_S` seconds,
+    (motions, steps). A way is one of the ego's paths that lie side by side, as lanes do. `motion`,
+    (n,), has for each of n sequences the index of its motion.
     """
 
     travelled_m: Floats  # distance along the ego's way, m, (motions, steps)
@@ -87,13 +92,19 @@ Start = tuple[float, float, int, tuple[int, int], int]
 
 
 def plan(scenario: Scenario, graph: SceneGraph) -> str:
-    """Return the meta-action that the reference planner takes, given the ego's scene graph."""
+    """Return the meta-action, such as `SLOWER`, that the reference planner takes for the ego.
+
+    `graph` is the ego's scene graph, all that the planner knows.
+    """
     [action] = plans(scenario, [graph])
     return action
 
 
 def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
-    """Return the meta-action that the reference planner takes for each scene graph of the ego."""
+    """Return the meta-action, such as `SLOWER`, that the reference planner takes for each ego.
+
+    Each of `graphs` is an ego's scene graph, all that the planner knows of its scene.
+    """
     p, road = scenario.parameters, scenario.road()
     places = [(_way(road, graph.ego), road.zone_arc_m - graph.ego.zone_m) for graph in graphs]
     beside = [road.beside(way, at_m) for way, at_m in places]
@@ -193,7 +204,8 @@ def _sequences(
 def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
     """Return by how many levels each decision changes the ego's target speed, (n, decisions).
 
-    `sequences` are n sequences of meta-actions; the levels are the scenario's target speeds.
+    `sequences` are n sequences of meta-actions, equally long. A level is an index in the scenario's
+    target speeds: FASTER is 1, SLOWER -1, and all else 0.
     """
     return _changes(sequences, SPEED)
 
@@ -235,11 +247,18 @@ def _rollouts(
 def travelled_m(
     moves: Ints, speeds_mps: Floats, targets_mps: Floats, left: int, parameters: Parameters
 ) -> Floats:
-    """Return the distance (m) that the ego travels, (starts, sequences, steps of `STEP_S`).
+    """Return how far the ego travels, m, after each step of `STEP_S` seconds, by its actions.
 
-    Follows highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest to
-    the present speed, and IDLE keeps the target. `moves` are changes of level, (sequences,
-    decisions). `speeds_mps` and `targets_mps` are (starts,), and `left` decisions remain.
+    The result is (starts, sequences, steps), for each start with each sequence of actions. Speeds
+    are those of highway-env's `MDPVehicle`: FASTER and SLOWER move one level from the level nearest
+    to the present speed, and IDLE keeps the target.
+
+    Args:
+        moves: changes of level, an index in the scenario's target speeds, (sequences, decisions).
+        speeds_mps: the ego's speed at each start, m/s, (starts,).
+        targets_mps: its target speed at each start, m/s, (starts,).
+        left: how many decisions remain; those that `moves` does not have are FASTER.
+        parameters: the scenario's, with the target speeds and the limits of acceleration.
     """
     levels, shape = np.array(parameters.target_speeds_mps), (len(speeds_mps), len(moves))
     steps, every = round(LOOK_AHEAD_S / STEP_S), round(parameters.decision_period_s / STEP_S)
@@ -281,7 +300,9 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
 class Motion:
     """Describe the predicted motion of another vehicle, and the ego's path that it may meet.
 
-    A position on a path is its distance along it from the beginning.
+    A position on a path is its distance along it from the beginning, m. `way` is the ego's path and
+    `begin_m` where the ego is on it now; `path` is the other's, and `arc_m`, (steps,), where it is
+    after each step of `STEP_S` seconds.
     """
 
     way: Path  # the ego's path
@@ -292,9 +313,10 @@ class Motion:
 
 
 def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:
-    """Predict, for `steps` steps of `STEP_S`, the motions of vehicles that the ego could meet.
+    """Predict the motions of vehicles that the ego could meet, for `steps` steps of `STEP_S` s.
 
-    Vehicles keep path and speed, unless they queue behind another one or are seen to brake.
+    They are those with a conflict in the ego's scene graph. They keep path and speed, unless they
+    queue behind another one or are seen to brake.
     """
     time_s = np.arange(1, steps + 1, dtype=np.float64) * STEP_S
     key = _way(road, graph.ego)
@@ -345,8 +367,14 @@ def least_gap(
 ) -> Floats:
     """Return the smallest gap (m) to another vehicle for each of the ego's motions, (motions,).
 
-    A value below 0 is a collision. Only steps where `under_way` is true count, (motions, steps). A
-    gap wider than `within_m` may be given as inf.
+    A value below 0 is a collision.
+
+    Args:
+        tried: the ego's predicted motions.
+        motion: the other vehicle's.
+        under_way: which steps of each motion count, such as those before the goal,
+            (motions, steps); True for all.
+        within_m: a gap wider than this may be given as inf, which is faster.
     """
     (ego_discs, ego_reach), (discs, reach) = cover(*SIZES_M["car"]), cover(*motion.size_m)
     (x, y), off_m = _middles(tried, motion.way, motion.begin_m)
@@ -384,9 +412,10 @@ def _middles(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
 
 @lru_cache(maxsize=64)
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
-    """Return discs that cover a vehicle: offsets along its axis, (discs,) m, and a radius (m).
+    """Return equal discs that cover a vehicle of so many metres: their centres and their radius.
 
-    The array is shared and must not be written to.
+    Centres are offsets along the vehicle's axis from its middle, (discs,) m, in a shared array that
+    must not be written to; the radius is in m.
     """
     count = max(3, round(length_m / width_m))
     places = (np.arange(count) - (count - 1) / 2) * length_m / count

@@ -25,10 +25,11 @@ BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `su
 
 
 def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, str]]:
-    """Return, for each world, the meta-action that its driver takes for each agent, by agent index.
+    """Return the meta-actions that drivers now take: for each world, those of its agents.
 
-    Agents whose drive has ended are left out. `drivers` has one name per world; all worlds are of
-    one scenario.
+    A world is one simulated episode; all are of one scenario. `drivers` has the name of each
+    world's reference driver, which decides for all of its agents. Actions are keyed by an agent's
+    index among the vehicles (0 is the ego); an agent whose drive has ended is left out.
     """
     deciding: list[Place] = []
     for n, world in enumerate(worlds):
@@ -66,14 +67,19 @@ def _graphs(
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
     """Let each world's driver take all remaining decisions; return each ego's outcome.
 
-    `drivers` has one name per world; all worlds are of one scenario, and are driven in place.
+    A world is one simulated episode; all are of one scenario, and are driven in place. `drivers`
+    has the name of each world's reference driver, which decides for all of its agents.
     """
     turns(worlds, drivers)
     return [world.outcome for world in worlds]
 
 
 def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, list[str]]]:
-    """Drive worlds to their ends as `finish` does; return each world's actions by agent index."""
+    """Drive worlds, simulated episodes of one scenario, to their ends; return the actions taken.
+
+    For each world these are the meta-actions of each agent, in order, by the agent's index among
+    the vehicles (0 is the ego). `drivers` has the name of each world's reference driver.
+    """
     scripts: list[dict[int, list[str]]] = []
     for world in worlds:
         scripts.append({agent: [] for agent in world.journeys})
@@ -90,8 +96,9 @@ def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, lis
 def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> None:
     """Apply each agent's action after the decision lag, and simulate to the next decision.
 
-    `actions` has, for each world, the meta-action of each agent by its index. The worlds are of one
-    scenario.
+    The lag is the time from seeing to acting. `actions` has, for each world, a simulated episode,
+    the meta-action of each agent by its index among the vehicles. The worlds are of one scenario,
+    and are changed in place.
     """
     p = worlds[0].scenario.parameters
     lockstep.advance(worlds, [p.due_frame(world.step) + p.lag_frames for world in worlds])
@@ -104,9 +111,10 @@ def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> 
 
 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
-    """Drive one episode with a reference driver, and return the ego's outcome.
+    """Drive the episode of a layout seed with a reference driver, and return the ego's outcome.
 
-    It is not yet judged for being `late` (`Outcome.judged`).
+    `driver` is a name of `DRIVERS`, such as `full-view`, which sees everything. Success is not yet
+    judged for being `late` (`Outcome.judged`).
     """
     [outcome] = finish([World.start(scenario, seed)], [driver])
     return outcome
@@ -115,8 +123,8 @@ def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
     """Drive each seed's episode with every driver of `DRIVERS`; return outcomes by driver.
 
-    An outcome is `late` if that driver cleared too long after the full-view driver, which sees
-    everything.
+    There is one dict for each layout seed, in order; a driver is a rule such as `brake`. An outcome
+    is `late` if that driver reached the goal too long after `full-view`, which sees everything.
     """
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
     outcomes = finish(worlds, DRIVERS * len(seeds))
@@ -134,9 +142,10 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcom
 def drive_apart(
     scenario: Scenario, seeds: Sequence[int], workers: Workers, progress: Callable[[int], None]
 ) -> list[dict[str, Outcome]]:
-    """Run `drive_all` on workers; return, per seed, outcomes by driver.
+    """Drive the episodes of layout seeds on workers; return, for each, outcomes by driver.
 
-    `progress` is called with the number of episodes just done.
+    They are those of `drive_all`: of every reference driver, judged for being late. `progress` is
+    called with the number of episodes just done.
     """
     return in_chunks(partial(drive_all, scenario), seeds, TOGETHER, workers, progress)
 
@@ -150,7 +159,8 @@ def in_chunks(
 ) -> list[T]:
     """Return `drives(seeds)` in order, computed by workers in chunks of `together` layout seeds.
 
-    `progress` is called with the number of seeds of each finished chunk.
+    `drives` takes layout seeds and returns one result for each. `progress` is called with the
+    number of seeds of each finished chunk.
     """
     chunks = [seeds[at : at + together] for at in range(0, len(seeds), together)]
     # all but the last have one size, so the order of completion is no matter
@@ -168,7 +178,11 @@ def in_chunks(
 def check(
     scenario: Scenario, episodes: int, seed: int, workers: Workers, progress: Callable[[int], None]
 ) -> dict[str, Any]:
-    """Drive every reference driver through the same episodes; return each one's `summary`."""
+    """Drive every reference driver through the same episodes; return how well each did.
+
+    By driver, it is a `summary`: how often episodes ended in each way. The layout seeds are
+    `episodes` ones from `seed` on; `progress` is called with the number of episodes just done.
+    """
     seeds = range(seed, seed + episodes)
     layouts = drive_apart(scenario, seeds, workers, progress)
     dangerous = [scenario.layout(each, scenario.parameters).danger is not None for each in seeds]
@@ -180,11 +194,13 @@ def check(
 
 
 def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str, Any]:
-    """Return rates of each result with Wilson intervals, and counts of collisions and crashes.
+    """Return how often episodes ended in each way, and counts of collisions and crashes.
 
-    Keys are `success`, `collision`, `late`, `time_out`, `off_road`, `ego_at_fault`,
-    `other_at_fault` and `other_crashes`. `dangerous` says which episodes hold a danger; if some do
-    and some do not, success is also given as `dangerous`, `harmless` and their mean `balanced`.
+    The keys `success`, `collision`, `late`, `time_out` and `off_road` have rates with Wilson
+    intervals; `ego_at_fault`, `other_at_fault` and `other_crashes` (of vehicles without the ego)
+    have counts. `dangerous` says which episodes hold a danger, a vehicle that would meet a cruising
+    ego; if some do and some do not, success is also given as `dangerous`, `harmless` and their mean
+    `balanced`.
     """
     rates: dict[str, Estimate] = {}
     for result in ("cleared", "collision", "late", "time_out", "off_road"):

@@ -34,7 +34,10 @@ NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
 class Path:
     """Describe one path along the road, in consecutive sections, each a lane of highway-env.
 
-    An arc length is the distance along the path from its beginning.
+    `points`, (n, 2), are m to the east and to the south of the road's origin. An arc length is the
+    distance along the path from its beginning, m: `arc_m`, (n,), of each point, and `ends_m` of the
+    end of each section but the last. `roles` and `lanes` name each section, in scene graphs and in
+    highway-env. `priority` is the right of way; the higher one goes first.
     """
 
     approach: str  # where it comes from, such as `left`
@@ -66,8 +69,10 @@ class Path:
         """Build a path along the middle of consecutive lanes of a road network.
 
         `network` is a `highway_env.road.road.RoadNetwork`, and `lanes` are the lanes' indices in
-        it; `roles` names each lane as scene graphs do. Only the part of a lane within `reach_m` of
-        the origin (`origin_m` in highway-env's frame) counts, but at least one point.
+        it; `approach` says where the path comes from and `route` what it does, `roles` names each
+        lane as scene graphs do, and `priority` is the right of way, the higher one first. Only the
+        part of a lane within `reach_m` of the origin (`origin_m` in highway-env's frame) counts,
+        but at least one point.
         """
         middles = [_within(_middle(network.get_lane(lane), origin_m), reach_m) for lane in lanes]
         corners = np.concatenate(middles)
@@ -88,7 +93,10 @@ class Path:
 
     @cached_property
     def columns(self) -> Floats:
-        """Return the points' coordinates x and y, (2, n) m, each in contiguous memory."""
+        """Return the points' coordinates, x in row 0 and y in row 1, (2, n) m.
+
+        Rows are contiguous in memory, which is faster to read.
+        """
         return np.ascontiguousarray(self.points.T)
 
     @cached_property
@@ -112,12 +120,12 @@ class Path:
 
     @cached_property
     def uneven_m(self) -> float:
-        """Largest deviation (m) of a point's arc length from equal spacing of all points."""
+        """Return how far, at most, a point is along the path from where even spacing puts it, m."""
         return float(np.abs(self.arc_m - self.arc_m[1] * np.arange(len(self.arc_m))).max())
 
     @cached_property
     def kink_rad(self) -> float:
-        """Largest change of the heading (rad) from one point to the next."""
+        """Return the largest change of the heading (rad) from one point to the next."""
         return float(np.abs(np.diff(np.unwrap(self.headings_rad))).max())
 
     # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene
@@ -126,13 +134,19 @@ class Path:
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         """Project a position on the path: arc length (m), unsigned lateral offset (m), heading.
 
-        The heading (rad) is that of the path there.
+        The position is in m to the east and south of the road's origin. The heading is that of the
+        path there, rad from +x (east) towards +y (south).
         """
         arc, lateral, heading = self.project_all(np.array([x_m]), np.array([y_m]))[:, 0].tolist()
         return arc, lateral, heading
 
     def project_all(self, x_m: Floats, y_m: Floats) -> Floats:
-        """Project n positions on the path as `project` does; arc, offset and heading, (3, n)."""
+        """Project n positions on the path; return arc lengths, offsets and headings, (3, n).
+
+        Arc lengths along the path and unsigned offsets from it are in m, and headings those of the
+        path there, rad. The positions, (n,) each, are in m to the east and south of the road's
+        origin.
+        """
         if self._step is None:
             nearest = self._tree.query_nearest(shapely.points(x_m, y_m), all_matches=False)[1]
         else:
@@ -166,12 +180,19 @@ class Path:
 
     @lru_cache(maxsize=8192)  # noqa: B019
     def at(self, arc_m: float) -> tuple[float, float, float]:
-        """Return x (m), y (m) and heading (rad) of the path at an arc length."""
+        """Return x (m), y (m) and heading (rad) of the path at an arc length.
+
+        That is the distance from the path's beginning, m. x is to the east and y to the south of
+        the road's origin.
+        """
         x, y, heading = self.places(np.array(arc_m))
         return float(x), float(y), float(heading)
 
     def places(self, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return x (m), y (m) and heading (rad) of the path at arc lengths (...), each (...)."""
+        """Return x (m), y (m) and heading (rad) of the path at arc lengths (...), each (...).
+
+        An arc length is the distance from the path's beginning, m.
+        """
         x, y = (np.interp(arc_m, self.arc_m, along) for along in self.columns)
         return (
             x,
@@ -180,7 +201,7 @@ class Path:
         )
 
     def points_at(self, arc_m: Floats) -> Floats:
-        """Return positions on the path, (n, 2) m, at arc lengths (n,)."""
+        """Return positions on the path, (n, 2) m, at arc lengths (n,), m from its beginning."""
         return np.stack(self.places(arc_m)[:2], axis=-1)
 
     def section(self, arc_m: float) -> int:
@@ -206,9 +227,10 @@ def _within(points: Floats, reach_m: float) -> Floats:
 
 @dataclass(frozen=True)
 class Crossing:
-    """Describe the point where another path meets the ego's.
+    """Describe the point where another path meets the ego's: it crosses it, or merges into it.
 
-    An arc length is the distance along a path from its beginning.
+    An arc length is the distance along a path from its beginning, m. The point is in m to the east
+    and south of the road's origin.
     """
 
     x_m: float  # position, m to the east of the road's origin
@@ -221,7 +243,12 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Ground:
-    """Hold what pictures show of a road's ground, in m to the east and to the *north*."""
+    """Hold what pictures show of a road's ground, in m to the east and to the *north*.
+
+    `outlines` are edges of the surface, `marks` centre lines and `stops` stop lines, each points
+    (n, 2); `boxes` are areas that labels must avoid, each its south-west and north-east corner,
+    (2, 2).
+    """
 
     # edges of the surface, (n, 2) each: the outer one, and those of islands
     outlines: tuple[Floats, ...]
@@ -235,8 +262,13 @@ class Ground:
 class Road:
     """Describe a road with all of its paths, and which of its places matter to the ego.
 
-    A path is known by its approach (where it comes from) and its route (what it does). The conflict
-    zone is where others may meet the ego. Positions are in m to the east and south of the origin.
+    A path's key is its approach (where it comes from) and its route (what it does). The conflict
+    zone is where others may meet the ego, at `zone_m`; `crossings` are the points where other paths
+    meet the ego's. A sector is a direction that danger can come from, with the points, (k, 2), that
+    must be seen. `ways` are the ego's paths side by side, as lanes are. `network()` returns
+    highway-env's road network, `goal_m(parameters)` how far along its path the ego's goal is, and
+    `ground(far_m)` what pictures show; `facts` describe the road in datasets. Positions are in m to
+    the east and south of the origin.
     """
 
     # description in frozen records: texts, and numbers with their unit in the name
@@ -267,14 +299,15 @@ class Road:
     ground: Callable[[float], Ground] | None = None
 
     def ground_within(self, far_m: float) -> Ground:
-        """Return the ground for a picture that reaches `far_m` from the origin on each side."""
+        """Return what pictures show of the ground, up to `far_m` from the origin on each side."""
         return self.ground(far_m) if self.ground else ground(self.network(), far_m, self.origin_m)
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[Side, PathKey]:
         """Return the keys of the ego's paths side by side: `key` as `own`, its `left` and `right`.
 
-        A side without a path is left out. With an arc length, so is one whose path shares the lane
-        there.
+        They are the paths between which the ego may change, as between lanes. A side without a path
+        is left out. With `arc_m`, a distance along the path `key`, so is one whose path shares the
+        lane there.
         """
         if key not in self.ways:
             return {"own": key}
@@ -291,10 +324,11 @@ class Road:
         }
 
     def project(self, keys: Sequence[PathKey], x_m: Floats, y_m: Floats) -> Floats:
-        """Project n positions, each on the path of its own key, as `Path.project` does, (3, n).
+        """Project n positions, each on the path of its own key, (3, n).
 
         Rows of the result are arc lengths along the paths (m), unsigned offsets to the side (m) and
-        the paths' headings there (rad). `x_m` and `y_m` are (n,).
+        the paths' headings there (rad). `keys` are n pairs of approach and route; `x_m` and `y_m`,
+        (n,), are m to the east and south of the origin.
         """
         projected, places = np.empty((3, len(keys))), defaultdict[PathKey, list[int]](list)
         for n, key in enumerate(keys):
@@ -305,9 +339,10 @@ class Road:
 
     @cached_property
     def forks(self) -> frozenset[tuple[PathKey, int]]:
-        """Sections, as path key and section number, whose lane several paths of one approach share.
+        """Return the sections whose lane several paths of one approach share.
 
-        There, only a vehicle's indicator tells which of these paths it will take.
+        Each is a path's key (approach, route) and the section's number from 0 in it. There, only a
+        vehicle's indicator tells which of these paths it will take.
         """
         of_lane: dict[tuple[str, Lane], list[tuple[PathKey, int]]] = {}
         for key, path in self.paths.items():
@@ -323,7 +358,7 @@ class Road:
 
     @cached_property
     def zone_arc_m(self) -> float:
-        """Return the arc length (m) of the ego's path at the point nearest to the conflict zone."""
+        """Return how far along the ego's path, m, the point nearest to the conflict zone is."""
         return self.ego_path.project(*self.zone_m)[0]
 
     @cached_property
@@ -337,7 +372,9 @@ def paths_along(
 ) -> dict[PathKey, Path]:
     """Build the paths of a network by key (approach, route).
 
-    Each is given as consecutive lanes, the role of each lane, and the path's right of way.
+    `network` is a `highway_env.road.road.RoadNetwork`. Each path is given as the indices of its
+    consecutive lanes, the role of each lane in scene graphs, and the right of way, the higher one
+    first.
     """
     return {
         key: Path.along(network, *key, lanes, roles, priority)
@@ -346,7 +383,11 @@ def paths_along(
 
 
 def crossings(paths: Mapping[PathKey, Path], ego: PathKey) -> dict[PathKey, Crossing]:
-    """Return where paths of other approaches first meet the ego's path, by path key."""
+    """Return where paths of other approaches first meet the ego's path, by path key.
+
+    A key is (approach, route): where a path comes from, and what it does. `ego` is that of the
+    ego's path. Paths that do not meet it, or more than once without a common lane, are left out.
+    """
     ego_path = paths[ego]
     meetings = {}
     for key, path in paths.items():
@@ -387,10 +428,11 @@ def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple
 def to_the_left(
     begin: tuple[float, float], end: tuple[float, float], width_m: float
 ) -> tuple[Any, Any]:
-    """Build a lane shift to the left from two arcs: one that turns left, and one that turns back.
+    """Build a lane shift to the left of two arcs: one that turns left, and one that turns back.
 
-    `begin` and `end` are x and y in m; both ends head east, and `end` lies farther north. Unlike
-    highway-env's `SineLane`, an arc's longitudinal coordinate is its true length.
+    They are lanes of highway-env, `width_m` wide. `begin` and `end` are x and y in m; both ends
+    head east, and `end` lies farther north. Unlike highway-env's `SineLane`, an arc's longitudinal
+    coordinate is its true length.
     """
     from highway_env.road.lane import CircularLane, LineType
 
@@ -420,8 +462,8 @@ def lanes_of(network: Any) -> dict[Lane, Any]:
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
     """Build the ground that pictures show of all lanes within `far_m` of the origin.
 
-    `network` is a `highway_env.road.road.RoadNetwork`, and `origin_m` the position of the origin
-    in its frame, m.
+    It is made of the lanes of `network`, a `highway_env.road.road.RoadNetwork`, in whose frame the
+    road's origin is at `origin_m`, m.
     """
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)

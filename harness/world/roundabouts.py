@@ -24,7 +24,11 @@ NAMES = ("own", "right", "oncoming", "left")
 
 @dataclass(frozen=True)
 class Roundabout:
-    """Describe a one-lane roundabout with four arms around the origin."""
+    """Describe a one-lane roundabout with four arms around the origin.
+
+    `ring_m` is the radius of the middle of its lane, `entry_m` that of the arcs by which cars enter
+    and leave, and `beside_m` the distance of an arm's centre line to the middle of its lanes, m.
+    """
 
     ring_m: float  # radius of the middle of the ring's lane, m
     entry_m: float  # radius of the arcs by which cars enter and leave, m
@@ -42,13 +46,17 @@ class Roundabout:
         return math.atan2(self.arc_y_m, self.beside_m + self.entry_m)
 
     def ring_rad(self, node: int) -> float:
-        """Return the angle (rad) of the nth junction of `RING`; it decreases along the traffic."""
+        """Return the angle (rad, from +x towards +y) of a junction on the ring.
+
+        `node` is its index in `RING`, which lists entries and exits in the order of traffic, from
+        the south entry on. Angles decrease along the traffic.
+        """
         exits = self.touch_rad if node % 2 == 0 else math.pi / 2 - self.touch_rad
         return exits - math.pi / 2 * (node // 2)
 
     @cache  # noqa: B019 there are few, and they are never freed
     def network(self) -> Any:
-        """Build highway-env's `RoadNetwork` of the ring and its four arms, without gaps."""
+        """Build the ring and its arms, without gaps: a `highway_env.road.road.RoadNetwork`."""
         from highway_env.road.lane import CircularLane, LineType, StraightLane
         from highway_env.road.road import RoadNetwork
 
@@ -89,10 +97,11 @@ class Roundabout:
     def path(
         self, approach: str, route: str, begin: str, end: str, priority: int, home: str = ARMS[0]
     ) -> Path:
-        """Build the path of `approach` and `route` from arm `begin` round the ring to arm `end`.
+        """Build the path from arm `begin` round the ring to arm `end`: `s`, `e`, `n` or `w`.
 
-        Arms are `s`, `e`, `n` or `w`. Lane names in the path are relative to an agent that comes
-        from the arm `home`.
+        `approach` and `route` are its key, as an agent (a vehicle that decides) from the arm `home`
+        calls it, and lanes are named from there, too. `priority` is the right of way; the higher
+        one goes first.
         """
         first, last = RING.index(f"{begin}e"), RING.index(f"{end}x")
         if last <= first:  # once more past the node where the ring's list begins
@@ -105,9 +114,10 @@ class Roundabout:
         return Path.along(self.network(), approach, route, lanes, roles, priority)
 
     def mound(self, radius_m: float) -> list[tuple[float, float, float, float]]:
-        """Return three boxes (west, north, east, south; m) that together approximate a disc.
+        """Return three boxes that together approximate a disc around the origin, to block sight.
 
-        Their corners lie on the circle around the origin.
+        Each is its walls' positions west, north, east and south, m; its corners lie on the circle
+        of radius `radius_m`.
         """
         boxes = []
         for degrees in (22.5, 45.0, 67.5):
@@ -120,7 +130,7 @@ class Roundabout:
 def name_of(arm: str, home: str) -> str:
     """Return how an agent from arm `home` calls `arm`: `own`, `right`, `oncoming` or `left`.
 
-    Arms are given as `s`, `e`, `n` or `w`.
+    An agent is a vehicle that decides. Arms are given as `s`, `e`, `n` or `w`.
     """
     return NAMES[(ARMS.index(arm) - ARMS.index(home)) % len(ARMS)]
 

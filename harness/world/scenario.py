@@ -22,7 +22,8 @@ class Draws:
     """Draw the random quantities of one layout, each keyed by its name and the layout seed.
 
     A layout is the start situation of an episode. So a parameter that changes one quantity leaves
-    the draws of all others as they are.
+    the draws of all others as they are. `attempt` counts earlier draws that did not fit, and
+    `seats` names further cars that see no danger (`harness.world.lookouts`).
     """
 
     scenario: str  # name of the scenario
@@ -39,7 +40,7 @@ class Draws:
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
 
     def ids(self, names: Collection[str]) -> dict[str, str]:
-        """Draw vehicle ids from `v5` on for `names` and `seats`, keyed by these names.
+        """Draw vehicle ids from `v5` on for the vehicles named in `names` and `seats`, by name.
 
         Ids are shuffled, and absent vehicles get one too, so neither an id nor a gap between two
         tells anything about a vehicle. The ego and the helpers have `v1` to `v4`.
@@ -51,7 +52,13 @@ class Draws:
 
 @dataclass(frozen=True)
 class Spawn:
-    """Describe one vehicle at the start of an episode."""
+    """Describe one vehicle at the start of an episode, and when it brakes by itself.
+
+    It is `arc_m` m along its path, which is known by its approach (where it comes from) and its
+    route (what it does). `part` is `ego`, `helper` (may be asked for messages) or `other`; `radio`
+    says whether an `other` sends beacons. From `brakes_at_s` s on, if that is not None, it brakes
+    with `brakes_mps2` down to `brakes_to_mps`.
+    """
 
     id: str  # `v1`, `v2`, …
     kind: Kind  # class of vehicle
@@ -71,8 +78,8 @@ class Spawn:
 class Layout:
     """Hold the start situation of one episode: its vehicles, its buildings and its danger.
 
-    A danger is the vehicle that would meet an ego which keeps its speed; a sector is a direction
-    that it may come from.
+    A danger is the vehicle that would meet an ego which keeps its speed: `danger_id` is its id, and
+    `danger` the sector, the direction that it comes from. Both are None without a danger.
     """
 
     spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first
@@ -90,8 +97,9 @@ class Layout:
     ) -> "Layout":
         """Return a layout with the vehicles in the order of their ids.
 
-        `danger` is the sector of the dangerous vehicle `danger_id`; if it is None the layout has no
-        danger, and the id is ignored.
+        `spawns` are the vehicles in any order. `danger` is the sector, or direction, that the
+        dangerous vehicle `danger_id` comes from; if it is None the layout has no danger, and the id
+        is ignored.
         """
         order = sorted(spawns, key=lambda spawn: int(spawn.id[1:]))
         return cls(tuple(order), tuple(buildings), danger, danger_id if danger else None)
@@ -102,7 +110,8 @@ class Seat:
     """Describe the scenario as an agent other than the ego plays it: with that agent as the ego.
 
     An agent is a vehicle that decides for itself. The road network, name, actions and parameters
-    are the shared scenario's; road, goal and prompt words are the agent's own.
+    are the shared scenario's; road, goal and prompt words are the agent's own. `names` translates
+    keys of paths, (approach, route), from the shared road's to the agent's.
     """
 
     scenario: "Scenario"  # the scenario with the agent as its ego
@@ -114,8 +123,13 @@ class Seat:
 class Scenario:
     """Describe one scenario: its road, layouts, goal, actions, parameters and words for prompts.
 
-    A layout is the start situation of an episode. A scenario is pickled by name and parameters, so
-    it must be found by name in the registry.
+    A layout is the start situation of an episode. `road()` returns the road,
+    `layout(seed, parameters)` draws the start of an episode,
+    `cleared(xy_m, approaches, parameters)` tells whether egos have reached their goal, and
+    `seats()` returns the scenario as other vehicles that decide play it. `words` are texts for
+    prompts, `prompt` the default prompt version, and `dials` the parameters that a user may set
+    behind the name. `one_sided` says why a mirrored scene would be wrong. A scenario is pickled by
+    name and parameters, so it must be found by name in the registry, `harness.world.scenarios`.
     """
 
     name: str  # its name for users, and in manifests and frozen states
@@ -159,14 +173,18 @@ class Scenario:
 
     @property
     def has_own_world(self) -> bool:
-        """Whether something beside the harness's simulator plays the episodes; the harness then
-        knows no layout and no danger.
+        """Return whether something beside the harness's simulator plays the episodes.
+
+        The harness then knows no layout, where vehicles start, and no danger.
         """
         return self.world is not None
 
     @property
     def prompt_words(self) -> dict[str, str]:
-        """Return texts for prompts by name: `words`, and `speeds`, the target speeds in m/s."""
+        """Return texts for prompts by name: `words`, and `speeds`, the target speeds in m/s.
+
+        The speeds are one text, the highest first: `14, 7, 0`. Templates read `words.<name>`.
+        """
         speeds = ", ".join(f"{speed:g}" for speed in reversed(self.parameters.target_speeds_mps))
         return {**self.words, "speeds": speeds}
 

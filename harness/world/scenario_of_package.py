@@ -80,7 +80,8 @@ def put_doors(scenario: Scenario) -> None:
     """Replace the functions of another package's scenario, in place, by checking wrappers.
 
     The wrappers (of `road`, `layout`, `cleared` and `seats`) raise a one-line UserError that names
-    the scenario when the function fails or returns something invalid.
+    the scenario when the function fails or returns something invalid. The harness's own functions
+    stay.
     """
     what = f"scenario {printable(scenario.name)}"
     for name, door in (("road", _RoadDoor), ("cleared", _ClearedDoor), ("seats", _SeatsDoor)):

@@ -94,7 +94,7 @@ class Conflict(Closed, frozen=True):
 
     @property
     def meets(self) -> bool:
-        """Whether the paths cross or merge, rather than run along the same lane."""
+        """Return whether the paths cross or merge, rather than run along the same lane."""
         return self.kind in (UNSET, "crossing", "merging")
 
 
@@ -124,34 +124,44 @@ class SceneGraph(Closed, frozen=True):
 
     @property
     def sensed(self) -> tuple[Node, ...]:
-        """Nodes of the vehicles that the viewer's sensors report, not those known by beacons."""
+        """Return the vehicles that the viewer's sensors report, not those known by beacons."""
         return tuple(node for node in self.nodes if node.sensors != BY_BEACON)
 
     @property
     def seen(self) -> tuple[str, ...]:
-        """Ids of the vehicles that the viewer's sensors report."""
+        """Return the ids of the vehicles that the viewer's sensors report."""
         return tuple(node.id for node in self.sensed)
 
     @property
     def occluded(self) -> tuple[str, ...]:
-        """Names of the sectors (directions of danger) of which the viewer sees less than half."""
+        """Return the names of the sectors of which the viewer sees less than half.
+
+        A sector is a direction that danger can come from.
+        """
         return tuple(sector.sector for sector in self.sectors if sector.occluded)
 
     @property
     def all_in_sight(self) -> tuple[Sector, ...]:
-        """The graph's sectors as a viewer that sees all of each would list them."""
+        """Return the graph's sectors as a viewer that sees all of each would list them.
+
+        A sector is a direction that danger can come from.
+        """
         return tuple(Sector(sector.sector, 1.0, False, ()) for sector in self.sectors)
 
     def blinded(self) -> "SceneGraph":
-        """Return the graph as a viewer without sensors has it: no vehicles, and no sector in sight.
+        """Return the graph as a viewer without sensors has it: no vehicles, no sector in sight.
 
-        It keeps the viewer itself and the ego, which is known by its beacon.
+        A sector is a direction that danger can come from. It keeps the viewer itself and the ego,
+        which is known by its beacon.
         """
         unseen = tuple(Sector(sector.sector, 0.0, True, ()) for sector in self.sectors)
         return msgspec.structs.replace(self, nodes=(), conflicts=(), sectors=unseen)
 
     def plain(self) -> dict[str, Any]:
-        """Return the graph as dicts and lists for templates, without members that are `UNSET`."""
+        """Return the graph as dicts and lists, by the names in files, for templates of prompts.
+
+        Members that are `UNSET`, as those that a scenario does not have, are left out.
+        """
         plain: dict[str, Any] = msgspec.to_builtins(self, order="sorted")
         for node in plain["nodes"]:
             node["sensors"] = list(node["sensors"])

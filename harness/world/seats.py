@@ -19,9 +19,10 @@ from harness.world.state import VehicleState, WorldState
 
 
 def agent_share(scenario: Scenario) -> float:
-    """Return the probability that a vehicle which could decide for itself does so, the ego aside.
+    """Return the probability that a vehicle which could decide for itself does so.
 
-    0 in scenarios where only the ego has a goal.
+    It is for each vehicle but the ego, which always decides; 0 in scenarios where only the ego has
+    a goal.
     """
     return getattr(scenario.parameters, "agent_share", 0.0)
 
@@ -43,8 +44,8 @@ def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
     """Return the seat of each agent that is not the ego, by the path on which it starts.
 
     An agent is a vehicle that decides for itself. A seat is the scenario with that agent as its
-    ego; it has the parameters of `scenario`. A path is known by approach and route. Empty if only
-    the ego has a goal.
+    ego; it has the parameters of `scenario`. A path's key is (approach, route). Empty if only the
+    ego has a goal.
     """
     seats = scenario.seats() if scenario.seats else {}
     p = scenario.parameters
@@ -56,9 +57,9 @@ def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
 def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tuple[int, ...]]:
     """Return a layout, and the indices among its vehicles of the agents, which decide.
 
-    A layout is the start situation of an episode, drawn by `seed`. The ego comes first. If
-    `agent_share` is 0 the ego is the only agent and the layout is unchanged. Otherwise agents are
-    drawn by the seed, and a vehicle that could be one and was not drawn becomes traffic (`other`).
+    A layout is the start situation of an episode, drawn by `seed`. The ego, an agent, comes first.
+    If `agent_share` is 0 it is the only one and the layout is unchanged. Otherwise agents are drawn
+    by the seed, and a vehicle that could be one and was not drawn becomes traffic (`other`).
     """
     share, seats = agent_share(scenario), seats_of(scenario)
     if not share:
@@ -80,7 +81,8 @@ def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tu
 def offsets(scenario: Scenario) -> list[int]:
     """Return by how many frames agents may decide later than the ego's clock, ascending.
 
-    [0] unless the parameter `clock` is `apart`: then multiples of a quarter of the decision period.
+    An agent is a vehicle that decides for itself. It is [0] unless the parameter `clock` is
+    `apart`: then multiples of a quarter of the decision period, in frames of the simulation.
     """
     p = scenario.parameters
     quarters = range(4) if getattr(p, "clock", "together") == "apart" else range(1)
@@ -88,9 +90,10 @@ def offsets(scenario: Scenario) -> list[int]:
 
 
 def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
-    """Return the offset of one agent's decision times from the common clock, in frames.
+    """Return by how many frames one agent decides later than the common clock.
 
-    It is drawn by the layout `seed` and the agent's index among the vehicles.
+    It is drawn by the layout `seed` and `agent`, the agent's index among the vehicles; 0 for all
+    unless the parameter `clock` is `apart`.
     """
     times = offsets(scenario)
     if len(times) == 1:
@@ -103,13 +106,16 @@ def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
 def seat_of(scenario: Scenario, vehicle: VehicleState | Spawn) -> Seat:
     """Return the seat of an agent other than the ego: the scenario with that agent as its ego.
 
-    Raises KeyError if its path has none.
+    `vehicle` is that agent, at any time. Raises KeyError if its path has none.
     """
     return seats_of(scenario)[vehicle.approach, vehicle.route]
 
 
 def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
-    """Return the indices at which each scenario stands in a sequence, in order of the first."""
+    """Return, for each scenario in a sequence, the indices from 0 at which it stands there.
+
+    Scenarios are in the order in which they first come.
+    """
     places: dict[Scenario, list[int]] = {}
     for n, scenario in enumerate(scenarios):
         places.setdefault(scenario, []).append(n)
@@ -120,7 +126,7 @@ def seated(scenario: Scenario, state: WorldState, agent: int) -> WorldState:
     """Return a state as one agent sees it: this agent is the ego, and the ego a helper.
 
     `agent` is its index among the vehicles, not 0. Vehicles are reordered, the agent first, and
-    paths renamed as its scenario names them.
+    paths renamed as the scenario in which it is the ego names them.
     """
     names = seat_of(scenario, state.vehicles[agent]).names
 

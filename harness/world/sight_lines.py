@@ -24,12 +24,12 @@ def site(
     antennas: Collection[Antenna] = (),
     zone_m: Place = (0.0, 0.0),
 ) -> Site:
-    """Return where the ego and its helpers are in n states, and what is between them, (n, ...).
+    """Return where the ego and its helpers are in n states, and what is between them.
 
-    Each of the n `points` is a state with the ids of its ego and helpers, the ego first. Antennas
-    are at vehicle centres; if a building and a vehicle both block a link, the building counts.
-    `antennas` are on no vehicle, and add links to the ego and helpers; their positions are relative
-    to `zone_m`, the centre of the conflict zone (m).
+    Arrays of the result are (n, ...). Each of the n `points` is a state with the ids of its ego and
+    helpers, the ego first. Antennas are at vehicle centres; if a building and a vehicle both block
+    a link, the building counts. `antennas` are on no vehicle, and add links to the ego and helpers;
+    their positions are relative to `zone_m`, the centre of the conflict zone, m.
     """
     states = [state for state, _ in points]
     viewers: list[list[VehicleState]] = []
@@ -87,9 +87,10 @@ def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tup
 
 
 def corner(a: VehicleState, b: VehicleState) -> Floats:
-    """Return the distances (m) of vehicles `a` and `b` to where their straight courses cross, (2,).
+    """Return how far vehicles `a` and `b` are, m, from where their straight courses cross, (2,).
 
-    NaN if their headings are within 30° of parallel.
+    It is how far radio waves go around a corner of streets. NaN if their headings are within 30° of
+    parallel.
     """
     sine = np.sin(b.heading_rad - a.heading_rad)
     if abs(sine) < np.sin(LEAST_ANGLE_RAD):

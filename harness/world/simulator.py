@@ -50,11 +50,12 @@ class _OnRoute:
 class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
     """Drive a vehicle that keeps route and speed, but brakes for a slower one ahead in its lane.
 
-    It also brakes at a fixed time if its layout says so (`Spawn.brakes_at_s`).
+    It also brakes at a fixed time if its layout, the start situation, says so
+    (`Spawn.brakes_at_s`).
     """
 
-    braking_mps2 = 4.0
-    standoff_m = 2.0
+    braking_mps2 = 4.0  # how hard it brakes for who is ahead, m/s2
+    standoff_m = 2.0  # gap that it leaves to who is ahead, m
 
     def speed_control(self, target_speed: float) -> float:
         if self.spawn.brakes_at_s is not None and self.road.time_s >= self.spawn.brakes_at_s:
@@ -71,13 +72,13 @@ class Traffic(_OnRoute, ControlledVehicle):  # type: ignore[misc]
 
 
 class Van(Traffic):
-    """A van in traffic, high enough to hide the vehicles before or behind it."""
+    """Drive a van in traffic, high enough to hide the vehicles before or behind it."""
 
     LENGTH, WIDTH = SIZES_M["van"]
 
 
 class Truck(Traffic):
-    """A truck in traffic, long and wide enough to hide a car behind it."""
+    """Drive a truck in traffic, long and wide enough to hide a car behind it."""
 
     LENGTH, WIDTH = SIZES_M["truck"]
 
@@ -86,21 +87,31 @@ KINDS = {"car": Traffic, "van": Van, "truck": Truck}
 
 
 class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
-    """A vehicle that decides: it follows a target speed within limits of acceleration."""
+    """Drive a vehicle that decides: it follows a target speed within limits of acceleration.
 
-    limits_mps2 = (-8.0, 3.0)
-    # the lanes that it may change between, and their routes
+    `ways` has the lanes between which it may change, by highway-env's index, with the route that
+    its path has there.
+    """
+
+    limits_mps2 = (-8.0, 3.0)  # least and greatest acceleration, m/s2
+    # the lanes that it may change between, by highway-env's index, and the route of each
     ways: Mapping[Lane, str] = MappingProxyType({})
 
     def act(self, action: str | None = None) -> None:
-        """Take a meta-action, or just drive on if None; a lane change changes the route."""
+        """Take a meta-action, such as `SLOWER`, or just drive on if None.
+
+        A lane change changes the route.
+        """
         super().act(action)
         route = self.ways.get(self.target_lane_index, self.spawn.route)
         if route != self.spawn.route:
             self.spawn, self.route = replace(self.spawn, route=route), [self.target_lane_index]
 
     def on_state_update(self) -> None:
-        """Set the vehicle's lane to the nearest one of those between which it may change."""
+        """Set the vehicle's lane to the nearest one of those between which it may change.
+
+        highway-env calls it after each frame.
+        """
         super().on_state_update()
         if self.ways:
             self.lane_index = min(self.ways, key=self._off_m)
@@ -117,7 +128,8 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
 def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)) -> Any:
     """Return a `highway_env.road.road.Road` with a layout's vehicles on it, the ego first.
 
-    `agents` are the indices among the layout's vehicles of those that decide.
+    A layout is the start situation of an episode. `agents` are the indices among its vehicles of
+    those that decide; all others are traffic, which keeps route and speed.
     """
     road, static = new_road(scenario), scenario.road()
     for n, spawn in enumerate(layout.spawns):
@@ -140,7 +152,10 @@ def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)
 
 
 def copied(road: Any) -> Any:
-    """Return a copy of a `highway_env.road.road.Road`, simulated without changing the original."""
+    """Return a copy of a `highway_env.road.road.Road` with its vehicles.
+
+    To simulate the copy does not change the original.
+    """
     new = copy(road)
     new.vehicles = [copy(v) for v in road.vehicles]
     for v in new.vehicles:
@@ -162,11 +177,16 @@ def vehicle_on(
     heading: float,
     agent: bool,
 ) -> ControlledVehicle:
-    """Create a highway-env vehicle on the given section of its path, at a position and heading.
+    """Create a highway-env vehicle on a road, at a position on its path.
 
-    `road` is a `highway_env.road.road.Road`, and `section` the number from 0 of a section of the
-    path. `position` is in m in highway-env's frame, `heading` in rad. If `agent` is true it takes
-    actions and follows a target speed, else it is traffic.
+    Args:
+        road: a `highway_env.road.road.Road`; the vehicle is not yet among its vehicles.
+        scenario: the scenario, with the paths and the ego's target speeds.
+        spawn: the vehicle's id, class, path and speed.
+        section: number from 0 of the section of the path, a lane, that it is in.
+        position: x and y in highway-env's frame, m.
+        heading: rad, from +x towards +y.
+        agent: whether it decides: takes actions and follows a target speed; else it is traffic.
     """
     p, static = scenario.parameters, scenario.road()
     route = list(static.paths[spawn.approach, spawn.route].lanes)
@@ -186,7 +206,10 @@ def vehicle_on(
 
 
 def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
-    """Return the start of a vehicle, a `Spawn`, at its present position and speed."""
+    """Return a vehicle as one that starts at its present position and speed.
+
+    `layout` is the start situation of its episode, which says when the vehicle brakes by itself.
+    """
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     start = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
     plans = (start.brakes_at_s, start.brakes_mps2, start.brakes_to_mps) if start else ()
@@ -198,8 +221,9 @@ def state_of(
 ) -> VehicleState:
     """Return the state of a highway-env vehicle, with positions from `origin_m`.
 
-    Numbers are rounded to `DECIMALS`, since the last bits depend on the machine. Brake lamps are
-    reported only if `lamps` is true.
+    `origin_m` is the origin of the scenario's road in highway-env's frame, m. Numbers are rounded
+    to `DECIMALS`, since the last bits depend on the machine. Brake lamps are reported only if
+    `lamps` is true.
     """
     s = v.spawn
     numbers = (*(v.position - origin_m), v.heading, v.speed)

@@ -24,7 +24,10 @@ HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
 
 
 def indicator(route: str) -> str:
-    """Return what the turn indicator of a vehicle on this route shows: `left`, `right` or `off`."""
+    """Return what the turn indicator of a vehicle on this route shows: `left`, `right` or `off`.
+
+    A route is what a path does, such as `straight`.
+    """
     return route if route in ("left", "right") else "off"
 
 
@@ -46,23 +49,23 @@ class VehicleState(Closed, frozen=True, omit_defaults=True):
 
     @property
     def indicator(self) -> str:
-        """What the turn indicator shows: `left`, `right` or `off`."""
+        """Return what the turn indicator shows: `left`, `right` or `off`."""
         return indicator(self.route)
 
     @property
     def length_m(self) -> float:
-        """Length from bumper to bumper (m)."""
+        """Return the length from bumper to bumper, m, which the class of vehicle fixes."""
         return SIZES_M[self.kind][0]
 
     @property
     def width_m(self) -> float:
-        """Width from side to side (m)."""
+        """Return the width from side to side, m, which the class of vehicle fixes."""
         return SIZES_M[self.kind][1]
 
     def corners(self) -> NDArray[np.float64]:
         """Return the corners, (4, 2) m: front left first, then clockwise as seen from above.
 
-        The array is shared and must not be written to.
+        x is to the east and y to the south. The array is shared and must not be written to.
         """
         return _corners(self)
 
@@ -81,8 +84,8 @@ def rectangle(
 ) -> Floats:
     """Return corners of rectangles, (..., 4, 2) m: front left first, then clockwise from above.
 
-    The arguments are centres, headings (from +x towards +y), lengths and widths, each of shape
-    (...).
+    The arguments are centres to the east and south, m, headings (rad, from +x towards +y), lengths
+    and widths (m), each of shape (...).
     """
     cos, sin = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
     along = np.multiply.outer(length_m, [1.0, 1.0, -1.0, -1.0]) / 2
@@ -94,8 +97,8 @@ def rectangle(
 def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: Floats) -> Floats:
     """Return a lower bound of the gap between n pairs of rectangles, (n,) m, by separating axes.
 
-    A negative value means that they overlap. `poses` and `others` are x, y and heading, (n, 3); the
-    sizes are length and width, (n, 2).
+    A negative value means that they overlap. `poses` and `others` are x and y (m) and heading (rad)
+    of the one and the other of each pair, (n, 3); the sizes are length and width, m, (n, 2).
     """
     dx, dy = (others - poses)[:, :2].T
     apart = np.full(len(poses), -np.inf)
@@ -165,16 +168,16 @@ class WorldState(Closed, frozen=True):
 
     @property
     def ego(self) -> VehicleState:
-        """The ego: the vehicle whose decisions are evaluated, always the first."""
+        """Return the ego: the vehicle whose decisions are evaluated, always the first."""
         return self.vehicles[0]
 
     @property
     def helpers(self) -> tuple[VehicleState, ...]:
-        """The vehicles that the ego may ask for messages, in spawn order."""
+        """Return the vehicles that the ego may ask for messages, in spawn order."""
         return tuple(v for v in self.vehicles if v.part == "helper")
 
     def vehicle(self, vehicle_id: str) -> VehicleState:
-        """Return the vehicle with an id. Raises KeyError if there is none."""
+        """Return the vehicle with an id, such as `v2`. Raises KeyError if there is none."""
         for v in self.vehicles:
             if v.id == vehicle_id:
                 return v

@@ -21,8 +21,8 @@ def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float
     """Return when each agent would reach its goal with the road to itself, in s.
 
     An agent is a vehicle that decides for itself. The result is keyed by layout seed, then by the
-    agent's index among the vehicles. The agent keeps its initial target speed; one that does not
-    arrive gets the scenario's time limit.
+    agent's index among the vehicles (0 is the ego). The agent keeps its initial target speed; one
+    that does not arrive gets the scenario's time limit.
     """
     worlds: dict[tuple[int, int], World] = {}
     for seed in seeds:
@@ -43,7 +43,10 @@ def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float
 
 
 def by_scenario(worlds: Sequence[W]) -> list[list[W]]:
-    """Return worlds grouped by scenario: those of one group can be simulated together."""
+    """Return worlds, simulated episodes, in one list for each scenario.
+
+    Those of one list can be simulated together; lists are in the order of their first world.
+    """
     groups: dict[Scenario, list[W]] = {}
     for world in worlds:
         groups.setdefault(world.scenario, []).append(world)
@@ -55,8 +58,9 @@ def on_seat(
 ) -> tuple[Scenario, Layout]:
     """Return the scenario with an agent as its ego, and the layout as that scenario names it.
 
-    `agent` is its index among the layout's vehicles. The returned layout, a start situation, holds
-    only this agent, first, and `others`, given by their indices.
+    An agent is a vehicle that decides; `agent` is its index among the layout's vehicles. The
+    returned layout, a start situation, holds only this agent, first, and `others`, given by their
+    indices.
     """
     spawns = [layout.spawns[n] for n in (agent, *others)]
     if not agent:
@@ -71,9 +75,10 @@ def on_seat(
 
 
 def ends(world: World, alone_s: Mapping[int, float]) -> tuple[End, ...]:
-    """Return how each agent of a finished world ended, in the order of `world.journeys`.
+    """Return how each agent of a finished episode ended, in the order of `world.journeys`.
 
-    `alone_s` has the time (s) at which each would arrive on an empty road, by its index.
+    An agent is a vehicle that decides. `alone_s` has the time (s) at which each would arrive on an
+    empty road, by its index among the vehicles, as `alone` returns it for the episode's seed.
     """
     ids = {agent: world.vehicles[agent].spawn.id for agent in world.journeys}
     agent_ends = []
@@ -88,8 +93,9 @@ def ends(world: World, alone_s: Mapping[int, float]) -> tuple[End, ...]:
 def gravest(journeys: Mapping[int, Journey]) -> int | None:
     """Return the index of the agent with the worst failure, or None if no agent has failed.
 
-    Collision is worse than leaving the road, which is worse than a time-out; of equals the earliest
-    counts, then the lowest index.
+    `journeys` has the record of each agent, a vehicle that decides, by its index among the
+    vehicles. Collision is worse than leaving the road, which is worse than a time-out; of equals
+    the earliest counts, then the lowest index.
     """
     failures: list[tuple[int, float, int]] = []
     for agent, journey in journeys.items():

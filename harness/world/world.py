@@ -33,7 +33,12 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class Journey:
-    """Hold what has happened to one agent, a vehicle that decides, of an episode so far."""
+    """Hold what has happened so far in an episode to one agent, a vehicle that decides.
+
+    `outcome` says how its drive ended, if it has. `hard_brakings` counts how often it began to
+    brake harder than `HARD_BRAKING_MPS2`, and `conflicts` has how near in time other vehicles came
+    to it.
+    """
 
     outcome: Outcome = field(default_factory=Outcome)  # its `ended` says whether it is decided
     hard_brakings: int = 0  # how often it began to brake harder than HARD_BRAKING_MPS2
@@ -41,15 +46,15 @@ class Journey:
     conflicts: Conflicts = field(default_factory=Conflicts)  # how near others came to it in time
 
     def anew(self) -> "Journey":
-        """Return this record with outcome and counts reset, to count from a decision on."""
+        """Return a copy with outcome and counts reset, to count from a decision on."""
         return replace(self, outcome=Outcome(), hard_brakings=0, conflicts=self.conflicts.anew())
 
     def passed(self, speeds_mps: Floats, gap_m: float, conflicts: Conflicts, hz: int) -> None:
         """Record F more frames of the agent's drive.
 
-        `speeds_mps` are its speeds, (F + 1,), from the frame before; `gap_m` is its least gap to
-        another vehicle so far, m, `conflicts` how near in time others came so far, and `hz` frames
-        a second.
+        `speeds_mps` are its speeds, m/s, (F + 1,), with that of the frame before first; `gap_m` is
+        its least gap to another vehicle so far, m, `conflicts` how near in time others came so far,
+        and `hz` frames a second.
         """
         self.outcome = replace(self.outcome, least_gap_m=gap_m)
         self.conflicts = conflicts.collided() if self.outcome.result == "collision" else conflicts
@@ -64,17 +69,19 @@ class World:
     """Simulate one episode: its vehicles, its agents' records and its clock.
 
     An agent is a vehicle that decides for itself, known by its index among the vehicles; the ego
-    has 0.
+    has 0. `road` is a `highway_env.road.road.Road` with the vehicles, and `layout` where they
+    started. `journeys` has what became of each agent, by its index. `step` counts decisions and
+    `frame` frames of the simulation.
     """
 
     scenario: Scenario  # the episode's scenario
     seed: int  # seed of the episode's layout
-    layout: Layout  # its start situation
+    layout: Layout  # the start situation, drawn by that seed
     # a `highway_env.road.road.Road` with the episode's vehicles, the ego first
     road: Any
     step: int = 0  # number of decisions taken so far
     frame: int = 0  # number of frames simulated so far
-    # what has become of each agent, by its place among the vehicles; the ego is the first
+    # what has become of each agent, by its index among the vehicles; the ego has 0
     journeys: dict[int, Journey] = field(default_factory=lambda: {0: Journey()})
     beacons: tuple[Beacon, ...] = ()  # the beacons that still matter (`WorldState.beacons`)
 
@@ -84,7 +91,10 @@ class World:
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "World":
-        """Start the episode of a layout seed in this class of world; `World.start` chooses it."""
+        """Start the episode of a layout seed in this class of world.
+
+        Call `World.start`, which takes the class that the scenario names.
+        """
         layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
         road = populated(scenario, layout, agents)
         world = cls(scenario, seed, layout, road, journeys={agent: Journey() for agent in agents})
@@ -94,7 +104,10 @@ class World:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Return the names of the meta-actions that agents choose from, the most careful first."""
+        """Return the names of the meta-actions that the ego chooses from, the most careful first.
+
+        They are highway-env's, such as `SLOWER`.
+        """
         return self.scenario.actions
 
     @property
@@ -104,22 +117,22 @@ class World:
 
     @property
     def time_s(self) -> float:
-        """Return the simulated time, s, counted in frames (highway-env's own clock drifts)."""
+        """Return the time since the start, s, by frames (highway-env's own clock drifts)."""
         return self.frame / self.scenario.parameters.simulation_hz
 
     @property
     def outcome(self) -> Outcome:
-        """Return the ego's outcome so far."""
+        """Return how the episode has ended for the ego, or that it still runs."""
         return self.journeys[0].outcome
 
     @property
     def journey(self) -> Journey:
-        """Return the record of the ego."""
+        """Return the record of what has happened to the ego."""
         return self.journeys[0]
 
     @property
     def ended(self) -> bool:
-        """Return whether the outcome of every agent is decided."""
+        """Return whether the outcome of every agent, every vehicle that decides, is decided."""
         return all(journey.outcome.ended for journey in self.journeys.values())
 
     def branch(self) -> "World":
@@ -127,7 +140,10 @@ class World:
         return replace(self, road=copied(self.road), journeys=journeys)
 
     def snapshot(self) -> Snapshot | ActionsTaken:
-        """Return what `thaw` needs besides `state()` to continue exactly as this world would."""
+        """Return what is needed beside `state()` to continue exactly as this world would.
+
+        `thaw` takes both; they are what a dataset keeps of a scene.
+        """
         vehicles = self.road.vehicles
         return Snapshot(
             self.frame, tuple(map(self._section, vehicles)), int(vehicles[0].speed_index)
@@ -146,12 +162,19 @@ class World:
     def thaw(
         cls, scenario: Scenario, state: WorldState, snapshot: Snapshot | ActionsTaken
     ) -> "World":
-        """Restore the world from which `state` and `snapshot` were taken, its episode undecided."""
+        """Restore the world that `state()` and `snapshot()` were taken from.
+
+        No outcome is decided in it, and what was counted until then starts at 0. The class is that
+        of the scenario's worlds.
+        """
         return (scenario.world or World).resumed(scenario, state, snapshot)
 
     @classmethod
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":
-        """Restore a world of this class from a state and its snapshot; `thaw` chooses the class."""
+        """Restore a world of this class from what `state()` and `snapshot()` returned.
+
+        Call `thaw`, which takes the class that the scenario names.
+        """
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot.sections, strict=True):
             spawn = spawn_of(scenario, layout, v)
@@ -181,7 +204,10 @@ class World:
         )
 
     def state(self, agent: int = 0) -> WorldState:
-        """Return the present state as the agent with this index sees it: with itself as the ego."""
+        """Return the present state as one agent, a vehicle that decides, sees it: as the ego.
+
+        `agent` is its index among the vehicles; 0 is the scenario's own ego.
+        """
         name, states = self.scenario.name, tuple(map(self._state_of, self.vehicles))
         target_mps, buildings = float(self.vehicles[agent].target_speed), self.layout.buildings
         state = WorldState(
@@ -195,6 +221,7 @@ class World:
     def act(self, action: str) -> None:
         """Take an action after the decision lag, and simulate to the time of the next decision.
 
+        The lag is the time from seeing to acting, during which the ego keeps to its last action.
         After the last decision it simulates until the episode is decided.
         """
         p = self.scenario.parameters
@@ -203,22 +230,35 @@ class World:
         self.advance(p.due_frame(self.step))
 
     def decide(self, action: str) -> None:
-        """Let the ego take an action unless its episode is decided, and count the decision."""
+        """Let the ego take an action unless its episode is decided, and count the decision.
+
+        Nothing moves until the world advances.
+        """
         if not self.outcome.ended:
             self.take(action)
         self.step += 1
 
     def take(self, action: str, agent: int = 0) -> None:
-        """Set an agent's target by a meta-action. Nothing moves until the world advances."""
+        """Set an agent's target speed or lane by a meta-action, such as `SLOWER`.
+
+        `agent` is its index among the vehicles. Nothing moves until the world advances.
+        """
         self.vehicles[agent].act(action)
 
     def target(self, agent: int = 0) -> Target:
-        """Return an agent's route and the index of its target speed among the scenario's."""
+        """Return an agent's route, such as `straight`, and its target speed.
+
+        The speed is an index from 0 in the scenario's target speeds, and `agent` one among the
+        vehicles.
+        """
         vehicle = self.vehicles[agent]
         return vehicle.spawn.route, int(vehicle.speed_index)
 
     def target_after(self, action: str, agent: int = 0) -> Target:
-        """Return the `target` that an agent would have after an action, without taking it."""
+        """Return the `target` that an agent would have after an action, without taking it.
+
+        It is the agent's route and the index of its target speed.
+        """
         vehicle = self.vehicles[agent]
         kept = dict(vars(vehicle))
         self.take(action, agent)
@@ -227,11 +267,14 @@ class World:
         return target
 
     def advance(self, until_frame: int) -> None:
-        """Simulate until a frame number, or until the episode is decided."""
+        """Simulate until a frame number, or until the outcome of every agent is decided.
+
+        Frames are counted from the start of the episode.
+        """
         lockstep.advance([self], [until_frame])
 
     def passed(self, poses: Floats) -> None:
-        """Add the beacons that vehicles sent in the last F frames.
+        """Add the beacons, vehicles' messages about themselves, sent in the last F frames.
 
         `poses` are x and y (m from the origin of the scenario's road), heading (rad) and speed
         (m/s) of each of V vehicles in each frame, (F, V, 4).
@@ -283,14 +326,20 @@ class World:
         return {"partner": partner.id, "striker": striker(itself, partner), "fault": at_fault}
 
     def seat(self, agent: int) -> Scenario:
-        """Return the scenario in which the agent with this index is the ego."""
+        """Return the scenario in which the agent with this index among the vehicles is the ego.
+
+        An agent is a vehicle that decides; 0 is the ego of the scenario itself.
+        """
         if not agent:
             return self.scenario
         return seat_of(self.scenario, self.vehicles[agent].spawn).scenario
 
     @property
     def answering(self) -> list[int]:
-        """Return the indices of the vehicles that can be asked: the ego, helpers and agents."""
+        """Return the indices of the vehicles that can be asked: the ego, helpers and agents.
+
+        An agent is a vehicle that decides for itself; all others are traffic.
+        """
         return [n for n, v in enumerate(self.vehicles) if v.spawn.part != "other"]
 
     def _cleared(self, agent: int) -> bool:
@@ -308,7 +357,8 @@ class World:
     def judge(self, standing: Set[str]) -> None:
         """Set the outcome of each agent by what happened in the last frame.
 
-        `standing` has the ids of vehicles that had crashed before it.
+        An agent is a vehicle that decides. `standing` has the ids of vehicles that had crashed
+        before that frame. The simulation calls it after a crash, an arrival or the time limit.
         """
         p = self.scenario.parameters
         places = {n: v for n, v in enumerate(self.vehicles) if n not in self.journeys}

@@ -67,8 +67,8 @@ LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
 class Frame(Image):
     """Hold a picture of a vehicle's cameras, with the ids of the vehicles and buildings in it.
 
-    `owners`, (height, width), has for each pixel the index in `ids` of what it shows; -1 for road,
-    grass and sky.
+    `pixels` are (height, width, 3), red, green and blue. `owners`, (height, width), has for each
+    pixel the index in `ids` of what it shows; -1 for road, grass and sky.
     """
 
     def __init__(self, pixels: Pixels, owners: Places, ids: tuple[str, ...]) -> None:
@@ -76,10 +76,10 @@ class Frame(Image):
         self.owners, self.ids = owners, ids
 
     def boxes(self) -> dict[str, list[tuple[int, int, int, int]]]:
-        """Return bounding boxes of each visible object, by id: left, top, right, bottom in pixels.
+        """Return the bounding boxes of each visible vehicle and building, by its id.
 
-        Right and bottom are exclusive. An object has one box for each half of the picture that
-        shows it.
+        A box is left, top, right and bottom in pixels of the whole picture, right and bottom
+        exclusive. There is one for each half of the picture, front or rear, that shows the object.
         """
         half, boxes = len(self.owners) // 2, dict[str, list[tuple[int, int, int, int]]]()
         for place, name in enumerate(self.ids):
@@ -98,7 +98,8 @@ def frame(
 ) -> Frame:
     """Render the front and rear cameras of one vehicle as one picture, the front above the rear.
 
-    `size_px` is width and height; the height is even.
+    `viewer_id` is the id of that vehicle in `state`, and `size_px` the picture's width and height,
+    the height even. Vehicles that its sensors do not report are not drawn.
     """
     width, height = size_px
     viewer = state.vehicle(viewer_id)
@@ -122,7 +123,8 @@ def frame(
 class Sight(Image):
     """Hold a picture of a vehicle's cameras that is rendered when its pixels are read.
 
-    It holds the state instead of pixels, but is pickled as its pixels.
+    It holds what `frame` is called with, the state among it, and no pixels; it is pickled as a
+    plain picture with pixels.
     """
 
     scenario: Scenario  # the scenario of the state, whose road is drawn
@@ -132,7 +134,7 @@ class Sight(Image):
 
     @property
     def frame(self) -> Frame:
-        """Return the rendered picture, with the owner of each pixel."""
+        """Return the rendered picture, with the id of what each pixel shows."""
         return _drawn(self.scenario, self.state, self.viewer_id, self.size_px)
 
     @property
@@ -148,7 +150,11 @@ _drawn = lru_cache(maxsize=KEPT)(frame)
 
 @dataclass(frozen=True)
 class Box:
-    """Describe a vehicle or building as a box with painted walls."""
+    """Describe a vehicle or building, to be drawn, as a box with painted walls.
+
+    It has four walls, with a grid of `ROWS` x `COLUMNS` patches of paint on each; some are lamps.
+    `corners` are where walls meet, (4, 2) m to the east and south of the road's origin.
+    """
 
     name: str  # id of the vehicle or building
     corners: Floats  # its corners on the ground, (4, 2) m

@@ -23,15 +23,22 @@ ALIGNED = float(np.cos(ALIGNED_RAD))
 
 
 class Seat(Struct, frozen=True):
-    """Hold the pose of a viewer, from which positions are converted into its frame."""
+    """Hold the pose of a viewer, from which positions are converted into its frame.
 
-    x_m: float
-    y_m: float
-    cos: float
-    sin: float
+    Its centre is in m to the east and south of the road's origin; `cos` and `sin` are of its
+    heading, from +x (east) towards +y (south).
+    """
+
+    x_m: float  # position of its centre, m to the east of the road's origin
+    y_m: float  # position of its centre, m to the south
+    cos: float  # cosine of its heading
+    sin: float  # sine of its heading
 
     def relative(self, x_m: float, y_m: float) -> Point:
-        """Return a position (m, in the road's frame) in the viewer's frame, rounded to 0.1 m."""
+        """Return a position of the road's frame, m, in the viewer's frame, rounded to 0.1 m.
+
+        The viewer's frame has metres forward and to the left of its centre.
+        """
         dx, dy = x_m - self.x_m, y_m - self.y_m
         return Point(tenths(dx * self.cos + dy * self.sin), tenths(dx * self.sin - dy * self.cos))
 
@@ -39,8 +46,9 @@ class Seat(Struct, frozen=True):
 class Place(Struct, frozen=True):
     """Describe where on the road's paths a vehicle is.
 
-    `near` has, for each path near the vehicle, the arc length (m) and the path's heading there
-    (rad); `key` is the path that it seems to follow, None if none.
+    A path's key is (approach, route): where it comes from and what it does. `near` has, for each
+    path near the vehicle, the distance along it (m) and its heading there (rad). `key` is that of
+    the path which the vehicle seems to follow, None if none.
     """
 
     # arc length, and heading there, on each path to which it is nearer than ON_PATH_M
@@ -49,7 +57,7 @@ class Place(Struct, frozen=True):
 
     @property
     def arc_m(self) -> float:
-        """Arc length (m) on the path that the vehicle follows; only if it follows one."""
+        """Return how far along the path that it follows the vehicle is, m. It must follow one."""
         assert self.key is not None
         return self.near[self.key][0]
 
@@ -58,43 +66,49 @@ class Encounter(Struct, frozen=True):
     """Pair another vehicle with the ego, both as one viewer knows them.
 
     `seat` is the viewer's pose, `d` the other vehicle as detected and `place` where it is on the
-    road; `ego_arc_m` is the ego's arc length (m) on its path.
+    road: it follows a path. `ego` is the ego, `ego_arc_m` how far along its path it is, m, and
+    `has_lamps` whether the scenario's vehicles have brake lamps.
     """
 
-    seat: Seat  # the viewer's
-    d: Detection  # the vehicle
-    place: Place  # where it is; it follows a path
-    ego: VehicleState  # the ego
-    ego_arc_m: float  # arc length on the ego's path
-    has_lamps: bool  # whether vehicles have brake lamps
+    seat: Seat  # the viewer's pose
+    d: Detection  # the other vehicle
+    place: Place  # where the other vehicle is on the road; it follows a path
+    ego: VehicleState  # the ego, as the viewer knows it
+    ego_arc_m: float  # how far along its path the ego is, m
+    has_lamps: bool  # whether the scenario's vehicles have brake lamps
 
     def arrival(self, arc_m: float, time_s: float | None) -> Arrival:
-        """Return the vehicle's distance and time to a conflict point, its speed and brake lamps."""
+        """Return when the other vehicle comes to a conflict point, as a scene graph states it.
+
+        `arc_m` is how far it has to go, m, and `time_s` how long at its speed, s, None at a
+        standstill. Its speed and its brake lamps are added.
+        """
         braking = self.d.braking if self.has_lamps else UNSET
         return Arrival(tenths(arc_m), time_s, tenths(self.d.speed_mps), braking)
 
     @property
     def key(self) -> PathKey:
-        """Key (approach, route) of the path that the vehicle follows."""
+        """Return the key (approach, route) of the path that the other vehicle follows."""
         assert self.place.key is not None
         return self.place.key
 
     @property
     def ego_key(self) -> PathKey:
-        """Key (approach, route) of the ego's path."""
+        """Return the key (approach, route) of the ego's path."""
         return self.ego.approach, self.ego.route
 
 
 def tenths(value: float) -> float:
-    """Round to one decimal, with 0.0 in place of -0.0."""
+    """Round a number to one decimal, with 0.0 in place of -0.0."""
     return round(float(value), 1) + 0.0
 
 
 def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     """Return where each detected vehicle is on the road, and which path it seems to follow.
 
-    That is the nearest path that fits its heading and turn indicator; of equally good ones, the
-    first of the road.
+    That is, for each of `detections`, the paths near it, with the distance along each, and the
+    nearest path that fits its heading and turn indicator; of equally good ones, the first of the
+    road.
     """
     poses = []
     for d in detections:
@@ -128,7 +142,11 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
 
 
 def conflicts(road: Road, encounters: Sequence[Encounter]) -> list[list[Conflict]]:
-    """Return, for each encounter, the conflicts of its vehicle with the ego's paths."""
+    """Return, for each encounter, the conflicts of its vehicle with the ego's paths.
+
+    A conflict is where both meet: their paths cross or merge, or both are in one lane, which the
+    ego is on or may change to.
+    """
     conflicts_of: list[list[Conflict]] = [[] for _ in encounters]
     if road.form == 2:
         for n, conflict in _along(road, encounters):

@@ -35,7 +35,8 @@ def scene_graph(
 ) -> SceneGraph:
     """Return what one vehicle knows of a state by its sensors and by the beacons that it heard.
 
-    Vehicles whose ids are in `left_out` are treated as undetected.
+    `viewer_id` is its id. Vehicles whose ids are in `left_out` are treated as undetected: they are
+    not listed, and nothing is said to be hidden by them.
     """
     [graph] = scene_graphs(scenario, [(state, viewer_id)], left_out)
     return graph
@@ -44,7 +45,12 @@ def scene_graph(
 def scene_graphs(
     scenario: Scenario, looks: Sequence[tuple[WorldState, str]], left_out: Collection[str] = ()
 ) -> list[SceneGraph]:
-    """Return the `scene_graph` of each look: a state, and the id of the vehicle that looks."""
+    """Return the scene graph of each look: a state, and the id of the vehicle that looks in it.
+
+    A scene graph is what that vehicle knows by its sensors and by the beacons that it heard.
+    Vehicles whose ids are in `left_out` are treated as undetected. For several looks it is faster
+    than one call of `scene_graph` each.
+    """
     graphs: list[SceneGraph] = []
     for begin in range(0, len(looks), AT_ONCE):
         some = looks[begin : begin + AT_ONCE]
@@ -54,16 +60,20 @@ def scene_graphs(
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
-    """Return the ego's scene graph with every vehicle in view and no noise.
+    """Return the ego's scene graph with every vehicle in view, no noise, and no sectors.
 
-    Only the reference driver `full-view` may read it.
+    A scene graph is what one vehicle knows of a scene. Only the reference driver `full-view`, which
+    sees everything, may read this one.
     """
     [graph] = truth_graphs(scenario, [state])
     return graph
 
 
 def truth_graphs(scenario: Scenario, states: Sequence[WorldState]) -> list[SceneGraph]:
-    """Return each state's `truth_graph`: the ego's graph with everything in view and no noise."""
+    """Return, for each state, the ego's scene graph with every vehicle in view and no noise.
+
+    A scene graph is what one vehicle knows of a scene; only driver `full-view` may read these.
+    """
     looks: list[Look] = []
     exact: list[list[Detection]] = []
     no_sectors: list[list[Sector]] = []
@@ -137,8 +147,9 @@ def listed_graphs(
 ) -> list[SceneGraph]:
     """Return the scene graph of each viewer, given what it detected and how it sees each sector.
 
-    The four sequences are parallel: viewer, its detections, and the sectors that its graph lists.
-    Conflicts with the ego's path are computed here.
+    A look is a state and the vehicle that looks in it. `detected` and `sectors` have, for each look
+    in the same order, the vehicles that it knows of, and how much of each direction of danger it
+    sees. Conflicts with the ego's path are computed here.
     """
     if not looks:
         return []

@@ -20,7 +20,11 @@ Look = tuple[WorldState, VehicleState]  # a state, and the vehicle that looks ar
 
 @dataclass(frozen=True)
 class Sweep:
-    """Hold the bearings and distances of one full turn of `RAYS` rays, and what each ray hits."""
+    """Hold the rays that a vehicle casts in one full turn, `RAYS` of them, and what each ray hits.
+
+    `bearing_rad` and `range_m`, (RAYS,), are a ray's direction and the distance to what it meets
+    first; `hits` has, by id, the indices of the rays that end on a vehicle or building.
+    """
 
     # direction of each ray in the road's frame, radians from +x (east) towards +y (south), (RAYS,)
     bearing_rad: Floats
@@ -34,7 +38,9 @@ class Surfaces:
     """Hold the outlines that stop the rays of v viewers, n in all, viewer by viewer.
 
     A viewer is a vehicle that looks. Its surfaces are all other vehicles of its state, in their
-    order, then the buildings. Positions are in m to the east and south of the road's origin.
+    order, then the buildings: `ids` names them, and `viewer` and `place`, (n,), say which viewer's
+    each surface is, and which of them. Positions are in m to the east and south of the road's
+    origin.
     """
 
     origins_m: Floats  # the viewers' centres, (v, 2)
@@ -45,9 +51,10 @@ class Surfaces:
     corners_m: Floats  # the four corners of each, (n, 4, 2)
 
     def by_viewer(self, values: Any) -> Any:
-        """Return values (n,) of the surfaces as a table (v, most surfaces of a viewer).
+        """Return `values`, one of each surface, (n,), as a table with a row for each viewer.
 
-        Cells without a surface are 0 or false.
+        It is (v, k), where k is the number of surfaces of the viewer that has the most; cells
+        without a surface are 0 or false.
         """
         table = np.zeros((len(self.ids), max(map(len, self.ids), default=0)), dtype=values.dtype)
         table[self.viewer, self.place] = values
@@ -55,14 +62,14 @@ class Surfaces:
 
 
 def turned(angle_rad: Any) -> Any:
-    """Wrap an angle, or angles, to -pi to pi."""
+    """Wrap an angle, or an array of angles, to -pi to pi rad."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
 def surfaces(looks: Sequence[Look]) -> Surfaces:
     """Return the outlines of all vehicles and buildings around each viewer, itself excluded.
 
-    Each of `looks` is a state and the vehicle in it that looks.
+    Each of `looks` is a state and the vehicle in it that looks, the viewer.
     """
     states = {id(state): state for state, _ in looks}
     vehicles = [
@@ -97,12 +104,12 @@ def surfaces(looks: Sequence[Look]) -> Surfaces:
 
 
 def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, Floats]:
-    """Intersect rays from a point with the walls of n rectangles.
+    """Intersect r rays from a point with the walls of n rectangles.
 
     The rays go from `origin` (2,) to `targets` (r, 2), and the rectangles are `corners` (n, 4, 2),
-    all in m; wall k goes from corner k to the next. Returned are the ray parameter, (r, 4n), which
-    is 1 at the target and inf if the wall is missed, and the position along the wall from 0 to 1,
-    (r, 4n).
+    all in m; wall k goes from corner k to the next. Both results are (r, 4n), a column a wall: how
+    far along the ray the wall is, 1 at the target and inf if it is missed, and where on the wall,
+    from 0 to 1.
     """
     walls = _walls(np.broadcast_to(origin, (len(corners), 2)), corners).swapaxes(1, 2)
     return _met(walls.reshape(5, -1), targets[:, :1], targets[:, 1:])
@@ -149,7 +156,11 @@ def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Hold m possible meetings of a ray with a surface, by ascending number of the surface."""
+    """Hold m possible meetings of a ray with a surface, by ascending number of the surface.
+
+    All arrays are (m,): the number of the surface in `Surfaces`, that of the ray, with `RAYS` of
+    them for each viewer, and the distance `t` at which they meet, m; inf if the ray passes by.
+    """
 
     surface: Ints  # number of the surface among all of `Surfaces`, (m,)
     target: Ints  # number of the ray, with `RAYS` of them for each viewer, (m,)
@@ -160,7 +171,10 @@ class Rays:
 
 
 def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
-    """Cast `RAYS` rays in all directions from a vehicle's centre, and return what they hit."""
+    """Cast `RAYS` rays in all directions from a vehicle's centre, and return what they hit.
+
+    The rays do not hit `viewer`, the vehicle itself.
+    """
     around = surfaces([(state, viewer)])
     rays = cast(around, np.ones(len(around.place), dtype=bool))
     distance, met = _first(rays.surface, rays.target, rays.t, RAYS)
@@ -173,7 +187,8 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
 def cast(around: Surfaces, of: Bools) -> Rays:
     """Cast, from all viewers, the rays that may meet some surfaces, and return where they do.
 
-    `of` is a mask, (n,), of the surfaces that count.
+    `of`, (n,), says which of the n surfaces of `around` count. The rays that may meet one of these
+    are followed to all surfaces.
     """
     begin, count = _towards(around)
     surface = np.repeat(np.arange(len(count)), count)
@@ -191,10 +206,10 @@ def cast(around: Surfaces, of: Bools) -> Rays:
 
 
 def rays_on(around: Surfaces, rays: Rays, solid: Bools) -> tuple[Ints, Ints]:
-    """Return how many of its viewer's rays reach each surface, (n,), if only `solid` ones block.
+    """Return how many rays reach each surface, (n,), and where each ray of `rays` ends, (m,).
 
-    `solid` (n,) says which surfaces stop rays. Returned second is, for each meeting of `rays`, the
-    number of the surface that stops its ray, (m,); -1 if none does.
+    Only the surfaces where `solid`, (n,), is true stop rays; all others let them pass. The second
+    result is, for each of the m meetings, the number of the surface that stops its ray; -1 if none.
     """
     stops = solid[rays.surface]
     ended = rays.of(stops)
@@ -232,7 +247,8 @@ def _all_round() -> tuple[Floats, Floats]:
 def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
     """Return the number of the surface that hides each point from each viewer, (v, k); -1 if none.
 
-    `points` are (k, 2) m, the same for all viewers. Only surfaces where `solid` (n,) is true hide.
+    `points` are (k, 2) m, the same for all v viewers of `around`. Only surfaces where `solid`,
+    (n,), is true hide.
     """
     surface = np.flatnonzero(solid)
     viewer = around.viewer[surface]
@@ -249,7 +265,7 @@ def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
 def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
     """Return the id of the vehicle or building that hides each point from a viewer; None if seen.
 
-    `points` are (k, 2) m.
+    `points` are (k, 2), m to the east and south of the road's origin.
     """
     around = surfaces([(state, viewer)])
     met = hidden(around, points, np.ones(len(around.place), dtype=bool))

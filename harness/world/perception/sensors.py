@@ -39,9 +39,10 @@ SENSORS = {
 class Detection(Struct, frozen=True):
     """Describe one object as all sensors of one vehicle together report it, in the road's frame.
 
-    `sensors` are those of camera, lidar and radar that reported it. What a sensor alone tells is
-    None without it: `kind`, `indicator` and `braking` are the camera's, `range_rate_mps` (negative
-    when closing) the radar's; `heading_rad` is None if only the radar saw it.
+    The position of its centre is in m to the east and south of the road's origin. `sensors` are
+    those of camera, lidar and radar that reported it. What a sensor alone tells is None without it:
+    `kind`, `indicator` and `braking` are the camera's, `range_rate_mps` (negative when closing) the
+    radar's; `heading_rad` is None if only the radar saw it.
     """
 
     id: str  # the object's id (association across vehicles is assumed to be perfect)
@@ -49,17 +50,18 @@ class Detection(Struct, frozen=True):
     kind: Kind | None  # class from the camera; None without one
     # turn indicator from the camera: `left`, `right` or `off`; None without one
     indicator: str | None
-    x_m: float  # estimated position of the centre
-    y_m: float  # estimated position of the centre
-    heading_rad: float | None  # estimated heading; None if only the radar saw it
-    speed_mps: float  # estimated speed
-    # range rate from the radar, negative when closing; None without one
+    x_m: float  # estimated position of the centre, m to the east of the road's origin
+    y_m: float  # estimated position of the centre, m to the south
+    # estimated heading, rad from +x (east) towards +y (south); None if only the radar saw it
+    heading_rad: float | None
+    speed_mps: float  # estimated speed, m/s
+    # range rate from the radar, m/s, negative when closing; None without one
     range_rate_mps: float | None
     braking: bool | None = None  # whether it is seen to brake, from the camera; None without one
 
 
 def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> list[Detection]:
-    """Return the detections of one vehicle's sensors, in the order of the state's vehicles."""
+    """Return what a vehicle's sensors report, in the order of the state's vehicles."""
     looks = [(state, viewer)]
     return list(reports(looks, surfaces(looks), parameters).values())
 
@@ -67,12 +69,12 @@ def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> l
 def reports(
     looks: Sequence[Look], around: Surfaces, parameters: Parameters
 ) -> dict[tuple[int, int], Detection]:
-    """Return what the sensors of several viewers report, keyed by viewer number and vehicle index.
+    """Return what the sensors of several viewers report, by (viewer, vehicle).
 
-    `looks` are the viewers, each a vehicle in a state, and `around` is `surfaces(looks)`; the
-    second part of a key is the vehicle's index among its viewer's surfaces. A vehicle that is hit
-    by too few rays or out of range is not reported. Under `parameters.perception` 1 it still hides
-    what is behind it, under 2 it hides nothing.
+    Both parts of a key are indices from 0: the viewer's in `looks`, each a state and the vehicle
+    that looks in it, and the vehicle's among the viewer's surfaces in `around`, which is
+    `surfaces(looks)`. A vehicle that is hit by too few rays or out of range is not reported. Under
+    `parameters.perception` 1 it still hides what is behind it, under 2 it hides nothing.
     """
     nearby: list[list[VehicleState]] = []
     for state, viewer in looks:
@@ -120,9 +122,9 @@ def reports(
 
 
 def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
-    """Return which of n surfaces are in `pairs`, (n,).
+    """Return a mask of those of the n surfaces of `around` that are in `pairs`, (n,).
 
-    A pair is a viewer's number and a surface's index among that viewer's surfaces.
+    A pair is the index of a viewer and that of a surface among the viewer's own, from 0.
     """
     most = max([len(ids) for ids in around.ids], default=0)
     table = np.zeros((len(around.ids), most), dtype=bool)
@@ -140,9 +142,10 @@ def _motion(vehicles: Sequence[VehicleState]) -> Floats:
 def detections(
     pairs: Sequence[tuple[WorldState, VehicleState, VehicleState]], ambient: Ambient
 ) -> list[Detection | None]:
-    """Return what the viewer's sensors report of a vehicle, for each pair; None if nothing.
+    """Return what a viewer's sensors report of a vehicle, for each pair; None if nothing.
 
-    Each of `pairs` is a state, a viewer, and a vehicle that the viewer has a line of sight to.
+    Each of `pairs` is a state, a viewer, and a vehicle that the viewer has a line of sight to,
+    which is not checked. `ambient` is the light and weather, which limit the camera.
     """
     if not pairs:
         return []

@@ -42,7 +42,9 @@ ROUNDED_M = 0.1 / 12**0.5  # standard deviation of the rounding of a graph's pla
 class Heard(NamedTuple):
     """Hold what the ego sees by itself, and the scene graphs that it got from helpers.
 
-    A scene graph is what one vehicle knows of a state.
+    A scene graph is what one vehicle knows of a state. `state` is the ego's, and `source` that of
+    the helpers: None if it is the same, as it is unless messages of another scene are put in their
+    place.
     """
 
     state: WorldState  # the state in which the ego is
@@ -55,7 +57,8 @@ class Heard(NamedTuple):
 class Report:
     """Describe one object as one sender reports it, with the covariance of its errors.
 
-    The sender is the ego itself or a helper.
+    The sender is the ego itself or a helper. `place_m2` is (2, 2), of the position to the east and
+    to the south; `node` is the object in the ego's own scene graph, None for one out of a message.
     """
 
     detection: Detection  # the object, in the frame of the road
@@ -65,15 +68,16 @@ class Report:
 
     @property
     def spread_m2(self) -> float:
-        """Return the sum of the position's variances along both axes, m²."""
+        """Return the sum of the position's variances along both axes, m²: less is more precise."""
         return float(np.trace(self.place_m2))
 
 
 def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
     """Return the ego's scene graph of each case, with the objects that helpers' messages report.
 
-    An object that several report is matched by position and speed (chi-squared test), and the most
-    precise report of it is kept.
+    A scene graph is what one vehicle knows of a scene. Reports of several senders are taken for one
+    object if positions and speeds agree (chi-squared test), and the most precise of them is kept.
+    Of each direction of danger as much counts as seen as whoever sees most of it does.
     """
     own_ids: list[list[str]] = []  # whose report in the ego's own graph stands
     added: list[list[Detection]] = []  # what messages report
@@ -115,7 +119,7 @@ def _reports(p: Parameters, case: Heard) -> list[Report]:
 def state_in_message(p: Parameters, state: WorldState, sender: str) -> VehicleState:
     """Return a helper's state as its message gives it, with the errors of a beacon.
 
-    The true state under perfect knowledge.
+    `sender` is the helper's id. Under perfect knowledge it is the true state.
     """
     vehicle = state.vehicle(sender)
     if p.perfect_knowledge:
@@ -132,10 +136,11 @@ def state_in_message(p: Parameters, state: WorldState, sender: str) -> VehicleSt
 
 
 def invented(scenario: Scenario, state: WorldState, viewer: str) -> Node:
-    """Return a car that does not exist, on collision course with the ego, in a helper's frame.
+    """Return a car that does not exist, on collision course with the ego: an attacker's lie.
 
     It is on the first path that crosses the ego's, as far from there as the ego and as fast;
-    without such a path it stands `STANDS_M` ahead of the ego. `viewer` is the helper's id.
+    without such a path it stands `STANDS_M` ahead of the ego. `viewer` is the id of the helper that
+    makes it up, in whose frame (m forward and to the left) it is given.
     """
     road, sender, ego = scenario.road(), state.vehicle(viewer), state.ego
     path = road.paths[ego.approach, ego.route]

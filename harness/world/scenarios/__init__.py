@@ -28,7 +28,10 @@ class PackagesScenarios(Plugins[Scenario]):
     """Hold the scenarios of installed packages by name; each is checked when it is loaded."""
 
     def check(self, name: str, plugin: Scenario) -> None:
-        """Raise ValueError if a package's scenario is inconsistent, such as in name or actions."""
+        """Raise ValueError if a package's scenario is inconsistent, such as in its actions.
+
+        `name` is that of the entry point, which must be the scenario's own, too.
+        """
         if plugin.name != name:
             raise ValueError(f"its name is {printable(repr(plugin.name))}")
         if not isinstance(plugin.parameters, Parameters):
@@ -58,22 +61,24 @@ DEFAULT = "occluded-intersection"  # taken if none is named
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all scenarios in alphabetical order."""
+    """Return the names of all scenarios, built in or of a package, in alphabetical order."""
     return tuple(sorted({*_files(), *PLUG_INS}))
 
 
 def witnessed() -> tuple[str, ...]:
     """Return the built-in scenarios whose layouts can have a declared number of witnesses, sorted.
 
-    A witness is a helper that has the danger in sight at the first decision.
+    A layout is the start situation of an episode, and a witness a helper that has the danger in
+    sight at the first decision.
     """
     return tuple(name for name in sorted(_files()) if "witnesses" in get(name).dials)
 
 
 def get(text: str) -> Scenario:
-    """Return a scenario by name, with other settings if given: `occluded-intersection:ambient=fog`.
+    """Return a scenario by name, with other settings if given: `blind-merge:ambient=fog`.
 
-    Raises UserError if there is no such scenario or setting, or a value is not allowed.
+    Several settings have commas between them. Raises UserError if there is no such scenario or
+    setting, or a value is not allowed.
     """
     name, settings = split(text)
     scenario = _named(name)
@@ -84,7 +89,10 @@ def get(text: str) -> Scenario:
 
 
 def split(text: str) -> tuple[str, str | None]:
-    """Split a scenario argument such as `NAME:key=value` into name and settings, or None."""
+    """Split a scenario as a user types it, `NAME:key=value`, into its name and its settings.
+
+    The settings are one text, such as `key=value,other=3`; None without any.
+    """
     if family := family_of(text):
         return family.split(text)
     name, colon, settings = text.partition(":")
@@ -103,8 +111,8 @@ def argument(scenario: Scenario) -> str:
 def title(scenario: Scenario) -> str:
     """Return a scenario's name for people, with its settings that differ from the defaults.
 
-    If its settings are those of a suite (`SUITES`), it ends with `, scenes of` and the suite's
-    name.
+    If its settings are those of a suite (a set of datasets, in `SUITES`), it ends with
+    `, scenes of` and the suite's name instead of these.
     """
     scenes = _of_suites(scenario)
     suites = [suite for suite, of in SUITES.items() if of == scenes]
@@ -175,8 +183,9 @@ def is_here(name: str) -> bool:
 def of_manifest(name: str, parameters: Mapping[str, Any]) -> Scenario:
     """Return the scenario `name` with the parameters that a dataset's or run's manifest states.
 
-    Parameters that were added later and are not stated take the value of the earlier behaviour.
-    Raises UserError if one is unknown here, of another type or out of bounds.
+    `parameters` has values by the name of the parameter. One that was added to the harness later
+    and is not stated takes the value under which all is as before it was added (`LATER`). Raises
+    UserError if one is unknown here, of another type or out of bounds.
     """
     scenario = get(name)
     names = [field.name for field in fields(scenario.parameters)]

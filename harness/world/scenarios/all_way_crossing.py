@@ -38,8 +38,10 @@ AHEAD = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])
 class Parameters(Shared):
     """Hold the settings of `all-way-crossing`: cars meet at a crossing without signs.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
+    `_offset_s` is when a car is in the middle, in s after a cruising ego, one that keeps its speed.
+    A danger is the vehicle that would meet that ego.
     """
 
     # speeds that an agent's actions step through, m/s: up to 36 km/h
@@ -68,7 +70,12 @@ class Parameters(Shared):
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: cars from two to four arms, all in time to meet.
+
+    A layout is the start situation of an episode. Buildings stand on the corners; a danger, with
+    probability `danger_share`, is one more car that yields to nobody. The layout is the same for
+    equal seeds and `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -126,19 +133,22 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(arm: int, xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is past the crossing, for each world, (...).
+    """Return whether the ego is past the crossing by `parameters.cleared_m`.
 
-    `arm` is the number of the ego's arm (south, west, north, east), and `xy_m` are the centres of
-    all vehicles, (..., V, 2), the ego first.
+    `arm` is the number of the arm that the ego comes from: 0 to 3 for south, west, north, east.
+    `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
+    moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
+    from, is not read. The result is (...).
     """
     return np.asarray(xy_m[..., 0, :] @ AHEAD[arm] >= JUNCTION_M + parameters.cleared_m)
 
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the `Seat` (the scenario with that agent as its ego) of an agent from each arm.
+    """Return the scenario as an agent from each arm plays it: with that agent as its ego.
 
-    Keys are paths: approach and route as the shared scenario names them.
+    An agent is a vehicle that decides. Keys are the paths on which agents start: approach and route
+    as the ego's own road names them.
     """
     return {(seen_from(0, arm), "straight"): _seat(arm) for arm in range(len(AHEAD))}
 

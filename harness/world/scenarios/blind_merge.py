@@ -43,8 +43,10 @@ SEATS_MPS = (3.0, 4.5)
 class Parameters(Witnessed):
     """Hold the settings of `blind-merge`: the ego merges from a ramp into a lane hidden by a wall.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
+    `_offset_s` is when a vehicle is at the merge, in s after a cruising ego, one that keeps its
+    speed. A danger is the vehicle that would meet that ego.
     """
 
     ego_speed_mps: float = 14.0  # speed of the ego at the start, m/s: 50 km/h
@@ -104,7 +106,7 @@ def network() -> Any:
 
 @cache
 def road() -> Road:
-    """Return the main road and its ramp as a `Road`.
+    """Return the main road and its ramp as a `Road`, for an ego that comes along the ramp.
 
     The conflict zone is where the ramp has merged into the right lane.
     """
@@ -136,7 +138,12 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: the ego on a ramp, traffic, and a wall between them.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car that is at the merge when the ego is; three helpers see it. The layout is the same for equal
+    seeds and `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -183,9 +190,11 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough along the right lane, for each world, (...).
+    """Return whether the ego is beyond the merge by `parameters.cleared_m`.
 
-    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
+    moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
+    from, is not read. The result is (...).
     """
     return np.asarray(xy_m[..., 0, 0] > parameters.cleared_m)
 

@@ -42,8 +42,10 @@ SEATS_M = (8.0, 9.5), (7.5, 8.5), (7.5, 8.5)  # from the ego to the first, and f
 class Parameters(Witnessed):
     """Hold the settings of `do-not-pass`: the ego follows a truck that hides the oncoming lane.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
+    `danger_s` and `late_s` are when an oncoming car is where the ego started, in s from the start.
+    A danger is the vehicle that would meet an ego which passes at once.
     """
 
     # speeds that the ego's actions step through, m/s: up to 54 km/h
@@ -83,7 +85,10 @@ class Parameters(Witnessed):
 
 @cache
 def road() -> Road:
-    """Return the two-way road as a `Road`: the ego's lane to the east, and one to the west."""
+    """Return the two-way road as a `Road`: the ego's lane to the east, and one to the west.
+
+    The conflict zone is where the ego, which passes at once, would be beside the truck.
+    """
     ways = {
         ("own", BESIDE): ([("a", "b", 0)], [BESIDE], 0),
         ("own", OWN): ([("a", "b", 1)], [OWN], 1),
@@ -121,7 +126,12 @@ def network() -> Any:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: the ego behind a truck, and who comes towards it.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car in time to meet an ego that passes at once; three helpers, the truck among them, know more.
+    The layout is the same for equal seeds and `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -168,11 +178,13 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego has passed the truck, or safely stayed behind, for each world, (...).
+    """Return whether the ego has passed the truck, or safely stayed behind.
 
     It has if it is on its own lane and either far enough ahead of the truck, or at most `behind_m`
-    behind it after an oncoming vehicle went by. `xy_m` are vehicle centres, (..., V, 2), the ego
-    first and then the truck; `approaches`, (..., V), are where their paths come from.
+    behind it after an oncoming vehicle went by. `xy_m`, (..., V, 2), are the centres of the V
+    vehicles of each of any number of episodes at one moment, m in highway-env's frame, the ego
+    first and then the truck; `approaches`, (..., V), are where their paths come from. The result is
+    (...).
     """
     x, lengths = xy_m[..., 0], (CAR + TRUCK) / 2
     in_lane = np.abs(xy_m[..., 0, 1] - LANE_WIDTH_M) <= LANE_WIDTH_M / 4

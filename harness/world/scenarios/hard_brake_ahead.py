@@ -42,8 +42,10 @@ SEATS_MPS = (3.0, 4.5)
 class Parameters(Witnessed):
     """Hold the settings of `hard-brake-ahead`: a car brakes beyond the van that the ego follows.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_mps2`, `_s`), and a `_share` is a probability. A pair
+    of numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
+    A headway is in s between bumpers, and an `_at_s` in s from the start. A danger is the vehicle
+    that would meet an ego which keeps its speed: here the car that brakes.
     """
 
     # speeds that the ego's actions step through, m/s: 72 km/h, half of it, and standing
@@ -83,7 +85,10 @@ class Parameters(Witnessed):
 
 @cache
 def road() -> Road:
-    """Return the motorway of two lanes to the east as a `Road`, with the ego on the right one."""
+    """Return the motorway of two lanes to the east as a `Road`, with the ego on the right one.
+
+    The conflict zone is where a car that brakes hard comes to stand.
+    """
     lanes = {RIGHT: ("0", "1", 1), LEFT: ("0", "1", 0)}
     paths = paths_along(
         network(), {("own", name): ([lane], [name], 0) for name, lane in lanes.items()}
@@ -116,7 +121,12 @@ def network() -> Any:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: the ego behind a van, and who else is on the motorway.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is the
+    car beyond the van, which brakes; three helpers, the van among them, know more. The layout is
+    the same for equal seeds and `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -154,9 +164,11 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough past the conflict zone, for each world, (...).
+    """Return whether the ego is behind the conflict zone by `parameters.cleared_m`.
 
-    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
+    moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
+    from, is not read. The result is (...).
     """
     return np.asarray(xy_m[..., 0, 0] > ZONE_M + parameters.cleared_m)
 

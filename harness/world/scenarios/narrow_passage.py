@@ -50,8 +50,10 @@ FROM_EAST = {
 class Parameters(Shared):
     """Hold the settings of `narrow-passage`: cars from both sides meet where only one fits.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
+    `_offset_s` is when a danger is where the ego crosses the side road, in s after a cruising ego,
+    one that keeps its speed. A danger is the vehicle that would meet it.
     """
 
     # speeds that an agent's actions step through, m/s: up to 29 km/h
@@ -82,7 +84,8 @@ class Parameters(Shared):
 def network() -> Any:
     """Build the street's road network, a `highway_env.road.road.RoadNetwork`.
 
-    It has three lanes in a row for each direction, and the side road.
+    It has three lanes in a row for each direction, the middle one in the passage, and the side
+    road.
     """
     from highway_env.road.lane import LineType, StraightLane
     from highway_env.road.road import RoadNetwork
@@ -102,7 +105,7 @@ def network() -> Any:
 
 @cache
 def road(from_east: bool = False) -> Road:
-    """Return the street as a `Road` for an ego from the west, or from the east.
+    """Return the street as a `Road`, for an ego from the west or, if `from_east`, from the east.
 
     The conflict zone is the middle of the narrow passage.
     """
@@ -145,9 +148,9 @@ def road(from_east: bool = False) -> Road:
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the `Seat` of agents from the west and from the east, by path.
+    """Return the scenario as an agent from either side plays it: with that agent as its ego.
 
-    A seat is the scenario with that agent as its ego.
+    An agent is a vehicle that decides. Keys are the paths on which agents start, (approach, route).
     """
     from_east = replace(SCENARIO, road=partial(road, True), cleared=partial(cleared, ahead=-1))
     return {
@@ -157,7 +160,12 @@ def seats() -> dict[PathKey, Seat]:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: cars from both sides of a passage for one.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car from a side road that the embankment hides. The layout is the same for equal seeds and
+    `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -206,10 +214,12 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters, ahead: int = 1) -> Bools:
-    """Return whether the ego's centre is far enough beyond the passage, for each world, (...).
+    """Return whether the ego is beyond the passage by `parameters.cleared_m`.
 
-    `ahead` is 1 for an ego that goes east and -1 for one that goes west. `xy_m` are the centres of
-    all vehicles, (..., V, 2), the ego first.
+    `ahead` is 1 for an ego that goes east and -1 for one that goes west. `xy_m`, (..., V, 2), are
+    the centres of the V vehicles of each of any number of episodes at one moment, m in
+    highway-env's frame, the ego first. `approaches`, (..., V), where their paths come from, is not
+    read. The result is (...).
     """
     return np.asarray(ahead * xy_m[..., 0, 0] > parameters.cleared_m)
 

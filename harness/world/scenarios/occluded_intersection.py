@@ -41,8 +41,11 @@ SPARE_S = 0.15  # more than rounding, between the truck's tail and a car that cr
 class Parameters(Witnessed):
     """Hold the settings of `occluded-intersection`: the ego crosses where buildings hide traffic.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
+    `sector_shares` are probabilities of the directions that a danger comes from. An `_offset_s` is
+    when a vehicle is at the place where both meet, in s after a cruising ego, one that keeps its
+    speed. A danger is the vehicle that would meet that ego.
     """
 
     # seconds after which an ego that has not cleared the intersection never will
@@ -83,7 +86,12 @@ class Parameters(Witnessed):
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: the ego, three helpers, a truck and buildings.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car in time to meet an ego that keeps its speed. The layout is the same for equal seeds and
+    `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -171,8 +179,9 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mps: float) -> float:
     """Return the earliest time (s from the start) at which a crossing car can follow the truck.
 
-    The car comes from the side `approach` at `speed_mps` and would then be at its conflict point
-    without touching the truck, which starts at `truck_arc_m` of its path and keeps `truck_mps`.
+    It is when the car, from the side `approach` (`left` or `right`) at `speed_mps`, would be at its
+    conflict point with the ego if it just does not touch the truck, which starts at `truck_arc_m`
+    (m) of its path and keeps `truck_mps`.
     """
     at = road().crossings[approach, "straight"]
     truck, car = road().paths["oncoming", "straight"], road().paths[approach, "straight"]
@@ -186,9 +195,11 @@ def behind_truck_s(approach: str, speed_mps: float, truck_arc_m: float, truck_mp
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough past the junction, for each world, (...).
+    """Return whether the ego is behind the junction by `parameters.cleared_m`.
 
-    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
+    moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
+    from, is not read. The result is (...).
     """
     return np.asarray(JUNCTION_M + parameters.cleared_m <= -xy_m[..., 0, 1])
 

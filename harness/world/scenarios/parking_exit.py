@@ -41,8 +41,10 @@ SEATS_M = 6.0, 7.5  # blind seats: cars parked ahead of the van ahead, from cent
 class Parameters(Witnessed):
     """Hold the settings of `parking-exit`: the ego pulls out between vans into a hidden lane.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
+    `_offset_s` is when a car is where the ego comes into the lane, in s after a cruising ego, one
+    that keeps its speed. A danger is the vehicle that would meet that ego.
     """
 
     # speeds that the ego's actions step through, m/s: up to a driver's pace in a car park
@@ -104,7 +106,10 @@ def network() -> Any:
 
 @cache
 def road() -> Road:
-    """Return the street as a `Road`; its conflict zone is where the ego enters the lane."""
+    """Return the street as a `Road`, for an ego that pulls out of a kerbside space.
+
+    The conflict zone is where the ego enters the lane beside it.
+    """
     ego, behind = ("own", "pull-out"), ("behind", "straight")
     ego_lanes = [
         ("space", "pull", 0),
@@ -138,7 +143,12 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: the ego among parked vans, and who comes along.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car from behind in time to meet the ego; three helpers see it. The layout is the same for equal
+    seeds and `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -200,9 +210,11 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego's centre is far enough along the lane, for each world, (...).
+    """Return whether the ego is beyond its pull-out by `parameters.cleared_m`.
 
-    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
+    moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
+    from, is not read. The result is (...).
     """
     return np.asarray(xy_m[..., 0, 0] > OUT_M + parameters.cleared_m)
 

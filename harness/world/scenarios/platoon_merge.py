@@ -37,8 +37,10 @@ RAMP, MAIN = ("ramp", "merge"), ("main", "straight")  # where agents begin
 class Parameters(Shared):
     """Hold the settings of `platoon-merge`: the ego merges from a ramp into a row of cars.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. The
+    row has one place more than cars; `offset_s` is when that place is at the merge, in s after a
+    cruising ego, one that keeps its speed. A danger is the vehicle that would meet that ego.
     """
 
     # speeds that an agent's actions step through, m/s: up to 54 km/h
@@ -61,13 +63,19 @@ class Parameters(Shared):
 
 
 def road() -> Road:
-    """Return the road of scenario `blind-merge`: a main road of two lanes and a ramp."""
+    """Return the road of scenario `blind-merge`: a main road of two lanes and a ramp.
+
+    The ego comes along the ramp.
+    """
     return blind_merge.road()
 
 
 @cache
 def main_road() -> Road:
-    """Return the road for an agent on the right main lane, into which the ramp merges."""
+    """Return the road for an agent, a vehicle that decides, on the right lane of the main road.
+
+    The ramp merges into its lane.
+    """
     shared = road()
     back_m = shared.zone_arc_m - np.linspace(*SECTOR_REACH_M, 16)
     return replace(
@@ -81,7 +89,10 @@ def main_road() -> Road:
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the `Seat` of the platoon's cars, by path: the scenario with such a car as its ego."""
+    """Return the scenario as a car of the platoon plays it: with that car as its ego.
+
+    The key is the path on which these cars start, (approach, route).
+    """
     words = {
         "task": "keep to the right lane of a road, in a platoon, "
         "past a ramp that runs into the lane",
@@ -95,7 +106,12 @@ def seats() -> dict[PathKey, Seat]:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: the ego on a ramp, a row of cars, and a wall.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car that does not decide and takes one place of the row. The layout is the same for equal seeds
+    and `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 

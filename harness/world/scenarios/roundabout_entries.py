@@ -60,8 +60,11 @@ PRIORITY = {"left": 2, "oncoming": 2, "own": 1, "right": 0}
 class Parameters(Shared):
     """Hold the settings of `roundabout-entries`: cars enter a roundabout from several arms.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
+    agent is a vehicle that decides; `offset_s` is when one enters, in s after the agent from the
+    arm before has passed there. A danger is the vehicle that would meet an ego which keeps its
+    speed.
     """
 
     # speeds that an agent's actions step through, m/s
@@ -96,7 +99,8 @@ class Parameters(Shared):
 def key_of(begin: str, leaves: int, home: str = EGO) -> PathKey:
     """Return the path key (approach, route), as an agent from arm `home` names it.
 
-    The path enters at the arm `begin` (`s`, `e`, `n` or `w`) and leaves `leaves` arms farther on.
+    An agent is a vehicle that decides. The path enters at the arm `begin` (`s`, `e`, `n` or `w`)
+    and leaves `leaves` arms farther on, the way traffic goes round.
     """
     approach = name_of(begin, home)
     return approach, ROUTES[approach, leaves]
@@ -104,9 +108,10 @@ def key_of(begin: str, leaves: int, home: str = EGO) -> PathKey:
 
 @cache
 def road(home: str = EGO) -> Road:
-    """Return the roundabout as a `Road` for an agent from an arm (`s`, `e`, `n` or `w`).
+    """Return the roundabout as a `Road`, for an agent from the arm `home` as its ego.
 
-    The conflict zone is where the agent's path joins the ring.
+    An agent is a vehicle that decides; arms are `s`, `e`, `n` and `w`. The conflict zone is where
+    the agent's path joins the ring.
     """
     ego = key_of(home, 2, home)
     arms = {name_of(arm, home): arm for arm in ARMS}
@@ -142,10 +147,12 @@ def road(home: str = EGO) -> Road:
 
 
 def cleared(home: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
-    """Return whether an agent has left the ring past the next entry, for each world, (...).
+    """Return whether the ego has left the ring past the next entry.
 
-    `home` is its arm (`s`, `e`, `n` or `w`), and `xy_m` are the centres of all vehicles, (..., V,
-    2), the agent first.
+    `home` is the arm that it comes from (`s`, `e`, `n` or `w`). `xy_m`, (..., V, 2), are the
+    centres of the V vehicles of each of any number of episodes at one moment, m in highway-env's
+    frame, the ego first. `approaches`, (..., V), where their paths come from, is not read. The
+    result is (...).
     """
     turned_rad, edge_m = math.pi / 2 * ARMS.index(home), PLACE.ring_m + LANE_WIDTH_M / 2
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
@@ -156,7 +163,10 @@ def cleared(home: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bool
 
 @cache
 def seats() -> dict[PathKey, Seat]:
-    """Return the `Seat` of the agents from the west and the east, by the path of each."""
+    """Return the scenario as an agent from the west or the east plays it: with it as the ego.
+
+    An agent is a vehicle that decides. Keys are the paths on which agents start, (approach, route).
+    """
     seats = {}
     for arm in "we":
         mine = replace(SCENARIO, road=partial(road, arm), cleared=partial(cleared, arm))
@@ -166,7 +176,12 @@ def seats() -> dict[PathKey, Seat]:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: cars from two or three arms, in each other's way.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car on the ring that decides nothing; hedges hide it. The layout is the same for equal seeds and
+    `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 

@@ -42,8 +42,11 @@ SEATS_MPS = (1.0, 2.0)
 class Parameters(Witnessed):
     """Hold the settings of `roundabout-entry`: the ego enters a roundabout past a hedge.
 
-    A pair of numbers bounds a uniform draw, made anew for each layout, the start situation of an
-    episode. A cruising ego is one that keeps its speed; a danger is the vehicle that would meet it.
+    Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
+    numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
+    `sector_shares` are no such pair, but probabilities of the arms that a danger comes from. An
+    `_offset_s` is when a car is at the ego's entry, in s after a cruising ego, one that keeps its
+    speed. A danger is the vehicle that would meet that ego.
     """
 
     # speeds that the ego's actions step through, m/s
@@ -87,7 +90,10 @@ class Parameters(Witnessed):
 
 @cache
 def road() -> Road:
-    """Return the roundabout as a `Road`; its conflict zone is where the ego joins the ring."""
+    """Return the roundabout as a `Road`, for an ego from the south.
+
+    The conflict zone is where the ego joins the ring.
+    """
     ego = ("own", "straight")
     # Routes are named at the ego's arm: `right` leaves there and shows it, `straight` goes on past
     # it.
@@ -125,7 +131,12 @@ def road() -> Road:
 
 
 def layout(seed: int, parameters: Parameters) -> Layout:
-    """Return the start of the episode that a layout seed draws, always the same for a seed."""
+    """Return the layout that a seed draws: the ego, three helpers, a hedge, and who is on the ring.
+
+    A layout is the start situation of an episode. A danger, with probability `danger_share`, is a
+    car that passes the ego's entry when the ego is there. The layout is the same for equal seeds
+    and `parameters`.
+    """
     return placed(SCENARIO, _draft, seed, parameters)
 
 
@@ -185,9 +196,11 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 
 
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
-    """Return whether the ego is past the first exit after its entry, for each world, (...).
+    """Return whether the ego is past the first exit after its entry.
 
-    `xy_m` are the centres of all vehicles, (..., V, 2), the ego first.
+    `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
+    moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
+    from, is not read. The result is (...).
     """
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
     return np.asarray((x > 0) & (np.arctan2(y, x) < PLACE.ring_rad(1)))
