@@ -19,8 +19,11 @@ from harness.core.arrays import Bools, Floats, summed
 class Messages:
     """Hold what a consensus rule fuses: the ego's intent and its helpers' messages.
 
-    Arrays are of decisions of any shape `(...)`, with H helpers and A actions. On an axis of
-    length 1+H index 0 is the ego and 1+h is helper h; on one of length H, index h is helper h.
+    An intent is the probabilities that a vehicle gives to the ego's actions. Arrays are of
+    decisions of any shape `(...)`, with H helpers and A actions: `intents` `(..., 1+H, A)`,
+    `weights` and `distance_m` `(..., 1+H)`, all else `(..., H)`. On an axis of length 1+H index 0
+    is the ego and 1+h is helper h; on one of length H, index h is helper h. `weights` sum to 1 and
+    are 0 for a helper not heard, whose intent may hold anything.
     """
 
     # the probabilities that each vehicle gives to the ego's actions, `(..., 1+H, A)`, each row
@@ -45,7 +48,12 @@ class Messages:
 
 
 class Fused(NamedTuple):
-    """Hold what a consensus rule returns for decisions `(...)` with H helpers and A actions."""
+    """Hold what a consensus rule returns for decisions `(...)` with H helpers and A actions.
+
+    `policy`, `(..., A)`, are the probabilities of the ego's actions, `weights`, `(..., 1+H)`, what
+    each vehicle counted, the ego first, and `state`, `(..., K)`, the rule's memory for the
+    episode's next decision. `trust`, `(..., H)`, is None if the rule rates none.
+    """
 
     policy: Floats  # probabilities of the ego's actions after fusion, `(..., A)`
     # each vehicle's weight in the policy, `(..., 1+H)`, the ego first; NaN if the rule has none
@@ -66,21 +74,22 @@ class Rule(Protocol):
     an episode are fused in order, each from the memory that the last one returned. This includes
     steps in which the ego hears nobody; there it acts on its own intent, whatever the rule returns.
     A rule that uses `Messages.claims` has `needs = ("claims",)`. With `needs = ("plans",)` it reads
-    what each agent itself plans to do, and the ego's own intent is then its plan; no other rule
-    sees plans.
+    what each vehicle that decides plans to do itself, and the ego's own intent is then its plan; no
+    other rule sees plans.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the rule's memory before the first step of a batch of episodes, `(*batch, K)`.
+        """Return the rule's memory before the first decision of each episode, `(*batch, K)`.
 
-        It is K numbers an episode, as many as the rule likes. There are `helpers` helpers and
-        `actions` actions in each.
+        It is K numbers an episode, as many as the rule likes. `batch` is the shape of the episodes
+        that are fused together; in each there are `helpers` helpers and `actions` actions.
         """
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the policies, weights and next memory of one step of a batch of episodes.
+        """Return the policies, weights and next memory of one decision of each episode.
 
-        `state` is the memory of each episode before the step, `(..., K)`.
+        `messages` has what the ego and its helpers say, with arrays `(...)` of the episodes' shape;
+        `state` is the rule's memory of each before this decision, `(..., K)`.
         """
 
 
@@ -88,28 +97,39 @@ class Rule(Protocol):
 class Pool:
     """Make a consensus rule without memory of a function `pool` of (intents, weights).
 
-    `pool` takes intents `(..., 1+H, A)` and weights `(..., 1+H)`, and returns policies `(..., A)`.
+    `pool` takes the intents of the ego and H helpers over A actions, `(..., 1+H, A)`, and their
+    weights, `(..., 1+H)`, which sum to 1 and are 0 for a helper not heard. It returns policies,
+    `(..., A)`: the probabilities of the ego's actions.
     """
 
     pool: Callable[[Floats, Floats], Floats]
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`."""
+        """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`.
+
+        `batch` is the shape of the episodes; the numbers of helpers and actions in each do not
+        matter.
+        """
         return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the pool of the messages' intents and weights; `state` is passed on unchanged."""
+        """Return the pool of the messages' intents and weights; `state` is passed on unchanged.
+
+        The messages are of one decision of each episode; `state`, `(..., 0)`, is the memory of a
+        rule that keeps nothing.
+        """
         return Fused(self.pool(messages.intents, messages.weights), messages.weights, state)
 
 
 def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:
     """Return the weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2).
 
-    It is 0 for a helper not heard. If no helper is heard, the ego's weight is exactly 1: the
-    paper's fall-back to its own intent.
+    It falls with the distance. It is 0 for a helper not heard. If no helper is heard, the ego's
+    weight is exactly 1: the paper's fall-back to its own intent.
 
     Args:
-        distance_m: distance to the centroid of the conflict zone, `(..., 1+H)`.
+        distance_m: distance to the centroid of the conflict zone of the ego (index 0) and H
+            helpers, m, `(..., 1+H)`.
         heard: which helpers' replies are fused, `(..., H)`.
         min_distance_m: lower bound of a distance, above 0: Eq. 2 has no value at 0 m, and a vehicle
             in the zone would otherwise outvote all others.
@@ -142,8 +162,8 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
     """Return the weighted mean of intents, `(..., A)` (paper Eq. 1; opinion pool of Stone 1961).
 
     Args:
-        p: intents of the ego and H helpers over A actions, `(..., 1+H, A)`. Rows of weight 0 may
-            hold anything, NaN included.
+        p: intents, the probabilities that the ego (index 0) and H helpers give to A actions of the
+            ego, `(..., 1+H, A)`. Rows of weight 0 may hold anything, NaN included.
         weights: weight of each vehicle, `(..., 1+H)`, summing to 1.
     """
     row_weights = weights[..., None]
@@ -153,9 +173,10 @@ def linear_pool(p: Floats, weights: Floats) -> Floats:
 def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
     """Return the weighted geometric mean of intents, scaled to sum to 1, `(..., A)` (Genest 1984).
 
-    `p` are intents, `(..., 1+H, A)`: the ego's, those of H helpers, over A actions. `weights`,
-    `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose row may hold anything. A
-    probability below `floor` counts as `floor`, so that one rounded 0 is no veto.
+    `p` are intents, `(..., 1+H, A)`: the probabilities that the ego (index 0) and H helpers give to
+    A actions of the ego. `weights`, `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose
+    row may hold anything. A probability below `floor` counts as `floor`, so that one rounded 0 is
+    no veto.
     """
     row_weights = weights[..., None]
     logs = np.log(np.maximum(np.where(row_weights > 0, p, 1.0), floor))
@@ -166,10 +187,11 @@ def log_pool(p: Floats, weights: Floats, floor: float = 1e-3) -> Floats:
 def median(p: Floats, weights: Floats) -> Floats:
     """Return the weighted median of each action's probability, scaled to sum to 1, `(..., A)`.
 
-    `p` are intents, `(..., 1+H, A)`: the ego's, those of H helpers, over A actions. `weights`,
-    `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose row may hold anything. If exactly
-    half of the weight lies on either side, it is the mean of the two values in the middle. If all
-    medians are 0, as where each vehicle is sure of another action, the linear pool replaces them.
+    `p` are intents, `(..., 1+H, A)`: the probabilities that the ego (index 0) and H helpers give to
+    A actions of the ego. `weights`, `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose
+    row may hold anything. If exactly half of the weight lies on either side, it is the mean of the
+    two values in the middle. If all medians are 0, as where each vehicle is sure of another action,
+    the linear pool (weighted mean) replaces them.
     """
     values, below = _sorted(p, weights)
     low = _pick(values, below >= 0.5 - 1e-12)
@@ -180,10 +202,11 @@ def median(p: Floats, weights: Floats) -> Floats:
 def trimmed_mean(p: Floats, weights: Floats) -> Floats:
     """Return the weighted trimmed mean of each action's probability, scaled to sum to 1.
 
-    The result is `(..., A)`. `p` are intents, `(..., 1+H, A)`: the ego's, those of H helpers, over
-    A actions. `weights`, `(..., 1+H)`, sum to 1 and are 0 for a helper not heard, whose row may
-    hold anything. The lowest and the highest quarter of the weight are left out: more than the
-    linear pool leaves out, and less than the median.
+    The result is `(..., A)`. `p` are intents, `(..., 1+H, A)`: the probabilities that the ego
+    (index 0) and H helpers give to A actions of the ego. `weights`, `(..., 1+H)`, sum to 1 and are
+    0 for a helper not heard, whose row may hold anything. The lowest and the highest quarter of the
+    weight are left out: more than the linear pool (weighted mean) leaves out, and less than the
+    median.
     """
     values, below = _sorted(p, weights)
     inside = np.clip(below, 0.25, 0.75)
@@ -212,10 +235,10 @@ def _pick(values: Floats, reached: Bools) -> Floats:
 
 
 def scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
-    """Return the probabilities `pooled` of A actions, scaled to sum to 1, `(..., A)`.
+    """Return the pooled probabilities of A actions, scaled to sum to 1, `(..., A)`.
 
-    A row of zeros becomes the linear pool: the mean of the intents `p`, `(..., 1+H, A)`, of the ego
-    and H helpers, by `weights`, `(..., 1+H)`.
+    A row of zeros in `pooled`, `(..., A)`, becomes the linear pool: the mean of the intents `p`,
+    `(..., 1+H, A)`, which the ego and H helpers give to these actions, by `weights`, `(..., 1+H)`.
     """
     total = np.sum(pooled, axis=-1, keepdims=True)
     return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))

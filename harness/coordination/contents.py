@@ -46,10 +46,11 @@ class Call:
     """Describe a second question to the ego's model, which shows it what it has heard from helpers.
 
     Some contents of messages have one (`Content.call`): the question adds the helpers' objects to
-    the ego's scene graph (`in_graph`) or their words to its prompt (`in_words`).
+    the ego's scene graph, what it knows of the scene, (`in_graph`) or their words to its prompt
+    (`in_words`). `name` stands in the keys under which answers to it are stored.
     """
 
-    name: ClassVar[str]  # stands in the keys of the answers to it
+    name: ClassVar[str]  # stands in the keys under which answers to it are stored
     in_graph: ClassVar[bool] = False  # whether what was heard is added to the ego's scene graph
     in_words: ClassVar[bool] = False  # whether what was heard is added to the prompt as text
 
@@ -58,22 +59,28 @@ class Call:
     ) -> Sequence["SceneGraph | None"]:
         """Return the scene graph to show the ego in each case, or None where its own graph stays.
 
-        A scene graph is what one vehicle knows of a scene. Each case has what one ego sees and has
-        heard. All egos are of `scenario`: they come from the same approach, with the same route.
+        A scene graph is what one vehicle knows of a scene. Each case is one ego's: its scene, its
+        own graph and the graphs of the helpers that it has heard. All egos are of `scenario`: they
+        come from the same approach, with the same route.
         """
         return [None] * len(cases)
 
     def words(self, evidence: str) -> str:
-        """Return one helper's free text (`evidence`) as the line that the ego's prompt shows."""
+        """Return one helper's free text (`evidence`) as the line that the ego's prompt shows.
+
+        Here it is the text in one line; a package's call may write it in another way.
+        """
         return " ".join(evidence.split())
 
 
 class Content:
     """Describe what helpers' messages hold: the setting `content` of an operating point.
 
-    An operating point is the settings of radio, asking and fusion. Contents hold helpers' intents
-    with their words, words alone, lists of detected objects, or senders' own plans. Methods of this
-    base class are right for a helper's intent with its words.
+    An operating point is the settings of radio, asking and fusion. Messages hold helpers' intents
+    with their words, words alone, lists of detected objects, or senders' own plans: `holds` has
+    some of `KINDS`, and `needs` what the world must know to make such messages. An intent is
+    probabilities of the ego's actions. Methods of this base class are right for an intent with its
+    words.
     """
 
     holds: frozenset[str]  # the kinds of what such a message holds, some of `KINDS`
@@ -84,53 +91,67 @@ class Content:
 
     @property
     def of_agents(self) -> bool:
-        """Whether senders are agents that decide for themselves, and send what they plan to do."""
+        """Return whether senders decide for themselves, and send what they plan to do."""
         return PLANS in self.holds
 
     @property
     def asks_helpers(self) -> bool:
-        """Whether a helper's model must be asked before it can send such a message."""
+        """Return whether a helper's model must be asked before it can send such a message."""
         return not self.holds.isdisjoint(BY_MODELS)
 
     def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
         """Return why this content cannot be used under an operating point in a run, or None.
 
-        The text also says what to do instead. `run` has the run's agents, scenario and world.
+        It is one line, which also says what to do instead. `point` is the settings of radio, asking
+        and fusion; `run` has the run's models and prompts, its scenario and its world.
         """
         return None
 
     def able(self, point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
         """Return what vehicles intend in n decisions, with only those helpers valid that can send.
 
-        A helper that has nothing of this content is not valid in the result. `senders`, `(n, H)`,
-        is needed where messages hold plans: the row, among the n, of the decision that each helper
-        makes itself at this time, -1 for none. May also change helpers' inference times. Raises
-        UserError if it needs `senders` and they are None.
+        A helper that has nothing of this content is not valid in the result: it then sends nothing.
+        May also change helpers' inference times. Raises UserError if it needs `senders` and they
+        are None.
+
+        Args:
+            point: the operating point: the settings of radio, asking and fusion.
+            intents: what the ego and H helpers intend in each of the n decisions.
+            senders: where messages hold plans, the row, among the n, of the decision that each
+                helper makes itself at this time, `(n, H)`; -1 for none.
         """
         return intents
 
     def bits(self, encoding: str, intents: Intents, headers: bool) -> Floats:
         """Return the size of each helper's reply in bits, `(..., H)`.
 
-        `encoding` is how messages are written, `json` or one of `encodings.ENCODINGS`; `headers`
-        says whether those of network and transport count.
+        `encoding` is how messages are written, `json` or one of `encodings.ENCODINGS`; `intents`
+        has what H helpers say in decisions `(...)`. `headers` says whether those of network and
+        transport count.
         """
         return intent_bits(encoding, intents, headers)
 
 
 class OfIntent(Content):
-    """Describe the paper's content: what a helper intends in the ego's place, with its words."""
+    """Describe the paper's content of messages: a helper's intent, with its words.
+
+    The intent is what the helper would do in the ego's place, probabilities of the ego's actions.
+    """
 
     holds = frozenset((INTENTS, WORDS))
 
 
 class Contents(Plugins[Content]):
-    """Hold all contents of messages by name, those of installed packages included."""
+    """Hold all contents of messages by name, those of installed packages included.
+
+    A content says what helpers' messages hold, such as `intent`.
+    """
 
     def check(self, name: str, plugin: Content) -> None:
         """Raise ValueError if the content `plugin` of a package contradicts itself.
 
-        Such as one that holds a plan and something beside it. `name` is the content's.
+        Such as one that holds a plan and something beside it. `name` is the one under which the
+        package offers it.
         """
         if not NAME.fullmatch(name) or name == WHOLE:
             raise ValueError("its name is no plain word")
@@ -177,15 +198,19 @@ def _own_calls() -> frozenset[str]:
 
 
 def is_ours(call: Call) -> bool:
-    """Return whether a second question to the ego's model is one of a content that ships."""
+    """Return whether a second question to the ego's model is the harness's own.
+
+    It is that of a content of messages that ships, rather than a package's.
+    """
     return call.name in _own_calls()
 
 
 def of_any_model() -> list[str]:
     """Return the names of contents of messages that work with every backend.
 
-    Backends that are no language model, such as rules, read no words: contents whose words the
-    ego's model must read are left out, and so are plans.
+    A content says what helpers' messages hold, and a backend is what answers for vehicles. One that
+    is no language model, such as a rule, reads no words: contents whose words the ego's model must
+    read are left out, and so are plans.
     """
     names = []
     for name, content in CONTENTS.usable().items():

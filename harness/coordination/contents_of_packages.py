@@ -35,8 +35,9 @@ MOST_CHARACTERS = 10_000  # of a helper's words
 def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
     """Return why what messages hold at an operating point cannot be used in a run, or None.
 
-    The text is one line; `run` has the run's agents, scenario and world. Raises UserError if a
-    package's content fails or returns no text.
+    Call it in place of `Content.obstacle`, which a package may have written. The text is one line.
+    `point` is the settings of radio, asking and fusion; `run` has the run's models and prompts, its
+    scenario and its world. Raises UserError if a package's content fails or returns no text.
     """
     content, prompt = point.content, run.agents[0].prompt
     if point.has_fusion_call and content.call and content.call.in_words and not prompt.shows_words:
@@ -52,10 +53,15 @@ def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
 def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Intents:
     """Return what vehicles intend in n decisions, with only those helpers valid that can send.
 
-    What they send is the content of the operating point `point`. `senders`, `(n, H)`, has the row,
-    among the n, of the decision that each helper makes itself at this time, -1 for none; needed
-    where messages hold plans. Of a package's content only `valid`, helpers' inference times and
-    `unasked` may change; raises UserError if it fails or changes anything else.
+    Call it in place of `Content.able`, which a package may have written: of its content only
+    `valid`, helpers' inference times and `unasked` may change. Raises UserError if it fails or
+    changes anything else.
+
+    Args:
+        point: the settings of radio, asking and fusion, with the content of messages.
+        intents: what the ego and H helpers intend in each of the n decisions.
+        senders: where messages hold plans, the row, among the n, of the decision that each helper
+            makes itself at this time, `(n, H)`; -1 for none.
     """
     content = point.content
     if CONTENTS.is_ours(point.ask.content):
@@ -84,8 +90,10 @@ def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Int
 def bits(point: "OperatingPoint", intents: Intents) -> Floats:
     """Return the size in bits of each helper's reply at an operating point, `(..., H)`.
 
-    It depends on what messages hold there, and on how they are encoded. Raises UserError if a
-    package's content fails or gives sizes outside 0 to `MOST_BITS`.
+    Call it in place of `Content.bits`, which a package may have written. The size depends on what
+    messages hold at `point`, and on how they are encoded; `intents` has what H helpers say in
+    decisions `(...)`. Raises UserError if a package's content fails or gives sizes outside 0 to
+    `MOST_BITS`.
     """
     content, encoding, headers = point.content, point.radio.encoding, point.physical is not None
     if CONTENTS.is_ours(point.ask.content):
@@ -102,10 +110,12 @@ def bits(point: "OperatingPoint", intents: Intents) -> Floats:
 def graphs(
     call: Call, scenario: "Scenario", cases: Sequence["Heard"]
 ) -> Sequence[SceneGraph | None]:
-    """Return the scene graph that a second question shows the ego in each case; None keeps its own.
+    """Return the scene graph that a second question shows the ego in each case.
 
-    A case has what one ego sees and has heard; all egos are of `scenario`. Raises UserError if a
-    package's call fails or returns another vehicle's graph.
+    None keeps the ego's own graph. Call it in place of `Call.graphs`, which a package may have
+    written. Each case is one ego's: its scene, its own graph (what it knows of the scene) and those
+    of the helpers that it has heard. All egos are of `scenario`. Raises UserError if a package's
+    call fails or returns another vehicle's graph.
     """
     if is_ours(call):
         return call.graphs(scenario, cases)
@@ -122,8 +132,9 @@ def graphs(
 def words(call: Call, evidence: str) -> str:
     """Return one helper's free text (`evidence`) as the line that the ego's prompt shows.
 
-    `call` is the second question to the ego's model that shows it. Raises UserError if a package's
-    call fails or its line is too long.
+    Call it in place of `Call.words`, which a package may have written. `call` is the second
+    question to the ego's model that shows it. Raises UserError if a package's call fails or its
+    line is too long.
     """
     if is_ours(call):
         return call.words(evidence)
@@ -138,10 +149,11 @@ def words(call: Call, evidence: str) -> str:
 
 
 def graph_like(given: object, own_graph: SceneGraph, whose: str) -> SceneGraph:
-    """Return a graph that a package gave as one that a file may have.
+    """Return what a package gave as a scene graph: a fresh copy, checked as one from a file is.
 
-    Raises ValueError or TypeError unless it is of the same viewer, role, step and ego as
-    `own_graph`, the graph of that vehicle here.
+    A scene graph is what one vehicle knows of a scene; `own_graph` is the one that this vehicle has
+    here. Raises ValueError or TypeError, with `whose` (such as `the ego's`) in the message, unless
+    both are of the same viewer, role, step and ego.
     """
     if not isinstance(given, SceneGraph):
         raise TypeError(f"it returns what is no graph of {whose}")

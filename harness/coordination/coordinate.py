@@ -46,7 +46,12 @@ TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 
 @dataclass(frozen=True)
 class FusionInputs:
-    """Hold what `coordinate` and `fuse` need besides intents and draws; each may be None."""
+    """Hold what `coordinate` and `fuse` need besides intents and draws; each may be None.
+
+    `call` takes who was heard, `(..., H)`, and asks the ego's model once more; it returns the ego's
+    intents, `(..., A)`, and the seconds that each took. `state`, `(..., K)`, is the consensus
+    rule's memory, and `ties` draws between equally likely actions.
+    """
 
     # asks the ego's model once more, with what the ego has heard; required where the operating
     # point makes such a fusion call, as with consensus `ego-prompt`
@@ -62,8 +67,12 @@ class FusionInputs:
 class Coordination(Exchange):
     """Hold all that happened in each decision: exchange, fused policy, action and latency.
 
-    Made by `coordinate` and `fuse`. Times are seconds from the start of the decision. Arrays are of
-    decisions of any shape `(...)`, with H helpers and A actions; of 1+H vehicles the ego is first.
+    Made by `coordinate` and `fuse`. Arrays are of decisions of any shape `(...)`, with H helpers
+    and A actions; of 1+H vehicles the ego is first. `fused`, `(..., A)`, is the policy, the
+    probabilities of the ego's actions after fusion, and `action`, `(...)`, the index of the one
+    taken. `weights`, `(..., 1+H)`, are what each vehicle counted, `trust`, `(..., H)`, is how far
+    the rule trusts each helper, and `state`, `(..., K)`, its memory. `latency_s`, `(...)`, is when
+    the ego acts; times are s from the start of the decision.
     """
 
     # each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered
@@ -100,11 +109,14 @@ def coordinate(
 ) -> Coordination:
     """Play decisions of any shape `(...)`, from asking helpers to the ego's action.
 
-    `point` is the operating point: the settings of radio, asking and fusion. `intents` has what the
-    ego and up to H helpers intend over A actions in each decision; `draws` are the channel's random
-    numbers. `fusion` is needed where the point makes a fusion call (the ego's model answers once
-    more, with what it has heard), its rule has memory, or ties are drawn. Raises UserError if a
-    package's plug-in fails.
+    Raises UserError if a package's plug-in fails.
+
+    Args:
+        point: the operating point: the settings of radio, asking and fusion.
+        intents: what the ego and up to H helpers intend over A actions in each decision.
+        draws: the channel's random numbers.
+        fusion: what else is needed; required where the point makes a fusion call (the ego's model
+            answers once more, with what it has heard), its rule has memory, or ties are drawn.
     """
     return fuse(point, exchange(point, intents, draws), intents, fusion)
 
@@ -114,9 +126,15 @@ def fuse(
 ) -> Coordination:
     """Fuse what egos intend with what they heard, and return policies, actions and latencies.
 
-    The second half of `coordinate`: `heard` is the result of `exchange` on the same operating point
-    and intents, and `fusion` what else is needed. Raises ValueError if the point makes a fusion
-    call and `fusion` has none, and UserError if a package's rule fails.
+    The second half of `coordinate`, for decisions of any shape `(...)`. Raises UserError if a
+    package's rule fails.
+
+    Args:
+        point: the operating point: the settings of radio, asking and fusion.
+        heard: what `exchange` returned for this point and these intents: who was asked and heard.
+        intents: what the ego and up to H helpers intend over A actions in each decision.
+        fusion: what else is needed; raises ValueError if the point makes a fusion call (the ego's
+            model answers once more, with what it has heard) and it has none.
     """
     fusion = fusion or FusionInputs()
     p = np.concatenate([heard.own[..., None, :], intents.helpers], axis=-2)

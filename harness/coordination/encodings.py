@@ -19,20 +19,27 @@ Held = Literal["intent", "objects", "request"]
 
 @runtime_checkable
 class Encoding(Protocol):
-    """Describe how a standard encodes messages, by how large they become."""
+    """Compute how large messages are as a standard encodes them; `json` needs no such class.
+
+    An extension adds one under the name that the setting `encoding` gives.
+    """
 
     def packet_bits(self, holds: Held, headers: bool, **counts: Floats | float) -> Floats:
-        """Return the bits of messages, 0 where none is sent.
+        """Return the size of messages in bits, 0 where none is sent, in the shape of `counts`.
 
         Args:
             holds: what they are: an `intent` with its words, a list of `objects`, or a `request`.
             headers: whether those of network and transport count.
-            counts: how much they hold: `actions` and `text_bytes` of an intent, `objects` that are
-                listed, `helpers` whom a request asks.
+            counts: how much each holds, a number or an array with one value for each message:
+                `actions` and `text_bytes` of an intent, `objects` that are listed, `helpers` whom a
+                request asks.
         """
 
     def beacon_bytes(self, rate_hz: float) -> int:
-        """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second."""
+        """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second.
+
+        A beacon is what a vehicle broadcasts about itself: pose and speed.
+        """
 
 
 ENCODINGS = Shipped[Encoding]("swarmdrive.encodings", Encoding, {})  # those beside `json`
@@ -42,8 +49,9 @@ SAYS = '{"from":"v2","says":""}'  # what compact JSON puts around words
 def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """Return the size in bits of each helper's message with its intent and its words, `(..., H)`.
 
-    `encoding` is `json` or one of `ENCODINGS`. `headers` adds those of network and transport,
-    except under `json`.
+    An intent is probabilities of the ego's actions. `encoding` is how messages are written, `json`
+    or one of `ENCODINGS`; `intents` has what H helpers say in decisions `(...)`. `headers` adds
+    those of network and transport, except under `json`.
     """
     if encoding == JSON:
         return intents.payload_bits
@@ -57,8 +65,9 @@ def intent_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """Return the size in bits of each helper's message with its words alone, `(..., H)`.
 
-    `encoding` is `json` or one of `ENCODINGS`. `headers` adds those of network and transport,
-    except under `json`.
+    `encoding` is how messages are written, `json` or one of `ENCODINGS`; `intents` has what H
+    helpers say in decisions `(...)`. `headers` adds those of network and transport, except under
+    `json`.
     """
     if encoding == JSON:
         return 8 * (len(SAYS) + _text_bytes(intents))
@@ -69,8 +78,9 @@ def words_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
     """Return the size in bits of each helper's list of detected objects, `(..., H)`.
 
-    `encoding` is `json` or one of `ENCODINGS`. `intents` must have `objects` and `object_bits`.
-    `headers` adds those of network and transport, except under `json`.
+    `encoding` is how messages are written, `json` or one of `ENCODINGS`. `intents`, of decisions
+    `(...)` with H helpers, must have `objects` and `object_bits`. `headers` adds those of network
+    and transport, except under `json`.
     """
     assert intents.object_bits is not None
     assert intents.objects is not None
@@ -81,9 +91,10 @@ def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 
 
 def request_bits(encoding: str, helpers: int, headers: bool) -> float:
-    """Return the size in bits of one request that asks so many helpers.
+    """Return the size in bits of one request of the ego that asks so many helpers.
 
-    `encoding` is one of `ENCODINGS`. `headers` says whether those of network and transport count.
+    `encoding` is one of `ENCODINGS`, not `json`. `headers` says whether those of network and
+    transport count.
     """
     return float(ENCODINGS[encoding].packet_bits("request", headers, helpers=helpers))
 
@@ -91,7 +102,8 @@ def request_bits(encoding: str, helpers: int, headers: bool) -> float:
 def beacon_bytes(encoding: str, rate_hz: float) -> int:
     """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second.
 
-    `encoding` is any but `json`.
+    A beacon is what a vehicle broadcasts about itself. `encoding` is one of `ENCODINGS`, not
+    `json`.
     """
     return ENCODINGS[encoding].beacon_bytes(rate_hz)
 

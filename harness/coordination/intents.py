@@ -22,7 +22,10 @@ class Intents:
     An intent is the probabilities that a vehicle gives to the ego's actions: what the ego should
     do, as that vehicle sees it. Arrays are of decisions of any shape `(...)`, with H helpers and A
     actions. On an axis of length 1+H index 0 is the ego and 1+h is helper h; on one of length H,
-    index h is helper h.
+    index h is helper h. `own`, the ego's intent, is `(..., A)`, `helpers` `(..., H, A)`,
+    `distance_m` and `inference_s` `(..., 1+H)`, `own_bits` and `own_text_bytes` `(...)`, and all
+    other arrays `(..., H)`. `valid` says which helpers have something to send; a field that is None
+    is not needed, or holds for nobody.
     """
 
     own: Floats  # the ego's intent, `(..., A)`; a row with a NaN is a failed answer
@@ -65,7 +68,10 @@ class Intents:
     own_text_bytes: Floats | None = None  # bytes of the text in it, `(...)`
 
     def take(self, at: Any) -> "Intents":
-        """Return the decisions at `at`, indices or a mask, of the leading axis of all arrays."""
+        """Return some decisions: those at `at` of the leading axis of all arrays.
+
+        `at` is an array of indices or a mask.
+        """
         return replace(
             self,
             site=self.site and self.site.take(at),
@@ -78,7 +84,8 @@ class Intents:
     def replaced(self, at: Ints, newer: "Intents") -> "Intents":
         """Return a copy in which the decisions at indices `at`, `(k,)`, have the arrays of `newer`.
 
-        `newer` has k decisions. `site`, `outlook`, `claims` and `plans` stay those of this object.
+        `newer` has k decisions, in that order. `site`, `outlook`, `claims` and `plans` stay those
+        of this object.
         """
         arrays = {name: array.copy() for name, array in self.arrays().items()}
         for name, values in newer.arrays().items():
@@ -86,9 +93,10 @@ class Intents:
         return replace(self, **arrays)
 
     def without_models(self) -> "Intents":
-        """Return the intents for messages that list objects and need no answer of a helper's model.
+        """Return a copy for messages that list objects and need no answer of a helper's model.
 
-        Every present helper is then valid, has an inference time of 0 s, and is not waited for.
+        Every present helper is then valid (able to send), has an inference time of 0 s, and is not
+        waited for.
         """
         own_s = self.inference_s[..., :1]
         return replace(
@@ -99,9 +107,9 @@ class Intents:
         )
 
     def with_words(self) -> "Intents":
-        """Return the intents for messages of words alone: without a text a helper is not valid.
+        """Return a copy for messages of words alone: without a text a helper has nothing to send.
 
-        A helper whose model was not asked yet stays valid.
+        It is then not valid. A helper whose model was not asked yet stays valid.
         """
         text_bytes = np.zeros(self.valid.shape) if self.text_bytes is None else self.text_bytes
         unasked = np.zeros(self.valid.shape, dtype=bool) if self.unasked is None else self.unasked
@@ -143,8 +151,8 @@ class Intents:
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
         """Return the decisions of several objects as one, concatenated along the leading axis.
 
-        All must have the same numbers of helpers and actions, and no `site`, `outlook`, `claims` or
-        `plans`.
+        All must have the same numbers of helpers and actions, the same optional arrays, and None as
+        `site`, `outlook`, `claims` and `plans`.
         """
         arrays = [part.arrays() for part in parts]
         joint: dict[str, Any] = {}
@@ -153,9 +161,9 @@ class Intents:
         return cls(**joint)
 
     def of_first(self, helpers: int) -> "Intents":
-        """Return the decisions with only the first `helpers` helpers of each.
+        """Return the same decisions with only the first `helpers` helpers of each.
 
-        There must be no `site`, `outlook` or `claims`.
+        Its `site`, `outlook` and `claims` must be None.
         """
         cut = {
             name: array[..., : helpers + (name in WITH_EGO)]
@@ -165,10 +173,10 @@ class Intents:
         return replace(self, helpers=self.helpers[..., :helpers, :], **cut)
 
     def of_helpers(self, places: Ints) -> "Intents":
-        """Return the n decisions with other helpers: in each those that `places`, `(n, H')`, names.
+        """Return the same n decisions with other helpers: in each those that `places` names.
 
-        A place is the index of a helper here, from 0. It may be repeated: one vehicle then speaks
-        with several voices.
+        `places`, `(n, H')`, are indices of the H helpers here, from 0. One may be repeated: one
+        vehicle then speaks with several voices.
         """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         selected = {
@@ -188,7 +196,10 @@ class Intents:
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Return the array fields that are not None, by field name."""
+        """Return the arrays that are not None, by the name of the field.
+
+        Left out are `site`, `outlook`, `claims` and `plans`, which are records of arrays.
+        """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {
             name: value for name, value in values.items() if name not in PARTS and value is not None

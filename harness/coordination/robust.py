@@ -25,17 +25,20 @@ SMOOTHING = 1e-6  # keeps Weiszfeld's weights finite if a message is the median 
 class Heads(Pool):
     """Make a consensus rule that weighs all vehicles alike, and that no helper can turn alone.
 
-    If all vehicles but at most one, the ego among them, have the same likeliest action and the
-    fused policy (`pool`) has another, the mean intent of these vehicles replaces it.
+    It is made of a function `pool` from intents `(..., 1+H, A)` and weights `(..., 1+H)` to
+    policies `(..., A)`. If all vehicles but at most one, the ego among them, have the same
+    likeliest action and the policy has another, the mean intent of these vehicles replaces it.
     """
 
+    # whether claimed distances weigh; read by the checks of an operating point
     by_distance: ClassVar[bool] = False
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
         """Return the pool with equal weights of all heard, or a majority's mean intent.
 
         The latter where the pool's likeliest action is another than that of a majority: all but at
-        most one of the vehicles heard, the ego among them, at least two. `state` is passed on
+        most one of the vehicles heard, the ego among them, at least two. `messages` are of one
+        decision of each episode; `state`, the memory of a rule that keeps nothing, is passed on
         unchanged.
         """
         voices = messages.weights > 0
@@ -51,7 +54,8 @@ def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
     """Return the policy, replaced where a majority of votes wants another action, `(..., A)`.
 
     The replacement is the mean intent of the vehicles in the majority, which counts only if the ego
-    is in it. A vehicle votes for its likeliest action.
+    is in it. An intent is the probabilities that a vehicle gives to the ego's actions; it votes for
+    the likeliest.
 
     Args:
         policy: the fused probabilities of A actions to check, `(..., A)`.
@@ -79,9 +83,9 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
     """Return each action's mean probability without its lowest and highest voice, `(..., A)`.
 
     It is scaled to sum to 1 (k-truncated mean with k = 1, Guo and Kong 2024). With fewer than three
-    voices, none is left out. `p` are intents of the ego (index 0) and H helpers over A actions,
-    `(..., 1+H, A)`; of `weights`, `(..., 1+H)`, only whether they are above 0 counts, which marks
-    the voices heard.
+    voices, none is left out. `p` are intents, the probabilities that the ego (index 0) and H
+    helpers give to A actions, `(..., 1+H, A)`; of `weights`, `(..., 1+H)`, only whether they are
+    above 0 counts, which marks the voices heard.
     """
     voices = weights > 0
     heads = np.sum(voices, axis=-1)[..., None, None]
@@ -98,8 +102,9 @@ def head_trimmed_mean(p: Floats, weights: Floats) -> Floats:
 def geometric_median(p: Floats, weights: Floats) -> Floats:
     """Return the distribution with the least weighted sum of L2 distances to intents, `(..., A)`.
 
-    Computed by Weiszfeld's iteration (1937). `p` are intents of the ego (index 0) and H helpers
-    over A actions, `(..., 1+H, A)`; `weights`, `(..., 1+H)`, are 0 for a helper not heard.
+    Computed by Weiszfeld's iteration (1937). `p` are intents, the probabilities that the ego (index
+    0) and H helpers give to A actions, `(..., 1+H, A)`; `weights`, `(..., 1+H)`, are 0 for a helper
+    not heard.
     """
     points = np.where((weights > 0)[..., None], p, 0.0)
     middle: Floats = linear_pool(p, weights)
@@ -113,10 +118,10 @@ def geometric_median(p: Floats, weights: Floats) -> Floats:
 def centred_clipping(p: Floats, weights: Floats) -> Floats:
     """Return the ego's intent, moved `CLIP_ROUNDS` times by the weighted mean of clipped steps.
 
-    A step leads to another vehicle's intent and is at most `CLIP` long (L2); the result is `(...,
-    A)`. From Karimireddy, He and Jaggi (2021), but starting from the ego's intent. `p` are intents
-    of the ego (index 0) and H helpers over A actions, `(..., 1+H, A)`; `weights`, `(..., 1+H)`, sum
-    to 1 and are 0 for a helper not heard.
+    A step leads to another vehicle's intent and is at most `CLIP` long (L2); the result is
+    `(..., A)`. From Karimireddy, He and Jaggi (2021), but starting from the ego's intent. `p` are
+    intents, the probabilities that the ego (index 0) and H helpers give to A actions,
+    `(..., 1+H, A)`; `weights`, `(..., 1+H)`, sum to 1 and are 0 for a helper not heard.
     """
     centre = p[..., 0, :]
     for _ in range(CLIP_ROUNDS):
@@ -128,16 +133,17 @@ def centred_clipping(p: Floats, weights: Floats) -> Floats:
 
 
 def bayes(p: Floats, weights: Floats, reliability: float | Floats = RELIABILITY) -> Floats:
-    """Return the posterior of the action by all intents as independent evidence, `(..., A)`.
+    """Return the posterior of the best action by all intents as independent evidence, `(..., A)`.
 
     Each helper is right with probability r (`reliability`) and else uninformative, so its intent
     counts as `r p + (1 - r) / A`; the ego's counts as it is, and the prior is uniform. Vehicles
     that see the same are not independent, which this ignores.
 
     Args:
-        p: intents of the ego (index 0) and H helpers over A actions, `(..., 1+H, A)`.
+        p: intents, the probabilities that the ego (index 0) and H helpers give to A actions,
+            `(..., 1+H, A)`.
         weights: 0 for a helper not heard, `(..., 1+H)`; nothing else of them counts.
-        reliability: reliability of the helpers, `(..., H)` or one for all.
+        reliability: reliability of the helpers, from 0 to 1, `(..., H)` or one for all.
     """
     actions = p.shape[-1]
     helper_r = np.broadcast_to(np.asarray(reliability), weights[..., 1:].shape)

@@ -21,7 +21,8 @@ class Outlook:
 
     A place that a danger may come from is one of the road's R sectors, or regions: stretches of
     other roads before the ego's conflict zone. Arrays are of decisions of any shape `(...)`, with H
-    helpers.
+    helpers: `unseen` `(..., R)` and `added` `(..., H, R)` are shares from 0 to 1, and `to_zone_s`
+    `(...)` is how many s the ego has until that zone.
     """
 
     unseen: Floats  # share of each region that the ego does not see, `(..., R)`
@@ -34,7 +35,10 @@ class Outlook:
     to_zone_s: Floats
 
     def take(self, at: Any) -> "Outlook":
-        """Return the outlooks of the decisions at `at`, indices or a mask of the leading axis."""
+        """Return the outlooks of some decisions: those at `at` of the leading axis of all arrays.
+
+        `at` is an array of indices or a mask.
+        """
         return Outlook(self.unseen[at], self.added[at], self.to_zone_s[at])
 
     def of_helpers(self, places: Ints) -> "Outlook":
@@ -50,7 +54,9 @@ class ScheduleInputs:
     """Hold what the ego knows before it asks anybody, the input of a schedule.
 
     A schedule is the rule for whom to ask. Arrays are of decisions of any shape `(...)`, with H
-    helpers and A actions. Values for a helper that may not be asked are arbitrary.
+    helpers and A actions: `own` `(..., A)`, `entropy_nats` and `lot` `(...)`, `distance_m`
+    `(..., 1+H)` with the ego first, and the others `(..., H)`. Values for a helper that may not be
+    asked are arbitrary.
     """
 
     # the ego's intent, its probabilities of its actions, `(..., A)`; the fallback, such as all
@@ -73,31 +79,43 @@ class Schedule(Protocol):
     """Describe a schedule, the rule for whom the ego asks, by what asking each helper is worth.
 
     It is a pure function of arrays. The ego asks the helpers whose worth is above the threshold,
-    those worth the most first, up to its largest number of helpers.
+    those worth the most first, up to the number that its operating point (the settings of a
+    decision) allows.
     """
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Which of `in_time`, `outlook` and `lot` it uses; others are None in `ScheduleInputs`."""
+        """Return which of `in_time`, `outlook` and `lot` it uses.
+
+        Those that it does not name may be None in `ScheduleInputs`.
+        """
 
     @property
     def threshold(self) -> float | None:
-        """The worth above which the ego asks, unless the operating point sets another; or None.
+        """Return the worth above which the ego asks, in the schedule's own unit; or None.
 
-        None means that the schedule has no threshold, and a point may set none.
+        An operating point, the settings that a decision depends on, may set another. None means
+        that the schedule has no threshold, and a point may set none.
         """
 
     def worth(self, known: ScheduleInputs) -> Floats:
         """Return what asking each helper is worth, in the schedule's own unit, `(..., H)`.
 
-        It is `(..., 1)` if it is the same for all. If helpers differ, it is NaN for one that may
-        not be asked.
+        `known` has what the ego knows in decisions `(...)` before it asks. The result is `(..., 1)`
+        if it is the same for all helpers. If helpers differ, it is NaN for one that may not be
+        asked.
         """
 
 
 @dataclass(frozen=True)
 class Formula:
-    """Make a schedule, a rule for whom the ego asks, of a function of what the ego knows."""
+    """Make a schedule, a rule for whom the ego asks, of a function of what the ego knows.
+
+    `formula` returns what asking each helper is worth, `(..., H)` or, if it is the same for all,
+    `(..., 1)`, in a unit of its own; the ego asks those above `threshold`. `needs` names the
+    optional fields of `ScheduleInputs` that it reads, and `by_presence` says whether what one
+    helper is worth depends on which others may be asked.
+    """
 
     # returns what asking each helper is worth, `(..., H)`, or `(..., 1)` if it is the same for all
     formula: Callable[[ScheduleInputs], Floats]
@@ -109,17 +127,27 @@ class Formula:
     by_presence: bool = False
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Return the formula's worth of asking each helper, `(..., H)` or `(..., 1)`."""
+        """Return the formula's worth of asking each helper, `(..., H)`, or `(..., 1)` for all.
+
+        `known` has what the ego knows in decisions `(...)` before it asks.
+        """
         return self.formula(known)
 
 
 def never(inputs: ScheduleInputs) -> Floats:
-    """Return a worth of minus infinity, `(..., 1)`, so that nobody is ever asked."""
+    """Return a worth of minus infinity, `(..., 1)`, so that nobody is ever asked.
+
+    It is the formula of schedule `never`, for decisions `(...)`.
+    """
     return np.full((*inputs.entropy_nats.shape, 1), -np.inf)
 
 
 def entropy(inputs: ScheduleInputs) -> Floats:
-    """Return the entropy of the ego's intent in nats, `(..., 1)`, as the worth (paper Eq. 3)."""
+    """Return how unsure the ego is as the worth of asking anybody, `(..., 1)` (paper Eq. 3).
+
+    It is the entropy of its intent, in nats, in decisions `(...)`: the formula of schedule
+    `entropy`.
+    """
     return inputs.entropy_nats[..., None]
 
 
@@ -133,8 +161,15 @@ def chosen(worth: Floats, threshold: float, may_ask: Bools, range_m: Floats, mos
     """Return a mask of the helpers that are asked, `(..., H)`: no more than `most` of them.
 
     Asking each is worth more than `threshold`. Those worth the most come first, and of equals the
-    nearest. `worth` is `(..., H)` or `(..., 1)`; `may_ask`, which of H helpers may be asked, and
-    `range_m`, their distance to the ego in m, are `(..., H)`.
+    nearest.
+
+    Args:
+        worth: what a schedule says that asking each of H helpers is worth, `(..., H)`, or
+            `(..., 1)` for all.
+        threshold: in the same unit.
+        may_ask: which helpers may be asked, `(..., H)`.
+        range_m: each helper's distance to the ego, m, `(..., H)`.
+        most: the largest number of helpers asked in one decision.
     """
     is_asked = may_ask & (worth > threshold)
     if most >= is_asked.shape[-1]:

@@ -34,8 +34,11 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 class Trust:
     """Learn during an episode which helpers to trust, and fuse only the intents of those.
 
-    A helper's claimed place and speed, and its intents, count for or against it (the module's
-    description has the checks).
+    A consensus rule. A helper's claimed place and speed, and its intents, count for or against it
+    (the module's description has the checks). `faith` is what counts for and against one before its
+    first message, a full contradiction counts `contradiction` times a full agreement, and the share
+    `kept` of all that counts is left at the next decision. The other numbers bound what may be
+    true, in m and m/s.
 
     All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`).
     """
@@ -58,17 +61,20 @@ class Trust:
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
         """Return the rule's memory before the first decision of each episode, `(*batch, K)`.
 
-        For each of the `helpers` it has, one helper after another: evidence for and against it, its
-        last intent over A `actions`, and its last claim, 2 + A + `CLAIM` numbers.
+        `batch` is the shape of the episodes. For each of the `helpers` helpers it has, one after
+        another: evidence for and against it, its last intent over A `actions`, and its last claim,
+        2 + A + `CLAIM` numbers.
         """
         state = np.full((*batch, helpers, 2 + actions + CLAIM), np.nan)
         state[..., :2] = self.faith
         return state.reshape(*batch, -1)
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the linear pool of the helpers that are trusted after this step's checks.
+        """Return the linear pool of the helpers that are trusted after this decision's checks.
 
-        `Fused.trust` has each helper's reputation, from 0 to 1, with the present message counted.
+        `messages` are of one decision of each episode, and `state`, `(..., K)`, is the memory that
+        `start` or the episode's last decision returned. `Fused.trust` has each helper's reputation,
+        from 0 to 1, with the present message counted.
         """
         p, heard = messages.intents, messages.heard
         remembered = state.reshape(*heard.shape, -1)
