@@ -19,7 +19,10 @@ MARKS = f"{ASKED}{REWRITTEN}/+"  # in keys, beside who answered
 class Answered:
     """Hold how many answers a run has, how many could not be read, and what the ego answered.
 
-    A role is who answers, and to what: `ego`, `helper` or `merge` (a fusion call).
+    `count` has numbers by role, who answers and to what: `ego`, `helper` or `merge` (a fusion call:
+    the ego asked again, with the messages it heard). `failed` has by role the numbers of those that
+    could not be read, by parse status. `ego` has the n readable answers of the ego, probabilities
+    of A actions, (n, A).
     """
 
     count: Counter[str]  # number of answers by role
@@ -32,10 +35,11 @@ class Answered:
 class Answers:
     """Hold the answers of a run in the order of their file, decoded anew at each access.
 
-    So they take the memory of the file only, a tenth of what decoded answers would.
+    An answer is what a model said about one scene (decision point) for one vehicle. Undecoded, they
+    take the memory of the file only, a tenth of what decoded answers would.
 
     Attributes:
-        by_scene: the answers of each scene (decision point), by its id.
+        by_scene: the answers about each scene, by the scene's id.
     """
 
     def __init__(self, lines: bytes, actions: int) -> None:

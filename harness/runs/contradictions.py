@@ -46,7 +46,7 @@ def refuse(run: Run | SuiteRun) -> None:
     """Raise UserError if a table of a run or suite contradicts the tables it is computed from.
 
     Such as a mean in `summary.csv` that is not that of `episodes.csv`. A suite is checked with all
-    of its runs.
+    of its runs. A suite is a run on each of several scenarios.
     """
     if isinstance(run, SuiteRun):
         for member in run.runs.values():
@@ -74,8 +74,9 @@ def sound(folder: Path) -> Run:
 def contradictions(run: Run) -> Iterator[str]:
     """Yield a sentence for each statement of a run's tables that its other tables contradict.
 
-    Scores are computed again by the rules of the version that the run states (`versions.FIGURES`);
-    a run of an earlier version may lack figures that only later ones have.
+    Such a statement is a score in `summary.csv` that is not what `episodes.csv` gives. Scores are
+    computed again by the rules of the version that the run states (`versions.FIGURES`); a run of an
+    earlier version may lack figures that only later ones have.
     """
     version = run.manifest.versions.get("figures", "1")
     if version not in map(str, range(1, FIGURES + 1)):
@@ -145,9 +146,10 @@ def _scores(run: Run) -> Iterator[Score]:
 
 
 def current(run: Run) -> bool:
-    """Return whether a run's figures are by this harness's version of the rules for them.
+    """Return whether a run's figures were computed by the rules that this harness has for them.
 
-    The run's manifest states the version; one that states none is of version 1.
+    The run's manifest states the version of the rules, a number; one that states none is of version
+    1, the oldest.
     """
     return run.manifest.versions.get("figures", "1") == str(FIGURES)
 
@@ -185,8 +187,10 @@ def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
 
 
 def unchecked(run: Run) -> Iterator[str]:
-    """Yield a sentence on a run's figures that nothing here computes again, such as those of a
-    package's metric, and one on figures that a run by older rules is allowed to lack.
+    """Yield a sentence on a run's figures that nothing here computes again, if it has any.
+
+    Such are those of a package's metric. Another is on figures that a run by rules of an earlier
+    version is allowed to lack.
     """
     figures = {score.key: score for score in run.scores}
     here = {} if current(run) else {score.key: score for score in _scores(run)}
@@ -286,8 +290,8 @@ def differing(
 ) -> Iterator[tuple[str, int]]:
     """Yield each column in which two tables of episodes differ, and in how many rows it does.
 
-    Both tables have the same episodes in the same order. Numbers may differ by rounding, as `close`
-    allows.
+    Both tables have the same episodes in the same order: what a file states, and what is computed.
+    Numbers may differ by the rounding of files.
     """
     for name in Episode.__struct_fields__:
         pairs = zip(stated_rows, computed_rows, strict=True)
@@ -314,7 +318,10 @@ def _ends(run: Run) -> Sequence[bool | None]:
 
 
 def close(a: object, b: object) -> bool:
-    """Return whether two values are equal, numbers up to the rounding of files."""
+    """Return whether two cells of a table are equal, floats up to the rounding of files (`CLOSE`).
+
+    Used to compare what a file states with what is computed again.
+    """
     if isinstance(a, float) and isinstance(b, float):
         return math.isclose(a, b, rel_tol=CLOSE, abs_tol=CLOSE)
     return a == b

@@ -119,7 +119,8 @@ ROW_GROUP = 1 << 18  # least rows of a group in the file but the last: about 0.1
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
     """Return the Arrow schema of decisions: names and types of the columns, in order.
 
-    `helpers` is the greatest number of messages in a decision.
+    `actions` are the names of the meta-actions, for which some columns are repeated, and `helpers`
+    is the greatest number of messages in a decision, for which others are.
     """
     columns, added = [], added_columns()
     for name, kind in COLUMNS.items():
@@ -135,7 +136,7 @@ def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
 def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
     """Return values (n, A) of n decisions and A actions as columns (n,) by name.
 
-    There is a column for each action, such as `fused_IDLE`.
+    There is a column for each of `actions`, whose name begins with `name`, such as `fused_IDLE`.
     """
     return {f"{name}_{action}": values[:, place] for place, action in enumerate(actions)}
 
@@ -143,14 +144,18 @@ def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
 def by_message(name: str, values: Any) -> dict[str, Any]:
     """Return values (n, H) of n decisions and H messages as columns (n,) by name.
 
-    There is a column for each message, such as `delivered_1`.
+    There is a column for each message, counted from 1, whose name begins with `name`, such as
+    `delivered_1`.
     """
     return {f"{name}_{place + 1}": values[:, place] for place in range(values.shape[1])}
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Hold a name for each of n rows in a compact form."""
+    """Hold a name for each of n rows in a compact form.
+
+    `codes`, (n,), has each row's index in `names`, negative for a row without a name.
+    """
 
     codes: Ints  # index in `names` of each row's name, (n,); negative for a row without one
     names: Sequence[str]  # the names, each once
@@ -160,8 +165,11 @@ class Labels:
 class Decisions:
     """Hold n decisions of a run as a table, one row for each decision point, condition and seed.
 
-    A decision point is one situation in which a decision is due; a condition is the operating point
-    under which it is decided, and the seed is that of the channel's draws.
+    A decision point is one situation in which a decision is due. A condition is a named set of
+    settings of channel, asking and fusion under which it is decided, and the seed is that of the
+    channel's random numbers. `actions` are the names of the A meta-actions, in the order of every
+    distribution, and `helpers` is the greatest number of messages in a decision. Columns are read
+    by name as arrays (n,), or (n, A).
     """
 
     table: pa.Table  # its columns, (n,) each, are those of `schema`
@@ -175,8 +183,8 @@ class Decisions:
     def of(cls, columns: Mapping[str, Any], actions: Sequence[str], helpers: int) -> "Decisions":
         """Build n decisions from the values (n,) of each column: an array, or `Labels` of names.
 
-        Missing columns are unknown. `actions` are the names of the meta-actions, `helpers` the
-        greatest number of messages in a decision.
+        `columns` has them by name; missing ones are unknown. `actions` are the names of the
+        meta-actions, `helpers` the greatest number of messages in a decision.
         """
         n = len(columns["seed"])
         fields = schema(actions, helpers)
@@ -188,7 +196,10 @@ class Decisions:
 
     @classmethod
     def concat(cls, parts: Sequence["Decisions"]) -> "Decisions":
-        """Return the decisions of several tables, one after another; all have the same actions."""
+        """Return the decisions of several tables, one after another; all have the same actions.
+
+        Columns of messages are as many as in the table with the most.
+        """
         actions, helpers = parts[0].actions, max(part.helpers for part in parts)
         tables = pa.concat_tables([part.table for part in parts], promote_options="default")
         return cls(
@@ -205,11 +216,11 @@ class Decisions:
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
-        """Return a column of whole numbers, (n,)."""
+        """Return the column of this name, which holds whole numbers, of all n rows, (n,)."""
         return cast(Ints, _values(self.table[name], 0, np.int64))
 
     def flags(self, name: str) -> Bools:
-        """Return a mask (n,) of the rows in which a flag is known and true."""
+        """Return a mask (n,) of n rows: where the column of this name is known and true."""
         return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
@@ -233,7 +244,7 @@ class Decisions:
         return np.stack(columns, axis=-1) if columns else np.empty((len(self), 0))
 
     def codes(self, name: str, names: Sequence[str]) -> Ints:
-        """Return of each row of a column of labels the index of its label in `names`, (n,).
+        """Return of each of n rows of a column of labels the index of its label in `names`, (n,).
 
         It is -1 in a row without one. `name` is the column's. Raises ValueError for a label that is
         not in `names`.
@@ -247,7 +258,7 @@ class Decisions:
         return cast(Ints, lookup[_values(column.indices, len(labels), np.int32)])
 
     def labels(self, name: str) -> list[str | None]:
-        """Return a column of labels as a list of n texts; None where unknown."""
+        """Return the labels of the column of this name as a list of n texts; None where unknown."""
         return cast("list[str | None]", self.table[name].to_pylist())
 
     @cached_property
@@ -278,7 +289,10 @@ class Decisions:
         return Decisions(self.table.select(names), self.actions, self.helpers)
 
     def row(self, index: int) -> Mapping[str, Any]:
-        """Return one row as values by column, None where unknown; reading in order is fastest."""
+        """Return the row of this index, from 0, as values by column, None where unknown.
+
+        Reading rows in order is fastest.
+        """
         chunk, offset = divmod(index, ROWS)
         if chunk not in self._rows:  # only the last is kept, since rows are read in order
             self._rows.clear()
@@ -330,7 +344,7 @@ class Decisions:
         )
 
     def write(self, path: Path) -> None:
-        """Write a Parquet file; equal rows give equal bytes."""
+        """Write the table to a Parquet file at `path`; equal rows give equal bytes."""
         with replacing(path) as part:
             self._write(part)
 
@@ -398,9 +412,9 @@ class DecisionFiles:
     actions: tuple[str, ...]  # the meta-actions of all of them
 
     def write(self, path: Path) -> None:
-        """Write the decisions of all files to one Parquet file.
+        """Write the decisions of all files to one Parquet file at `path`, one after another.
 
-        Raises OSError or ValueError if a file is broken, as `Decisions.read`.
+        Raises OSError or ValueError if a file is no table of decisions, or is broken.
         """
         columns = [set(pq.read_schema(arrow_file(file)).names) for file in self.files]
         helpers = max(_helpers(names) for names in columns)

@@ -25,11 +25,15 @@ REFERENCES = ("local-view", "cruise", "uniform")  # that ask no model
 class Layout(Struct, frozen=True):
     """Hold the success of three reference policies in one layout: a line of `difficulty.csv`.
 
-    A layout is one start situation of a scenario; the references need no model.
+    A layout is one start situation of a scenario, that of the episode of this number; `danger` is
+    the side from which the hidden vehicle comes. The references need no model: two rules that
+    drive, `local-view` (by what the ego alone sees) and `cruise` (never brakes), with 1 for success
+    and else 0, and actions drawn at random, `uniform`, with a probability.
     """
 
     episode: int  # the episode's number
-    danger: str  # where the hidden danger comes from; `none` without one
+    # where the vehicle comes from that would meet the ego: a sector; `none` without one
+    danger: str
     local_view: float  # 1 if the driver `local-view` succeeds, else 0
     cruise: float  # the same of the driver `cruise`
     uniform: float  # with what probability it succeeds if all actions are equally likely
@@ -44,7 +48,9 @@ class Pool:
     """Hold all N layouts that a run's E layouts are a random sample of, with their difficulty.
 
     A layout is one start situation of a scenario, and has one episode. How hard it is, is known
-    from K reference policies that need no model.
+    from the success of K reference policies that need no model, `known` (N, K). `dangerous`, (N,),
+    says whether it has a danger, and `answered`, (E,), has the index among the N of each of the
+    run's. A danger is a vehicle that would meet an ego which keeps its speed.
     """
 
     known: Floats  # success of each reference in each layout, 0 to 1, (N, K)
@@ -53,7 +59,11 @@ class Pool:
 
     @classmethod
     def of(cls, layouts: Sequence[Layout], episodes: Iterable[int]) -> "Pool":
-        """Return the pool of all layouts of a dataset; `episodes` are the numbers of the run's."""
+        """Return the pool of all layouts of a dataset, by one record of each, `layouts`.
+
+        `episodes` are the numbers of the episodes that the run evaluated, each that of one layout.
+        A layout is one start situation of a scenario.
+        """
         places = {layout.episode: place for place, layout in enumerate(layouts)}
         return cls(
             np.array([(each.local_view, each.cruise, each.uniform) for each in layouts]),
@@ -68,7 +78,8 @@ class Pool:
 
         `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes,
         and are paired by episode. `success` says how episodes are averaged, `level` is the
-        confidence of the interval. None if it cannot be corrected, as with too few episodes.
+        confidence of the interval. None if it cannot be corrected, as with too few episodes. A
+        layout is one start situation of a scenario.
         """
 
         def plain(part: Bools) -> Estimate:
@@ -81,7 +92,7 @@ class Pool:
 
         `values` are the success of its episodes, (S, E), by S channel seeds and E episodes;
         `success` says how episodes are averaged. None if it cannot be corrected, as with too few
-        episodes.
+        episodes. A layout is one start situation of a scenario.
         """
 
         def plain(part: Bools) -> Estimate:
@@ -120,7 +131,13 @@ def adjusted_scores(
 ) -> Iterator[Score]:
     """Yield the scores of success and of its gains that are adjusted for layout difficulty.
 
-    `episodes` are in the order of the grid: by condition, seed and episode.
+    A layout is one start situation of a scenario. A gain is a condition's success less that of the
+    condition without a radio. A condition is a named set of settings of channel, asking and fusion.
+
+    Args:
+        grid: the conditions, seeds and episodes of the run.
+        episodes: the run's, in the order of the grid: by condition, seed and episode.
+        layouts: all layouts that the run's are a sample of, with the success of reference drivers.
     """
     success, values = by_condition(grid, episodes)
     pool = Pool.of(layouts, grid.episodes)

@@ -20,17 +20,19 @@ Channel = tuple[Mapping[str, Any], Mapping[str, Sequence[float]]]  # its paramet
 def doubted(
     conditions: Conditions, channels: Mapping[str, Channel], off_lag: Mapping[str, float | None]
 ) -> set[str]:
-    """Return the names of the conditions with a warning: controls, another lag, unvalidated radios.
+    """Return the names of the conditions that a report warns about.
 
-    A condition is an operating point of a run; `conditions` has their settings by name. A control
-    replaces what helpers say. The lag is the time from a decision to its action, for which the
-    dataset knows what follows.
+    A condition is a named set of settings of channel, asking and fusion that a run scores. A
+    warning is due if it is a control, which replaces what helpers say; if half of its decisions or
+    more act at another time than the dataset knows the outcome for; or if its radio is outside of
+    what its channel model was validated for.
 
     Args:
-        conditions: the settings of each condition.
-        channels: by name of a channel profile its parameters, and for some the least and greatest
-            value for which its model was validated.
-        off_lag: by condition the share of decisions that act in another frame than after the lag.
+        conditions: the settings of each condition, values by name, its `name` among them.
+        channels: by name of a channel profile (a radio) its parameters, and for some of these the
+            least and greatest value for which its model was validated.
+        off_lag: by condition the share of decisions, 0 to 1, that act in another frame than after
+            the dataset's lag (the time from a decision to its action); None where unknown.
     """
     names = {name for control in control_settings().values() for name in under(conditions, control)}
     return names | {*lagging(off_lag)} | {name for name, _ in beyond(conditions, channels)}
@@ -39,7 +41,8 @@ def doubted(
 def under(conditions: Conditions, control: str) -> list[str]:
     """Return the names of the conditions with this control, such as `messages=blind`.
 
-    A control replaces what helpers say, to show whether a gain comes from cooperation.
+    `conditions` has the settings of each, values by name. A control replaces what helpers say, to
+    show whether a gain comes from cooperation.
     """
     setting, _, value = control.partition("=")
     return [c["name"] for c in conditions if c.get(setting) == value]
@@ -48,8 +51,9 @@ def under(conditions: Conditions, control: str) -> list[str]:
 def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
     """Return the names of the conditions half or more of whose decisions miss the dataset's lag.
 
-    The lag is the time from a decision to its action, for which the dataset knows what follows.
-    `off_lag` is by condition the share of decisions that would act in another frame.
+    The lag is the time from a decision to its action for which the dataset knows the outcome.
+    `off_lag` has by condition the share of decisions, 0 to 1, that would act in another frame; None
+    where unknown. A condition is a named set of settings of channel, asking and fusion.
     """
     return [name for name, share in off_lag.items() if (share or 0.0) >= MOST_OFF_LAG]
 
@@ -57,8 +61,9 @@ def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
 def beyond(conditions: Conditions, channels: Mapping[str, Channel]) -> Iterator[tuple[str, str]]:
     """Yield the name of each condition whose radio its channel model is not validated for, and why.
 
-    `conditions` has the settings of each; `channels` by name of a channel profile its parameters,
-    and for some the least and greatest value for which the model was validated.
+    `conditions` has the settings of each, values by name; `channels` by name of a channel profile
+    (a radio) its parameters, and for some of these the least and greatest value for which the model
+    was validated. Why is a sentence.
     """
     for condition in conditions:
         if channel := channels.get(condition.get("profile") or ""):

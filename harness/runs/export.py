@@ -24,9 +24,10 @@ AT_ONCE = 10_000  # decisions in a piece
 
 
 def decisions_csv(decisions: Decisions, path: Path) -> Path:
-    """Write decisions as CSV with the columns of `decisions.parquet`; unknown values are empty.
+    """Write decisions as CSV with the columns of `decisions.parquet`, and return the file's path.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe before it.
+    Unknown values are empty. A text that a spreadsheet would take for a formula gets an apostrophe
+    before it.
     """
     plain = pa.schema(
         (column.name, pa.string() if pa.types.is_dictionary(column.type) else column.type)
@@ -101,7 +102,10 @@ def _unanswered(run: Run) -> dict[tuple[str, int], str]:
 
 
 def junit_of_none(run: Path, error: str) -> str:
-    """Return JUnit's XML with one error for a run that stopped because its model did not answer."""
+    """Return JUnit's XML with one error for a run that stopped because its model did not answer.
+
+    `run` is the run's folder, which names the test, and `error` the error's message.
+    """
     name = run.absolute().name
     return test_suite(f"harness {name}", [Case(name, "the model answers", error=error)])
 
@@ -109,8 +113,9 @@ def junit_of_none(run: Path, error: str) -> str:
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:
     """Write answers as CSV: the fields of `answers.jsonl`, and each action's probability.
 
-    Paths in errors are reduced to file names. A text that a spreadsheet would take for a formula
-    gets an apostrophe before it.
+    `actions` are the names of the meta-actions, in the order of the probabilities. Paths in errors
+    are reduced to file names. A text that a spreadsheet would take for a formula gets an apostrophe
+    before it.
     """
     fields = (*Answer.__struct_fields__, *TURNS)
     plain = [name for name in fields if name not in ("intent", "message", "first")]

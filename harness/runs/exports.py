@@ -18,6 +18,8 @@ from harness.runs.folder import Run
 class Option:
     """Describe a further command-line option of an export format.
 
+    `kind` is the type of what is typed: `bool` for a switch, or `float`. `refusal` takes the value
+    and the command-line option of the format, and returns why the value is refused, or None.
     Formats that share an option hold the same object.
     """
 
@@ -30,7 +32,11 @@ class Option:
 
 @runtime_checkable
 class Export(Protocol):
-    """Describe an export format that an extension adds: a run as a file of another program."""
+    """Describe an export format that an extension adds: a run as a file of another program.
+
+    `help` is the help of its command-line option, `doing` what is said while it writes, and `needs`
+    the names of the optional modules without which it cannot.
+    """
 
     help: str  # the help of its command-line option
     doing: str  # what is said while it writes, such as `writing chats`

@@ -61,7 +61,7 @@ class Run:
 
     @property
     def world(self) -> World:
-        """Return the run's kind of world: `frozen` or `closed-loop`."""
+        """Return the kind of world: `frozen` (recorded scenes) or `closed-loop` (a simulator)."""
         return "frozen" if isinstance(self.manifest.world, FrozenScenes) else "closed-loop"
 
     @property
@@ -88,7 +88,10 @@ class Run:
 
     @property
     def episodes(self) -> tuple[Episode, ...]:
-        """Return the rows of `episodes.csv`: one for each condition, seed and episode."""
+        """Return the rows of `episodes.csv`: one for each condition, seed and episode.
+
+        A condition is a named set of settings of channel, asking and fusion.
+        """
         return self._placed[1]
 
     @property
@@ -150,7 +153,10 @@ class Run:
         return part
 
     def agent(self, answer: Answer) -> dict[str, Any]:
-        """Return the agent that gave an answer, as `Manifest.agent`: model, prompt and so on."""
+        """Return who gave an answer: the model, prompt and way of answering, as plain values.
+
+        The keys are those of an entry of `Manifest.helpers`, such as `model` and `prompt`.
+        """
         place = self._viewer_place(answer)
         if place not in self._agents:
             self._agents[place] = self.manifest.agent(place)
@@ -176,7 +182,12 @@ class Run:
         return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"
 
     def seconds(self, answer: Answer) -> float:
-        """Return the seconds that an answer takes by the run's latency (`Latency.answer_s`)."""
+        """Return the seconds that an answer takes by the run's latency, a repair turn included.
+
+        These are the times that the run states for a model's answers, or what its timer computes
+        from the answer's tokens; NaN if answers are timed and the engine failed. A repair turn is a
+        second question after an answer that cannot be parsed.
+        """
         return self.manifest.latency.answer_s(self._viewer_place(answer), answer)
 
     def _viewer_place(self, answer: Answer) -> int:
@@ -213,10 +224,11 @@ class Run:
         return layouts
 
     def score(self, condition: str, metric: str) -> Score | None:
-        """Return a metric's score in one condition; None if it has no value there.
+        """Return a metric's score in one condition, both by name; None if it has no value there.
 
-        Of scores with several kinds of interval it is the one that holds however often the run was
-        looked at while it went on, else the one over episodes.
+        A score has several kinds of interval: preferred is the one that holds however often the run
+        was looked at while it went on, else the one over episodes. A condition is a named set of
+        settings of channel, asking and fusion.
         """
         of_metric = [s for s in self.scores if (s.condition, s.metric) == (condition, metric)]
         candidates = [score for score in of_metric if score.value is not None]
@@ -260,7 +272,7 @@ class Run:
         return decisions
 
     def read_file(self, name: str, reader: Callable[[Path], T]) -> T:
-        """Return what `reader` makes of a file in the run's folder.
+        """Return what `reader` makes of the file `name` in the run's folder, given the file's path.
 
         Raises UserError if the file is missing or broken.
         """
@@ -318,7 +330,7 @@ def most_rows(episodes: Sequence[Episode]) -> int:
 
 
 def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
-    """Return the rows of a CSV file as records of type `kind`.
+    """Return the rows of a CSV file as records of type `kind`, whose fields are the columns.
 
     Raises ValueError for a column that is missing or has gaps.
     """
@@ -365,7 +377,7 @@ def scores_of(file: Path) -> tuple[Score, ...]:
 
 
 def whole(file: Path, reader: Callable[[Path], T]) -> T:
-    """Return what `reader` makes of a file. Raises UserError if the file is broken."""
+    """Return what `reader` makes of a file's path. Raises UserError if the file is broken."""
     try:
         with uncollected():
             return reader(file)

@@ -47,7 +47,7 @@ TYPED = ("model", "world.dataset", "world.scenario")
 
 
 class Added(NamedTuple):
-    """Describe a setting or column that was added to a format.
+    """Describe a setting or column that a later version added to the files of runs.
 
     `since` is the day that added it, `absent` its value in an older run, and `why` says why.
     """
@@ -198,10 +198,11 @@ SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way"
 def upgraded(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of an older `run.json`, or of a run's first record, in today's form.
 
-    Values of a wrong type are left as they are, for the reader to refuse. 2026-11-27: a driven
-    scenario is named without the settings that were typed after its name, which are among its
-    parameters. 2026-11-29: `kept` has the table `calibrations`, which stood beside it; what became
-    settings of extensions stands where it stood in files (`as_file`), and in tables of theirs here.
+    `record` has it as plain values. Missing keys get what the run did without them, and renamed
+    ones their new name. Values of a wrong type are left as they are, for the reader to refuse. A
+    driven scenario is named without the settings typed after its name, which are among its
+    parameters; `kept` has the table `calibrations`, which stood beside it; what became settings of
+    extensions, which stands among others in files, gets tables of its own.
     """
     if isinstance(calibrations := record.get("calibrations"), dict) and "kept" not in record:
         record = {**record, "kept": {"calibrations": calibrations} if calibrations else {}}
@@ -233,13 +234,18 @@ def upgraded(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def gathered(settings: Mapping[str, Any], of_run: bool = False) -> dict[str, Any]:
-    """Return a table of settings as this version holds it: those of extensions in a table
-    `extensions`.
+    """Return a table of settings, values by name, as this version of the program holds it.
 
-    In files some of them stand among the settings of the core, or of one of its tables; of these,
-    such as nobody set are left out, and of all of them lists without texts. Raises UserError for
-    one of an extension that is not installed. Of a run's settings, `of_run`, those of its scenes
-    may be: the run states these itself.
+    In files some settings of extensions stand among those of the core, or in one of its tables.
+    Here all of them stand in a table `extensions`, without those at their default and without empty
+    lists.
+
+    Args:
+        settings: the table as a file has it.
+        of_run: whether a finished run states it; then settings of its scenes whose extension is not
+            installed are left out, since the run states its scenes itself.
+
+    Raises UserError for a setting of an extension that is not installed.
     """
     beside, entries = extensions.beside(), {}
     tables = {name: value for name, value in settings.items() if isinstance(value, Mapping)}
@@ -302,10 +308,11 @@ def _without_gone(
 
 
 def as_file(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of run.json, of the manifest's plain values by name.
+    """Return the content of `run.json` as plain values, given a manifest's values by name.
 
-    Settings of extensions stand behind those of the core, where their extension says so; what they
-    opened stands beside the table of settings, and not in a table `beside`.
+    A manifest holds all settings of extensions in tables of their own; in the file some stand
+    behind settings of the core, where their extension says so, and what they opened stands at the
+    top.
     """
     table: dict[str, Any] = {}
     for name, value in manifest.items():
@@ -316,9 +323,10 @@ def as_file(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def settings_as_file(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table of settings in the form of run.json, as `as_file` writes it.
+    """Return a table of settings, values by name, in the form that `run.json` has it.
 
-    There, settings of extensions stand behind those of the core, where their extension says so.
+    There, some settings of extensions stand behind those of the core, where their extension says
+    so; the others stay in the table `extensions`. It undoes `gathered`.
     """
     of_extensions, beside = settings[EXTENSIONS], extensions.beside()
     table = _in_order(settings, of_extensions, "")
@@ -485,15 +493,19 @@ def _flat(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def versions(stated_versions: Mapping[str, str]) -> dict[str, str]:
-    """Return the versions that a run states, with those added that an older run lacks."""
+    """Return the versions of programs and rules, by name, that a run states, with missing ones.
+
+    A run of an earlier version of this harness states fewer; it gets those that there were then.
+    """
     return _with(VERSIONS, stated_versions)
 
 
 def identity(stated_identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what identifies a run's models, with the version of their answers.
+    """Return what identifies a run's models, as plain values by name, in today's form.
 
-    2026-11-26: `answers` replaced what engines without weights said of their version. All older
-    answers are of version 1.
+    `stated_identity` is that of a `run.json`, perhaps of an older version. `answers` is the version
+    of a rule's answers, 1, the oldest, where it states none. What only older versions stated is
+    left out.
     """
     kept = {
         name: value
@@ -532,7 +544,7 @@ def _condition(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def checked(version: object, file: object) -> None:
-    """Raise UserError if the format version that a `run.json` states is not `FORMAT`.
+    """Raise UserError if the format `version` that a `run.json` states is not `FORMAT`.
 
     `file` is its path, for the error.
     """

@@ -18,7 +18,10 @@ IN_WORDS = {SUCCESS: "success", BALANCED: "balanced success"}
 
 
 class Scored(Protocol):
-    """Describe what has scores: a run or a suite's run."""
+    """Describe what has scores, one for each metric and condition: a run, or a suite of several.
+
+    A condition is a named set of settings of channel, asking and fusion.
+    """
 
     @property
     def scores(self) -> "Sequence[Score]": ...
@@ -28,7 +31,8 @@ def headline_metric(*names: Container[str]) -> str:
     """Return the name of the metric by which runs are read, the headline metric.
 
     `names` has for each run the names of its metrics. It is balanced success, the mean of success
-    with a danger and without, if every run has that; otherwise plain success.
+    with a danger and without, if every run has that; otherwise plain success. A danger is a vehicle
+    that would meet an ego which keeps its speed.
     """
     return BALANCED if all(BALANCED in each for each in names) else SUCCESS
 
@@ -37,7 +41,8 @@ def headline_of(*runs: Scored) -> str:
     """Return the name of the metric by which runs are read, the headline metric.
 
     It is balanced success, the mean of success with a danger and without, if all of them have a
-    value of it; otherwise plain success.
+    value of it; otherwise plain success. A danger is a vehicle that would meet an ego which keeps
+    its speed.
     """
     names_by_run = []
     for run in runs:
@@ -48,13 +53,14 @@ def headline_of(*runs: Scored) -> str:
 def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:
     """Return the name of the condition with the highest success; empty if there is none.
 
-    A condition is an operating point of a run. Of equals it is the first. Conditions with a warning
-    do not count if another one with a radio is left.
+    A condition is a named set of settings of channel, asking and fusion that a run scores. Of
+    equals it is the first. Conditions with a warning do not count if another one with a radio is
+    left.
 
     Args:
         success: success from 0 to 1 by condition.
         radios: names of the conditions with a radio.
-        doubted: names of the conditions with a warning.
+        doubted: names of the conditions with a warning, such as that their radio is unvalidated.
     """
     trusted = [name for name in success if name not in doubted]
     counted = trusted if any(name in radios for name in trusted) else success

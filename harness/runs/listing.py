@@ -31,12 +31,20 @@ _BROKEN = (*BROKEN, AttributeError, csv.Error)  # in what no type was given to
 
 @dataclass(frozen=True)
 class Listed:
-    """Describe one run or study in a list; None where a value is unknown or a study has none."""
+    """Describe one run or study (several runs) in a list; None where a value is unknown.
+
+    `condition` is the condition (named set of settings of channel, asking and fusion) with the
+    highest success that no warning is about, `success` that success, 0 to 1, by the metric
+    `metric`, and `low` and `high` the ends of its 95 % interval. `unread` is the share of the ego's
+    answers that could not be parsed. `why` says how an unfinished run goes on, or what is wrong
+    with a broken one. `date` is when it began, or a study was last written.
+    """
 
     name: str  # its folder, relative to the folder that is listed
     # `eval`, `drive`, `suite`, a word of `STUDIES`, or `run` if it is broken and does not say
     kind: str
-    state: Literal["finished", "unfinished", "broken"]  # `finished`, `unfinished` or `broken`
+    # what it is; a run is broken if a file that says so much cannot be read
+    state: Literal["finished", "unfinished", "broken"]
     # when it began. For a suite, when the last of its runs began; for a study or a broken run, when
     # it was last written.
     date: datetime

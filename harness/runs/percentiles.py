@@ -24,11 +24,14 @@ Decided = tuple[Ints, Floats]  # the episode's index and the value of each decis
 def differences(
     a: Sequence[Decided], b: Sequence[Decided], episodes: int
 ) -> Iterator[tuple[int, float, float, Estimate]]:
-    """Yield for each of `PERCENTILES`: percent, value in A, value in B, and B - A with interval.
+    """Yield for each of `PERCENTILES` the percent, its value in run A and in B, and the difference.
 
-    `a` and `b` have of each run, for each seed of the channel's draws, the index of each decision's
-    episode and its value; a percentile is the mean over seeds. In a seed, an episode without values
-    in either run is left out. `episodes` is the number of all episodes.
+    The difference is B - A with its interval.
+
+    `a` and `b` have of each run, for each seed of the channel's random numbers, the index of each
+    of n decisions' episodes and its value, (n,) each; a percentile is the mean over seeds. In a
+    seed, an episode without values in either run is left out. `episodes` is the number of all
+    episodes.
     """
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
     common = [_common(of_a, of_b) for of_a, of_b in zip(a, b, strict=True)]

@@ -15,12 +15,13 @@ KIND = "episodes"  # of its intervals
 
 
 def mean_difference(pairs: Pairs) -> Estimate:
-    """Return the mean over families of success a - b, by the rules of figures' version 1.
+    """Return the mean over families of success a - b, by the rules of the oldest runs.
 
-    A family is the scenes of one scenario. `pairs` has for each its rule of how success is averaged
+    They are version 1 of the rules for figures; `harness.core.versions.FIGURES` has today's. A
+    family is the scenes of one scenario. `pairs` has for each its rule of how success is averaged
     and the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes. The
     interval of each half of a family, with a danger or without, is computed apart, and these are
-    combined. `harness.core.versions.FIGURES` has today's version.
+    combined.
     """
     families = []
     for success, a, b in pairs:
@@ -30,10 +31,11 @@ def mean_difference(pairs: Pairs) -> Estimate:
 
 
 def gain(run: Run, score: Score) -> Score:
-    """Return a run's gain over the condition without a radio, by the rules of figures' version 1.
+    """Return a run's gain over the condition without a radio, by the rules of the oldest runs.
 
-    `score` says of which condition, and of which metric. `harness.core.versions.FIGURES` has
-    today's version.
+    They are version 1 of the rules for figures; `harness.core.versions.FIGURES` has today's.
+    `score` is a score of the run's whose condition and metric are taken; its value is not. A
+    condition is a named set of settings of channel, asking and fusion.
     """
     success, values = by_condition(run.grid, run.episodes)
     counted = success if score.metric == GAINS[BALANCED] else success.plain

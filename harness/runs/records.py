@@ -29,17 +29,26 @@ Role = Annotated[str, Meta(pattern=r"^[a-z-]{1,40}\Z", description="a word")]  #
 
 
 def roles() -> tuple[Role, ...]:
-    """Return the roles of answers: ego, helper, merge (fusion call) and extensions' questions."""
+    """Return the roles of answers: ego, helper, merge (fusion call) and extensions' questions.
+
+    A fusion call asks the ego's model again, with the messages that it heard.
+    """
     return (*PLAIN_ROLES, *filter(None, questions()))
 
 
 def is_helper(role: str) -> bool:
-    """Return whether answers of a role are helpers' messages, which the radio may lose."""
+    """Return whether answers of a role are helpers' messages, which the radio may lose.
+
+    Other roles are the ego's: `ego`, and `merge`, after it heard messages.
+    """
     return role not in ("ego", "merge")
 
 
 def role_word(role: str) -> str:
-    """Return a role's name for people: `fusion` for `merge`, any other as it is."""
+    """Return a role's name for people: `fusion` for `merge`, any other as it is.
+
+    A role is who answers, and to what; `merge` is the ego after it heard messages.
+    """
     return "fusion" if role == "merge" else role
 
 
@@ -52,33 +61,39 @@ TURNS = ("turns", "first_status", "first_raw")  # an answer's properties that ta
 
 
 def asked_key(viewer: str, question: str) -> str:
-    """Return the key of a viewer's answer within a scene; `question` is empty for the plain one."""
+    """Return the key of a vehicle's answer, unique among the answers about one scene.
+
+    `viewer` is the vehicle's id, and `question` the name of the question that an extension adds;
+    empty for the usual one, which asks what the ego should do.
+    """
     return f"{viewer}{ASKED}{question}" if question else viewer
 
 
 class FirstTurn(Struct, frozen=True, kw_only=True):
-    """Hold the failed answer before a repair turn, with its parse status, tokens and seconds.
+    """Hold a failed answer that was followed by a repair turn: a second question after the failure.
 
-    The numbers of tokens are None if the engine has no tokenizer, and `seconds` if it was not timed
-    alone.
+    `raw` is its text, `status` the outcome of parsing it, such as `bad_sum`, and `slow_s` the
+    declared seconds that it takes beyond its model's latency. The numbers of tokens are None if the
+    engine has no tokenizer, and `seconds` if it was not timed alone.
     """
 
-    raw: str
-    status: str
-    finish_reason: str
-    prompt_tokens: Whole | None
-    completion_tokens: Whole | None
-    seconds: Measured | None
-    slow_s: float
+    raw: str  # the completion as it came
+    status: str  # the outcome of parsing (`harness.parsing.status`)
+    finish_reason: str  # `stop`, `length`, `refusal` or `error`
+    prompt_tokens: Whole | None  # tokens in
+    completion_tokens: Whole | None  # tokens out
+    seconds: Measured | None  # time of this answer, if its request was alone in the engine
+    slow_s: float  # declared seconds that it takes beyond its card's latency
 
 
 class Answer(Struct, frozen=True, kw_only=True):
     """Hold one answer of a model, a line of `answers.jsonl`.
 
     `viewer` is the vehicle that answered in the decision point `scene`, `raw` its text, and
-    `intent` the probability of each action, None if the text could not be parsed. Tokens and
-    seconds include those of a repair turn, a second question after a failed answer; they are None
-    where unknown.
+    `intent` the probability of each action, None if the text could not be parsed; `status` and
+    `verdict` say how it could, `repairs` what was corrected before. Tokens and seconds include
+    those of a repair turn, a second question after the failed answer `first`; they are None where
+    unknown. `label_mass` and the like are of read-outs: answers by one letter per action.
     """
 
     scene: str  # id of the decision point
@@ -132,13 +147,16 @@ class Answer(Struct, frozen=True, kw_only=True):
 
     @property
     def turns(self) -> int:
-        """Return the number of questions that were asked for the answer: 2 with a repair turn."""
+        """Return the number of questions that were asked for the answer: 2 with a repair turn.
+
+        A repair turn is a second question after an answer that could not be parsed. Else it is 1.
+        """
         return 2 if self.first else 1
 
     def may_take_longer(self, tail_s: float) -> bool:
-        """Return whether its extra seconds `slow_s` are as its model card declares them.
+        """Return whether its extra seconds `slow_s` are as its model's file declares them.
 
-        Allowed are none, or in each turn the declared slow tail, `tail_s`.
+        Allowed are none, or in each turn the declared slow tail, `tail_s` in s.
         """
         return self.slow_s in [turns * tail_s for turns in range(self.turns + 1)]
 
@@ -151,31 +169,36 @@ class Answer(Struct, frozen=True, kw_only=True):
         return self.first.raw if self.first else None
 
     def cell(self, column: str) -> Any:
-        """Return a field or property as a table's cell; None where it is unset."""
+        """Return the field or property of this name as a table's cell; None where it is unset."""
         if (value := getattr(self, column)) is UNSET:
             return None
         return " ".join(value) if column == "faults" else value
 
     @property
     def id(self) -> str:
-        """Return the id of its request: the scene's id and the answer's key."""
+        """Return the id of its request: the scene's id, a slash, and the answer's key there."""
         return f"{self.scene}/{self.key}"
 
     @property
     def key(self) -> str:
-        """Return its name within its scene: viewer, senders of messages it heard, and question."""
+        """Return its name within its scene: vehicle, senders of messages it heard, and question."""
         return asked_key("+".join((self.viewer, *self.heard)), self.question)
 
     @property
     def question(self) -> str:
-        """Return the name of an extension's question that it answers; empty for the plain one."""
+        """Return the name of an extension's question that it answers; empty for the plain one.
+
+        The plain question is what the ego should do, as the vehicle sees it.
+        """
         return "" if self.role in PLAIN_ROLES else self.role
 
 
 class AnswerFacts(Struct, frozen=True):
     """Hold the fields of `Answer` that a run's figures are computed from, with the same meaning.
 
-    Without the texts, all answers of a run fit into memory.
+    Texts are left out, so that all answers of a run fit into memory: `scene` is the id of the
+    decision point, `role` who answered, `verdict` and `repairs` how its text was parsed, and times
+    are in s, None where unknown.
     """
 
     scene: str
@@ -198,16 +221,19 @@ class AnswerFacts(Struct, frozen=True):
 
     @property
     def turns(self) -> int:
-        """Return the number of questions that were asked for the answer: 2 with a repair turn."""
+        """Return the number of questions that were asked for the answer: 2 with a repair turn.
+
+        A repair turn is a second question after an answer that could not be parsed. Else it is 1.
+        """
         return 2 if self.first else 1
 
 
 class Times(Struct, frozen=True, omit_defaults=True):
     """Hold how long n answers took that were asked one at a time: percentiles, s.
 
-    The 95 % intervals of the median and of the 95th percentile are over episodes, None if these
-    cannot bound them. `first_token` and `token` are None if the engine does not report times of
-    tokens.
+    The 95 % intervals of the median and of the 95th percentile, `_ci_`, are over episodes, None if
+    these cannot bound them. `first_token` has the times to the first token, and `token` those of
+    each further one; None if the engine does not report them.
     """
 
     n: int  # number of answers
@@ -225,8 +251,10 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     """Hold the seconds of inference by role, fixed before a run, or token rates to compute them.
 
     They decide which messages arrive within the decision window. `source` says where they come
-    from. Where a timer times each answer by itself, the seconds are None and `speeds` has each
-    agent's speed, the ego's first.
+    from, and `sample` has the times of the answers that were measured, by role. `ego_s`, `helper_s`
+    and `fusion_s` are of one answer of the ego, a helper, and the ego after it heard messages.
+    Where a timer times each answer by itself, they are None and `speeds` has each agent's speed (a
+    record of the timer's own), the ego's first. An agent is a model with its prompt.
     """
 
     # one of `SOURCES`, or what times each answer by itself, of `timers.TIMERS`
@@ -255,24 +283,27 @@ class Latency(Struct, frozen=True, omit_defaults=True):
             structs.force_setattr(self, "speeds", speeds)
 
     def helper_times_s(self) -> tuple[Seconds, ...]:
-        """Return the seconds of each agent of helpers, which are assigned to helpers in turn.
+        """Return the seconds of an answer by each of the models that helpers have, in their order.
 
-        It is empty if each answer is timed.
+        The helpers take these models in turn. It is empty if each answer is timed by itself.
         """
         return self.helpers_s or (() if self.helper_s is None else (self.helper_s,))
 
     def speed(self, place: int) -> Any:
-        """Return the speed of the viewer with this index, where 0 is the ego.
+        """Return how fast a vehicle's model answers, an object of the run's timer (`Timer.speed`).
 
-        Helper models are assigned to helpers in turn.
+        `place` is the vehicle's index, where 0 is the ego, and the helpers follow from 1. The
+        models of helpers are assigned to them in turn.
         """
         ego, *helpers = self.speeds
         return helpers[(place - 1) % len(helpers)] if place and helpers else ego
 
     def answer_s(self, place: int, answer: Answer) -> float:
-        """Return the seconds of an answer of the viewer with this index, where 0 is the ego.
+        """Return the seconds of an answer by a vehicle, whose index is `place`.
 
-        A repair turn is included. NaN if the answer was timed and the engine failed.
+        Index 0 is the ego, and the helpers follow from 1. A repair turn is included. NaN if the
+        answer was timed and the engine failed. A repair turn is a second question after an answer
+        that cannot be parsed. The engine is what runs the model.
         """
         if self.speeds:
             return timer(self.source).answer_s(self.speed(place), answer)
@@ -284,8 +315,11 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 class Message(Struct, frozen=True, rename={"sender": "from"}):
     """Hold a helper's reply to the ego: whether and when it arrived, and its weight in fusion.
 
-    `arrival_ms` counts from the start of the decision, None if the reply was lost. `weight` is None
-    if a fusion call made the decision, `trust` (0 to 1) if the consensus rule rates none.
+    `sender` is the helper's id. `arrival_ms` counts from the start of the decision, None if the
+    reply was lost; `on_time` says whether that was within the decision window. `weight` is None if
+    a fusion call made the decision, `trust` (0 to 1) if the consensus rule rates none; `attacker`
+    says whether the sender attacks. A fusion call asks the ego's model again, with the messages
+    that it heard.
     """
 
     sender: str  # the helper
@@ -302,8 +336,10 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
 class Decision(Struct, frozen=True, kw_only=True):
     """Hold one decision, a row of `decisions.parquet`, for reports; None where unknown.
 
-    `fused` is the policy after fusion; `value` is whether success was still possible before the
-    action, `safe` whether it is after it.
+    It is about the decision point `scene`, under one condition (named set of settings of channel,
+    asking and fusion) and channel seed. `fused` is the policy after fusion: a probability for each
+    action; `value` is whether success was still possible before the action, `safe` whether it is
+    after it, and `regret` whether the action gave it away.
     """
 
     scene: str  # id of the decision point
@@ -336,9 +372,10 @@ class Decision(Struct, frozen=True, kw_only=True):
 class Episode(Struct, frozen=True, kw_only=True):
     """Hold the outcome of one layout under one condition and seed, a line of `episodes.csv`.
 
-    `outcome` says how it ended, `failure` how it failed, and `time_s` when that was decided. A
-    field is None where its kind of run does not know it; such as what only frozen or closed-loop
-    runs have.
+    A layout is one start situation, which `layout_seed` draws; a condition is a named set of
+    settings of channel, asking and fusion. `outcome` says how it ended, `failure` how it failed,
+    and `time_s` when that was decided. Times are in s, `latency_ms` apart. A field is None where
+    its kind of run does not know it; such as what only frozen or closed-loop runs have.
     """
 
     condition: str  # name of the operating point
@@ -394,9 +431,13 @@ class Episode(Struct, frozen=True, kw_only=True):
 
 
 class Variant(Struct, frozen=True):
-    """Name the model, prompt and answer mode of a run, as the first columns of its CSV files do."""
+    """Name the model, prompt and answer mode of a run, as the first columns of its CSV files do.
 
-    model: str  # name of the card
+    `prompt` is the prompt's version, and `answer` how the model answers, such as `json` (free text)
+    or `readout` (a letter). `helpers` has the same of models that answer for helpers.
+    """
+
+    model: str  # name of the model, which is that of the file that describes it (its card)
     prompt: str  # the prompt version
     answer: str  # the answer mode
     helpers: str = ""  # the same for the helpers' agents; empty if the ego's agent answers for them
@@ -406,16 +447,17 @@ class Variant(Struct, frozen=True):
 
     @property
     def mix(self) -> str:
-        """Return the helpers' models as the end of a name; empty if the ego's answers for them."""
+        """Return the helpers' models as the end of a name: ` + M`; empty if they have none."""
         return self.helpers and f" + {self.helpers}"
 
 
 class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
     """Hold the estimate of a metric in a condition, a line of `summary.csv`.
 
-    `low` and `high` are the ends of the 95 % interval, None if the data cannot bound it; `value` is
-    None if nothing could be averaged. `n` counts the units that `interval` names, such as episodes,
-    and `n_excluded` those without a value.
+    A condition is a named set of settings of channel, asking and fusion. `low` and `high` are the
+    ends of the 95 % interval, None if the data cannot bound it; `value` is None if nothing could be
+    averaged. `n` counts the units that `interval` names, such as episodes, and `n_excluded` those
+    without a value.
     """
 
     condition: str  # name of the operating point, or `all` for what is the same in all
@@ -431,13 +473,20 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 
     @classmethod
     def of(cls, condition: str, metric: str, e: Estimate, interval: str) -> "Score":
-        """Return an estimate as a line of `summary.csv`, with None for NaN."""
+        """Return an estimate `e` as a line of `summary.csv`, with None for NaN.
+
+        `condition` and `metric` are the names of what it is of; `interval` says what the units of
+        the estimate are, such as `episodes`.
+        """
         value, low, high = (None if x != x else float(x) for x in (e.value, e.low, e.high))
         return cls(condition, metric, value, low, high, e.n, e.n_excluded, interval)
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Return what is unique in a summary: condition, metric and kind of interval."""
+        """Return what is unique in a summary: condition, metric and kind of interval.
+
+        A condition is a named set of settings of channel, asking and fusion.
+        """
         return self.condition, self.metric, self.interval
 
     @property
@@ -451,19 +500,23 @@ class Score(Struct, frozen=True, rename={"low": "ci_low", "high": "ci_high"}):
 class FrozenScenes(
     Struct, frozen=True, tag="frozen", tag_field="kind", kw_only=True, omit_defaults=True
 ):
-    """Record the dataset of a frozen run and which of its episodes were evaluated.
+    """Record the dataset of a frozen run (on recorded scenes), and which of its episodes were used.
 
-    These are all of them without `limit` and `selection`.
+    `episodes` and `nodes` are the numbers of episodes and decision points that were used; these are
+    all of the dataset without `limit` and `selection`. `decision_lag_s` is the time from a decision
+    to its action that the dataset was made with, and `interim_looks` what a rule that may stop the
+    run states.
     """
 
-    name: str
-    sha256: str
-    nodes: int
-    episodes: int
-    limit: int | None
-    delay_allowance_s: float
-    decision_lag_s: float
-    path: str
+    name: str  # the dataset's name
+    sha256: str  # digest of the dataset
+    nodes: int  # number of decision points of the episodes that were used
+    episodes: int  # number of episodes that were used
+    limit: int | None  # only so many episodes, from the first; None for all
+    delay_allowance_s: float  # needless delay with which an episode still succeeds
+    decision_lag_s: float  # time from a decision to its action that the dataset was made with
+    path: str  # the dataset's folder
+    # values of `--only`, `--danger` and `--sample`, by name; empty for none
     selection: dict[str, int | str] = {}
     # what a rule that may stop the run states of its looks; None for a run of as many episodes as
     # were asked for
@@ -471,24 +524,26 @@ class FrozenScenes(
 
     @property
     def pinned(self) -> Any:
-        """Return what two runs on the same scenes share: the dataset's digest."""
+        """Return what is equal in two runs on the same scenes: the dataset's digest."""
         return self.sha256
 
 
 class ClosedLoop(
     Struct, frozen=True, tag="closed-loop", tag_field="kind", kw_only=True, omit_defaults=True
 ):
-    """Record the scenario of a closed-loop run; episode e has layout seed `first_seed` + e.
+    """Record the scenario of a closed-loop run (in a simulator), and which layouts were driven.
 
-    `episodes` is how many were driven. If they were sampled, `selection` has the number sampled
-    from, `of`, and the seed of the draw.
+    Episode e has layout seed `first_seed` + e, which fixes who stands where; `episodes` is how many
+    were driven. If they were sampled, `selection` has the number sampled from, `of`, and the seed
+    of the draw. `late_against` says in words whose time lateness is measured against. A layout is
+    one start situation of a scenario.
     """
 
-    scenario: dict[str, Any]
-    first_seed: int
-    episodes: int
-    late_against: str
-    selection: dict[str, int] = {}
+    scenario: dict[str, Any]  # its `name` and `parameters`, values by name
+    first_seed: int  # layout seed of episode 0
+    episodes: int  # number of episodes that were driven
+    late_against: str  # phrase on the driver against whose time lateness is measured
+    selection: dict[str, int] = {}  # how a sample was drawn; empty for all
     # what a rule that may stop the run states of its looks; None for a run of as many episodes as
     # were asked for
     interim_looks: Plain | None = field(default=None, name=formats.LOOKS)
@@ -500,9 +555,10 @@ class ClosedLoop(
 
     @property
     def pinned(self) -> Any:
-        """Return what two runs on the same scenes share: scenario, parameters and first seed.
+        """Return what is equal in two runs on the same scenes.
 
-        The settings of beacons are not part of it.
+        That is the scenario's name, its parameters without those of beacons, and the first layout
+        seed. A layout is one start situation of a scenario.
         """
         parameters = {k: v for k, v in self.scenario["parameters"].items() if k not in DIALS}
         return self.scenario["name"], parameters, self.first_seed
@@ -518,16 +574,18 @@ class ClosedLoop(
 
 
 class ChannelRecord(Struct, frozen=True, kw_only=True):
-    """Record a channel profile as it was when the run was made, with all its parameters.
+    """Record a channel profile (a radio) as it was when the run was made, with all its parameters.
 
-    `limits` has the least and greatest value for which the model was validated, by parameter.
+    `model` is the name of the channel model, `source` says where the parameters come from, and
+    `status` how well they are supported. `limits` has the least and greatest value for which the
+    model was validated, by parameter.
     """
 
-    model: str
-    description: str
-    source: str
-    status: str
-    parameters: dict[str, Any]
+    model: str  # name of the channel model
+    description: str  # one sentence for people
+    source: str  # where the parameters come from
+    status: str  # how well they are supported, such as measured or assumed
+    parameters: dict[str, Any]  # values by name, such as range in m
     limits: dict[str, tuple[float, float]] = {}
 
 
@@ -544,22 +602,26 @@ _SUMMED = ("amount", "asked", "uncounted", "read_tokens", "written_tokens")  # f
 
 
 class Cost(Struct, frozen=True):
-    """Hold what a run's requests to one model cost, by the price on its model card.
+    """Hold what a run's requests to one model cost, by the price that the model's file states.
 
     `amount` is in `currency`; of the `asked` requests, the `uncounted` ones are not in it, since
-    nobody said how many tokens they had.
+    nobody said how many tokens they had. `read_tokens` are those of prompts, `written_tokens` those
+    of answers.
     """
 
-    currency: str
-    amount: float
-    asked: int
+    currency: str  # such as `USD`
+    amount: float  # what the counted requests cost
+    asked: int  # number of requests
     uncounted: int  # of these, so many are not in the amount: nobody said how many tokens they had
-    read_tokens: int
-    written_tokens: int
+    read_tokens: int  # tokens of the prompts
+    written_tokens: int  # tokens of the answers
 
     @classmethod
     def joined(cls, runs: "Iterable[Manifest]") -> "dict[str, Cost]":
-        """Return the cost of several runs in sum, by model; all have the same price."""
+        """Return the cost of several runs in sum, by name of the model; all have the same price.
+
+        `runs` are the runs' manifests.
+        """
         total: dict[str, Cost] = {}
         for model, cost in (each for run in runs for each in (run.cost or {}).items()):
             old = total.get(model)
@@ -576,53 +638,71 @@ def _is_name(name: str) -> bool:
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
-    """Hold a run's settings and origin, `run.json`; docs/files.md has the meaning of each name."""
+    """Hold a run's settings and origin: the content of `run.json`.
 
-    format: str
-    name: str
-    created: str
-    command: str
-    tags: tuple[str, ...]
-    model: dict[str, Any]
-    prompt: dict[str, Any]
+    Whole records of models (`model`, `helpers`), radios (`channels`) and conditions (named sets of
+    settings of channel, asking and fusion) are in it, with digests and versions, so that the run
+    can be made again and checked. `seeds` are of the channel's random numbers, `settings` all
+    settings as typed. docs/files.md has more on each name.
+    """
+
+    format: str  # the format of the run's files, such as `swarmdrive-run/2`
+    name: str  # the name of the run's folder
+    created: str  # when the run was begun, UTC
+    command: str  # the command line that makes it again
+    tags: tuple[str, ...]  # words by which to find it
+    model: dict[str, Any]  # the whole content of the file that describes the ego's model (its card)
+    prompt: dict[str, Any]  # the ego's prompt: `version`, `sha256` and whether it is `released`
+    # the models that answer for helpers, with prompt and way of answering; empty if the ego's does
     helpers: tuple[dict[str, Any], ...]
-    world: FrozenScenes | ClosedLoop
+    world: FrozenScenes | ClosedLoop  # where the decision points come from
+    # names of the meta-actions, in the order of every distribution over them
     actions: tuple[str, ...]
+    # what the run scores: named sets of settings of channel, asking and fusion, each whole
     conditions: tuple[dict[str, Any], ...]
-    channels: dict[str, ChannelRecord]
-    networks: dict[str, dict[str, Any]]
-    schedules: dict[str, str]
+    channels: dict[str, ChannelRecord]  # the radios of the conditions, by name of the profile
+    networks: dict[str, dict[str, Any]]  # the networks to a cloud that the conditions use, by name
+    schedules: dict[str, str]  # digests of the rules by which helpers are asked, by name
+    # other things that conditions name, such as calibrations, by kind and name
     kept: dict[str, dict[str, Any]]
+    # what settings of extensions opened, by name of the setting
     beside: dict[str, Any] = field(default_factory=dict)
-    seeds: tuple[int, ...]
+    seeds: tuple[int, ...]  # seeds of the channel's random numbers
+    # which helpers were asked: those whose answer a condition uses, or all
     ask: Literal["used", "all"]
+    # which of equally likely actions was taken: a drawn one, or the first
     ties: Literal["drawn", "first"]
-    thinking: bool
-    answer: str
-    image: str
+    thinking: bool  # whether the model was asked to think before it answers
+    answer: str  # how the model answers: `json`, `constrained`, `readout` or `decision`
+    image: str  # the picture an image prompt shows: `own`, `blank`, `another` or `none`
+    # read-outs: letters read once, or averaged over several orders
     letters: Literal["raw", "cyclic"]
+    # whether an answer whose numbers do not sum to 1 is refused or divided
     sums: Literal["refuse", "divide"]
-    flip: bool
-    batch_size: int
-    dtype: str | None
-    temperature: float
-    sampling_seed: int
-    latency_source: str | None
-    settings: Settings
-    latency: Latency
+    flip: bool  # whether read-outs were also asked with the actions reversed
+    batch_size: int  # number of prompts in one batch
+    dtype: str | None  # number format of the weights; None is the card's
+    temperature: float  # sampling temperature; 0 is greedy
+    sampling_seed: int  # seed of the sampling
+    latency_source: str | None  # the value of `--latency`; None for the default
+    settings: Settings  # all settings by their names in `run.toml`
+    latency: Latency  # the inference times that decide which messages arrive
+    # what answers took that were asked alone, by role; they decide nothing
     answer_times: dict[str, Times] = field(default_factory=dict)
-    identity: dict[str, Any]
-    cached_answers: int
-    engine_errors: int
-    retries: int = 0
-    cost: dict[str, Cost] | UnsetType = UNSET
+    identity: dict[str, Any]  # the model that answered: engine, digests, versions, device
+    cached_answers: int  # number of answers from the completion cache
+    engine_errors: int  # helpers' questions without an answer, which count as lost messages
+    retries: int = 0  # number of failed attempts before answers came
+    cost: dict[str, Cost] | UnsetType = UNSET  # by model; unset if no model has a price
+    # of the harness, Python and packages, by name
     versions: dict[str, str] = field(default_factory=dict)
 
     @property
     def scenario(self) -> Scenario:
         """Return the scenario of a closed-loop run, with the parameters in the manifest.
 
-        Raises UserError if this version has no such scenario or parameters.
+        In closed loop a simulator plays the episodes. Raises UserError if this version has no such
+        scenario or parameters.
         """
         assert isinstance(self.world, ClosedLoop)
         record = self.world.scenario
@@ -632,22 +712,25 @@ class Manifest(Struct, frozen=True, kw_only=True):
             raise UserError(f"run.json of {printable(self.name)}: {error}") from None
 
     def as_file(self) -> dict[str, Any]:
-        """Return it as run.json has it, as plain values."""
+        """Return the manifest in the form of `run.json`, as plain values by name."""
         return formats.as_file(to_builtins(self))
 
     @property
     def timer(self) -> Timer | None:
-        """What timed each answer of the run; None for others, and for a replay of such a one."""
+        """Return what timed each answer by itself; None if nothing did, or in a replay."""
         return timer(self.latency.source).recorded(self) if self.latency.speeds else None
 
     @property
     def stopping_rule(self) -> StoppingRule | None:
-        """What may have stopped the run, without what its settings open; None for nothing."""
+        """Return the rule that may have stopped the run early; None if the run had none.
+
+        It is as registered: what the run's settings open for it is not opened.
+        """
         return stopping.rule_of(self.world.interim_looks)
 
     @property
     def interim_looks(self) -> InterimLooks | None:
-        """When the run was looked at; None if nothing was to stop it."""
+        """Return when the run was looked at, since it might stop; None without a stopping rule."""
         rule, record = self.stopping_rule, self.world.interim_looks
         if rule is None or record is None:
             return None
@@ -723,9 +806,10 @@ class Manifest(Struct, frozen=True, kw_only=True):
         return Variant(model, version, self.answer, " + ".join(helpers))
 
     def agent(self, place: int) -> dict[str, Any]:
-        """Return the agent of the viewer with this index, 0 the ego, in the form of `helpers`.
+        """Return the model, prompt and way of answering of a vehicle, as plain values by name.
 
-        Helper agents are assigned in turn; without any, the ego's agent answers for all.
+        `place` is the vehicle's index, where 0 is the ego, and the helpers follow from 1. Models of
+        helpers are assigned to them in turn; without any, the ego's answers for all.
         """
         if place and self.helpers:
             return self.helpers[(place - 1) % len(self.helpers)]

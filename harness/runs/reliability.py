@@ -41,8 +41,8 @@ AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay
 def mass(p: Floats, optimal: Bools) -> Floats:
     """Return the probability that policies give to all optimal actions together, (...).
 
-    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). NaN where no
-    action is optimal.
+    A policy, `p`, is the probabilities of A actions in a decision, (..., A), and `optimal` is the
+    mask of actions after which success is still possible, (..., A). NaN where no action is optimal.
     """
     # rounding may lift it above 1
     total = np.minimum(np.sum(np.where(optimal, p, 0.0), axis=-1), 1.0)
@@ -52,10 +52,10 @@ def mass(p: Floats, optimal: Bools) -> Floats:
 def brier(p: Floats, optimal: Bools) -> Floats:
     """Return the Brier score (Brier 1950) of policies: how far they are from optimal, (...).
 
-    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). NaN where no
-    action is optimal. With the probability m of the optimal actions together
-    it is (1 - m)² + (0 - (1 - m))²; 0 best, 2 worst. It does not matter how m is spread over
-    several optimal actions.
+    A policy, `p`, is the probabilities of A actions in a decision, (..., A), and `optimal` is the
+    mask of actions after which success is still possible, (..., A). NaN where no action is optimal.
+    With the probability m of the optimal actions together it is (1 - m)² + (0 - (1 - m))²; 0 best,
+    2 worst. It does not matter how m is spread over several optimal actions.
     """
     return np.asarray(2.0 * (1.0 - mass(p, optimal)) ** 2)
 
@@ -63,8 +63,9 @@ def brier(p: Floats, optimal: Bools) -> Floats:
 def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
     """Return -ln of the probability of the optimal actions together (Good 1952), (...).
 
-    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). NaN where no
-    action is optimal. A probability below `LEAST_P` counts as that, so that it is 5.3 nats at most.
+    A policy, `p`, is the probabilities of A actions in a decision, (..., A), and `optimal` is the
+    mask of actions after which success is still possible, (..., A). NaN where no action is optimal.
+    A probability below `LEAST_P` counts as that, so that it is 5.3 nats at most.
     """
     return np.asarray(-np.log(np.maximum(mass(p, optimal), LEAST_P)))
 
@@ -72,8 +73,9 @@ def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
 def right(p: Floats, optimal: Bools) -> Floats:
     """Return 1 where the likeliest action of a policy is optimal, else 0, (...).
 
-    `p` are probabilities of A actions, (..., A), and `optimal` is a mask, (..., A). For equally
-    likely actions it is the share that is optimal; NaN where no action is.
+    A policy, `p`, is the probabilities of A actions in a decision, (..., A), and `optimal` is the
+    mask of actions after which success is still possible, (..., A). For equally likely actions it
+    is the share that is optimal; NaN where no action is.
     """
     likeliest = p == p.max(axis=-1, keepdims=True)
     share = np.sum(likeliest & optimal, axis=-1) / np.maximum(likeliest.sum(axis=-1), 1)
@@ -84,7 +86,9 @@ def right(p: Floats, optimal: Bools) -> Floats:
 class Judged:
     """Hold how sure and how right the n decisions with exactly one optimal action are.
 
-    An action is optimal if success is still possible after it, where it is possible at all.
+    An action is optimal if success is still possible after it, where it is possible at all. `sure`,
+    (n,), is the probability of the likeliest action, `right`, (n,), 1 if that is the optimal one,
+    else 0, and `episode`, (n,), the index of the decision's episode.
     """
 
     sure: Floats  # probability of each decision's likeliest action, (n,)
@@ -97,8 +101,9 @@ class Judged:
     def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
         """Return those of n decisions that have exactly one optimal action.
 
-        `p` are the decisions' policies, probabilities of A actions, (n, A), `optimal` is a mask,
-        (n, A), and `episode`, (n,), the index of each decision's episode.
+        `p` are the decisions' policies, probabilities of A actions, (n, A), `optimal` is the mask
+        of actions after which success is still possible, (n, A), and `episode`, (n,), the index of
+        each decision's episode.
         """
         hits = right(p, optimal)
         is_judged = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
@@ -106,7 +111,10 @@ class Judged:
 
     @classmethod
     def joined(cls, parts: Sequence["Judged"], sizes: Sequence[int]) -> "Judged":
-        """Join decisions of parts of a run; `sizes` are the numbers of episodes in the parts."""
+        """Join decisions of parts of a run; `sizes` are the numbers of episodes in the parts.
+
+        Episodes are counted through: the first of a part follows the last of the part before.
+        """
         starts = np.cumsum([0, *sizes[:-1]])
         episode = [part.episode + start for part, start in zip(parts, starts, strict=True)]
         sure = np.concatenate([part.sure for part in parts])
@@ -114,9 +122,9 @@ class Judged:
         return cls(sure, hits, np.concatenate(episode))
 
     def bins(self) -> Ints:
-        """Return the number from 0 of each decision's bin of alike sure ones, (n,).
+        """Return the number from 0 of each of n decisions' bin, (n,); those in a bin are as sure.
 
-        The bins are those of `calibration_error`.
+        There are `BINS` bins of about as many decisions each; `calibration_error` uses the same.
         """
         levels, level = np.unique(-self.sure, return_inverse=True)
         return np.asarray(_bins(np.bincount(level, minlength=len(levels))[None])[0][level])
@@ -128,7 +136,8 @@ Figure = Callable[[Floats, Floats, Floats], Floats]
 def decisions(count: Floats, hits: Floats, sure: Floats) -> Floats:
     """Return the number of decisions in each of R bootstrap resamples, (R,).
 
-    The arguments are those of `calibration_error`.
+    All arguments are (R, L), by resample and by L levels of how sure decisions are: `count` is how
+    many decisions there are; `hits`, how many of these are right, and `sure` are not used.
     """
     return np.asarray(count.sum(axis=1))
 
@@ -136,13 +145,13 @@ def decisions(count: Floats, hits: Floats, sure: Floats) -> Floats:
 def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
     """Return the expected calibration error of the likeliest action (Naeini and others 2015), (R,).
 
-    `BINS` bins of equal mass (Nguyen and O'Connor 2015); equally confident decisions share a bin.
-    The error is the mean over decisions of a bin's distance between accuracy and mean confidence.
-    It is above 0 even for calibrated policies, the more the fewer decisions there are.
+    There is one for each of R bootstrap resamples: how far the share of right decisions is from the
+    mean probability of their likeliest action, the mean over `BINS` bins of equal mass (Nguyen and
+    O'Connor 2015); equally sure decisions share a bin. It is above 0 even for calibrated policies,
+    the more the fewer decisions there are.
 
     Args:
-        count: number of decisions at each of L levels of confidence, descending, for each of R
-            bootstrap resamples, (R, L).
+        count: number of decisions at each of L levels of confidence, descending, (R, L).
         hits: how many of these are right, (R, L).
         sure: the sum of their confidence, (R, L).
     """
@@ -152,11 +161,16 @@ def calibration_error(count: Floats, hits: Floats, sure: Floats) -> Floats:
 
 
 def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
-    """Return the greatest share of decisions, most confident first, with an error of `RISK`, (R,).
+    """Return the greatest share of decisions, the surest first, with an error of `RISK`, (R,).
 
     There is one for each of R bootstrap resamples. It is selective classification (El-Yaniv and
-    Wiener 2010) with a threshold that is chosen on the same decisions; equally confident ones are
-    taken together. The arguments are those of `calibration_error`.
+    Wiener 2010) with a threshold that is chosen on the same decisions; equally sure ones are taken
+    together.
+
+    Args:
+        count: number of decisions at each of L levels of confidence, descending, (R, L).
+        hits: how many of these are right, (R, L).
+        sure: not used.
     """
     acted, correct = count.cumsum(axis=1), hits.cumsum(axis=1)
     within = acted - correct <= RISK * acted + 1e-9
@@ -166,9 +180,9 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
     """Return a figure of judged decisions, such as `coverage`, with its bootstrap interval.
 
-    `figure` is one of the functions above; `episodes` is the number of all episodes. The figure is
-    unknown, unless it is the number of decisions, with fewer than `LEAST` of these or from fewer
-    than `LEAST_EPISODES` episodes.
+    `figure` is `decisions`, `calibration_error` or `coverage`; `episodes` is the number of all
+    episodes. A figure other than the number of decisions is unknown with fewer than `LEAST` of
+    these or from fewer than `LEAST_EPISODES` episodes.
     """
     return estimates(judged, [figure], episodes)[0]
 
@@ -176,11 +190,12 @@ def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
 def estimates(
     judged: Judged, figures: Sequence[Figure], episodes: int, older: bool = False
 ) -> list[Estimate]:
-    """Return several figures of the same decisions, as `estimate` does; they share resamples.
+    """Return several figures of the same decisions, with intervals from the same resamples.
 
-    `older` selects the rules by which runs of figures' version 1 state them
-    (`harness.core.versions.FIGURES`): any number of episodes is enough, and a figure whose
-    resamples are all alike has an interval of no width.
+    `figures` are among `decisions`, `calibration_error` and `coverage`; `episodes` is the number of
+    all episodes. With `older` they are computed as the oldest runs did (version 1 of
+    `harness.core.versions.FIGURES`): any number of episodes is enough, and a figure whose resamples
+    are all alike has an interval of no width.
     """
     known_figures = [figure for figure in figures if _is_known(figure, judged, older)]
     values = []
@@ -196,8 +211,8 @@ def difference(
     """Return a figure, such as `coverage`, of run A, that of run B, and B - A with its interval.
 
     They are paired by episode: episodes in which either has no decision are left out. All are NaN
-    if one is left with too few decisions, as in `estimate`. `episodes` is the number of all
-    episodes.
+    if one is left with fewer than `LEAST` decisions or `LEAST_EPISODES` episodes. `episodes` is the
+    number of all episodes.
     """
     both = np.intersect1d(a.episode, b.episode)
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))

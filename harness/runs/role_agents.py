@@ -19,7 +19,8 @@ class RoleAgents(ABC):
     """Say which agents answer for the vehicles of a role in place of the ego's; a base class.
 
     An agent is a model, its prompt and how it answers (`harness.evaluate.agent.Agent`); a role is
-    what a vehicle is asked as, such as `helper`. Objects do not change.
+    what a vehicle is asked as, such as `helper`. `chosen_by` names the settings that choose them.
+    Objects do not change.
     """
 
     chosen_by: ClassVar[tuple[str, ...]]  # names of the settings of its extension that choose them
@@ -30,14 +31,15 @@ class RoleAgents(ABC):
 
         There are none if the ego's answers for all. `settings` are the run's, a
         `harness.runs.settings.Settings`, and `ego` is the ego's agent. Raises UserError for agents
-        that cannot be.
+        that do not exist, or do not go together.
         """
 
     @abstractmethod
     def settings(self, ego: Any, agents: Sequence[Any]) -> dict[str, Any]:
         """Return the values, by name, of the settings in `chosen_by` that open these agents.
 
-        `ego` is the ego's `Agent`, and `agents` are the role's.
+        `ego` is the ego's `Agent`, and `agents` are the role's. An agent is a model, its prompt and
+        how it answers.
         """
 
     @abstractmethod
@@ -45,21 +47,24 @@ class RoleAgents(ABC):
         """Return the settings, values by name, that open the agents which a run states.
 
         `agents` are the run's records of them, as in `Manifest.helpers`. It may raise KeyError,
-        TypeError, AttributeError or IndexError for what is no record.
+        TypeError, AttributeError or IndexError for what is no record. An agent is a model, its
+        prompt and how it answers.
         """
 
     @abstractmethod
     def check(self, run: Any) -> None:
         """Raise UserError if a run has agents that cannot answer for the role.
 
-        `run` is a `harness.evaluate.spec.Spec`.
+        `run` is a `harness.evaluate.spec.Spec`: a run that is about to begin, its settings opened.
+        An agent is a model, its prompt and how it answers.
         """
 
     @abstractmethod
     def unlike(self, run: Any) -> str | None:
-        """Return why the ego's prompt cannot show the messages of a run's agents, or None.
+        """Return why the ego's prompt cannot show messages of a run's agents, or None if it can.
 
-        `run` is a `harness.evaluate.spec.Spec`.
+        `run` is a `harness.evaluate.spec.Spec`: a run that is about to begin, its settings opened.
+        An agent is a model, its prompt and how it answers.
         """
 
 
@@ -69,7 +74,8 @@ AGENTS = Shipped[RoleAgents]("swarmdrive.agents", RoleAgents, {})
 def of_helpers() -> RoleAgents:
     """Return the object that says which agents answer for helpers in place of the ego's.
 
-    Raises UserError if no installed extension adds one.
+    An agent is a model, its prompt and how it answers. Raises UserError if no installed extension
+    adds one.
     """
     if HELPER in AGENTS:
         return AGENTS[HELPER]
@@ -82,13 +88,16 @@ def opened(settings: Any, ego: Any) -> tuple[Any, ...]:
 
     An agent is a `harness.evaluate.agent.Agent`: a model, its prompt and how it answers. `settings`
     are the run's, a `harness.runs.settings.Settings`, and `ego` is the ego's agent. Raises
-    UserError for agents that cannot be.
+    UserError for agents that do not exist, or do not go together.
     """
     return AGENTS[HELPER].opened(settings, ego) if HELPER in AGENTS else ()
 
 
 def settings() -> tuple[str, ...]:
-    """Return the names of the settings of extensions that give helpers agents of their own."""
+    """Return the names of the settings of extensions that give helpers agents of their own.
+
+    An agent is a model, its prompt and how it answers.
+    """
     return AGENTS[HELPER].chosen_by if HELPER in AGENTS else ()
 
 
@@ -96,6 +105,8 @@ def recorded(helpers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the settings of extensions, values by name, that open a run's agents of helpers.
 
     `helpers` are the run's records of these agents (`Manifest.helpers`); there are no settings
-    without any. Raises UserError if the extension is gone, and what `RoleAgents.recorded` does.
+    without any. An agent is a model, its prompt and how it answers. Raises UserError if the
+    extension is gone, and may raise KeyError, TypeError, AttributeError or IndexError for what is
+    no record.
     """
     return of_helpers().recorded(helpers) if helpers else {}

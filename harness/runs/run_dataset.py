@@ -16,7 +16,7 @@ DEEPEST = 8  # folders of a dataset's stated path that are looked for above a ru
 
 
 def dataset_of(run: Run, given: Path | None = None) -> Dataset:
-    """Return the dataset of a run on frozen scenes, found by its digest.
+    """Return the dataset of a run on frozen (recorded) scenes, found by its digest.
 
     It is searched at the path in the run's manifest, at that path below each folder above the run,
     and by its name; if the user names a folder, `given`, only there. Raises UserError if it is not

@@ -44,8 +44,8 @@ def part_files(
 def write_part(out: Path, files: Mapping[str, bytes]) -> None:
     """Write the files of a part of a run to the folder `out`, which appears only when complete.
 
-    `files` has their content by name. A seal, by which a later run of this user knows its own
-    files, is written beside the folder if this user can make one.
+    `files` has their content by name. A seal (a signature with a key of this user), by which a
+    later run knows its own files, is written beside the folder if this user can make one.
     """
     write_seal(out, files)
     part = out.with_name(f".{out.name}.{os.getpid()}.part")

@@ -54,7 +54,8 @@ def option(
         panel: the heading that the help stands below; empty for the first.
         only: the world that alone has the setting, `frozen` or `closed-loop`; empty for both.
         listed: whether it is a text of names with commas, and its option may be repeated.
-        same: what of it must be equal when a stopped run resumes: `ITSELF`, `OPENED` or `NOTHING`.
+        same: what of it must be equal when a stopped run resumes: the value (`ITSELF`), what it
+            names, such as a model's weights (`OPENED`), or `NOTHING`.
         compared: whether a comparison of two runs reports it.
     """
     in_command = {"help": text, "panel": panel, "only": only, "listed": listed}
@@ -62,7 +63,10 @@ def option(
 
 
 class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="frozen"):
-    """Hold the settings of a frozen run's episodes: the dataset, and which of it to use."""
+    """Hold the settings of a frozen run's episodes: the dataset, and which of it to use.
+
+    A frozen run is on recorded scenes.
+    """
 
     dataset: Annotated[
         str,
@@ -77,7 +81,10 @@ class FrozenSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="f
 
 
 class DriveSettings(Struct, frozen=True, kw_only=True, tag_field="kind", tag="closed-loop"):
-    """Hold the settings of a closed-loop run's episodes: the scenario and its layouts."""
+    """Hold the settings of a closed-loop run's episodes: the scenario and its layouts.
+
+    In closed loop a simulator plays the episodes.
+    """
 
     scenario: Annotated[
         str | None,
@@ -289,13 +296,13 @@ class Option(NamedTuple):
     path: tuple[str, ...]  # the names of the table and the key in `run.toml`
     name: str  # as a parameter: batch_size
     kind: Any  # str, int, float, bool or list[str]
-    default: Any
-    help: str
-    panel: str
+    default: Any  # the value if it is not typed
+    help: str  # its help on the command line
+    panel: str  # the heading that the help stands below
     listed: bool  # whether it may be typed several times, which are joined by commas
-    same: str  # what of it is the same when a stopped run resumes
+    same: str  # what is the same when a stopped run resumes: `ITSELF`, `OPENED` or `NOTHING`
     compared: bool  # whether a comparison of two runs tells it
-    models: bool = False  # whether it names models
+    models: bool = False  # whether its value names models
     is_added: bool = False  # whether an extension adds it
 
     @property
@@ -315,7 +322,10 @@ class Option(NamedTuple):
         return settings
 
     def words(self, value: Any) -> list[str]:
-        """Return the command-line arguments that give the option this value; none for None."""
+        """Return the command-line arguments that give the option `value`; none for None.
+
+        They are the option's name and the value, once for each value of a list.
+        """
         if isinstance(value, bool):
             return [self.flag if value else self.off]
         values = value if isinstance(value, tuple) else () if value is None else (value,)
@@ -323,9 +333,10 @@ class Option(NamedTuple):
 
 
 def options(world: type[Struct]) -> list[Option]:
-    """Return the options of this world's command, in the order of fields; extensions' last.
+    """Return the options of a command, in the order of fields; extensions' last.
 
-    Those of extensions that stand behind one of the core follow it.
+    `world` is `FrozenSettings` for `harness eval` and `DriveSettings` for `harness drive`. An
+    option of an extension that says which of the core's it stands behind follows that one.
     """
     by_path = {".".join(each.path): each for each in core_options(world)}
     declared, last, kind = list[Option](), list[Option](), str(world.__struct_config__.tag)
@@ -354,7 +365,10 @@ def _added(name: str, setting: Setting, path: tuple[str, ...]) -> Option:
 
 
 def core_options(world: type[Struct]) -> list[Option]:
-    """Return the options of the command for this world, without those of extensions."""
+    """Return the options of a command, in the order of fields, without those of extensions.
+
+    `world` is `FrozenSettings` for `harness eval` and `DriveSettings` for `harness drive`.
+    """
     return [*_options(Settings, str(world.__struct_config__.tag), {"world": world})]
 
 
@@ -392,7 +406,7 @@ def _kind(plain: Any) -> Any:
 
 
 def kind_of(settings: Settings) -> str:
-    """Return the kind of world of settings: `frozen` or `closed-loop`."""
+    """Return the kind of world: `frozen` (recorded scenes) or `closed-loop` (a simulator)."""
     return str(settings.world.__struct_config__.tag)
 
 
@@ -419,7 +433,7 @@ COMPARED = dict.fromkeys(
 
 
 def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
-    """Return settings with some values replaced; `given` is by the name of the option.
+    """Return settings with some values replaced: `given` has the new ones by name of the option.
 
     Raises UserError for a value of a wrong type.
     """
@@ -436,14 +450,20 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
 
 
 def deciding(settings: Settings) -> Settings:
-    """Return settings with defaults for those that may differ when a stopped run resumes."""
+    """Return the settings that must be equal when a stopped run resumes.
+
+    All others, such as tags and the addresses of servers, are set to their defaults.
+    """
     declared = options(type(settings.world))
     free = {option.name: option.default for option in declared if option.same == NOTHING}
     return structs.replace(settings, **free)
 
 
 def words(settings: Settings) -> tuple[str, ...]:
-    """Return the command line of these settings, without defaults and without `--out`."""
+    """Return the command line that gives these settings: `harness`, `eval` or `drive`, and options.
+
+    Options at their default and `--out` are left out.
+    """
     typed: list[str] = []
     for option in options(type(settings.world)):
         value = option.of(settings)
@@ -469,9 +489,9 @@ def difference(before: Settings, now: Settings) -> tuple[str, str]:
 
 
 def of_words(typed: Sequence[str]) -> Settings:
-    """Return the settings of a command line.
+    """Return the settings of a command line, given as words, the program's name first.
 
-    Raises UserError if it is none that `words` writes.
+    Raises UserError if `words` would not write it.
     """
     try:
         kind = next(kind for kind, command in COMMANDS.items() if command == typed[1])
@@ -543,9 +563,11 @@ def _toml(value: Any) -> str:
 def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     """Return the settings of a `run.toml`, or of a run's folder, with typed options `given` on top.
 
-    A file may come from a stranger, so it may name cards, prompts, datasets, what extensions open
-    and runs to replay, but no other model to open and no server to ask. Raises UserError if it
-    cannot be read, is of another command, or names what only a user may.
+    `world` is `FrozenSettings` for `harness eval` and `DriveSettings` for `harness drive`; `given`
+    has values by name of the option. A file may come from a stranger, so it may name models by
+    their files (cards), prompts, datasets, what extensions open and runs to replay, but no other
+    model to open and no server to ask. Raises UserError if it cannot be read, is of another
+    command, or names what only a user may.
     """
     sayable("settings", file.name)
     file = file / FILE if file.is_dir() else file
@@ -581,7 +603,10 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
 
 
 def otherwise(folder: Path, made_with: Settings) -> str | None:
-    """Return what the file of a run's folder states otherwise than the run; None without one."""
+    """Return a sentence on settings of a folder's `run.toml` that the run was not made with.
+
+    `made_with` are the settings in the run's `run.json`. None if the file agrees, or is missing.
+    """
     file = folder / FILE
     if not file.exists():
         return None
@@ -612,9 +637,9 @@ def _say_otherwise(settings: Settings, file: Path, given: Mapping[str, Any]) -> 
 
 
 def check_extensions(settings: Settings, where: str) -> None:
-    """Raise UserError if a file sets what no extension has, or to another kind of value.
+    """Raise UserError if settings of extensions are unknown, of a wrong type or of another command.
 
-    So does one that its command does not have.
+    `where` names the file or option that states them, for the error.
     """
     known_settings = of_extensions()
     names = {each.name for each in options(type(settings.world)) if each.is_added}

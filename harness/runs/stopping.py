@@ -23,10 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class InterimLooks:
-    """Hold after how many of its layouts a run was looked at, and whether it stopped by that."""
+    """Hold after how many of its layouts a run was looked at, and whether it stopped by that.
 
-    layouts: int  # how many there were to evaluate
-    at: tuple[int, ...] = ()  # ascending; empty while the run goes on
+    A layout is one start situation of a scenario, with one episode; a look tests whether those
+    evaluated so far are enough. `layouts` is how many there were to evaluate, `at` after how many
+    it was looked at, ascending, and `is_enough` whether the last look said so.
+    """
+
+    layouts: int  # number of layouts that there were to evaluate
+    # numbers of layouts after which it was looked at, ascending; empty while the run goes on
+    at: tuple[int, ...] = ()
     is_enough: bool = False  # whether the last look was enough
 
 
@@ -60,29 +66,41 @@ class StoppingRule(ABC):
 
     @abstractmethod
     def check(self, run: Any) -> None:
-        """Raise UserError if this rule cannot stop a run, a `harness.evaluate.spec.Spec`."""
+        """Raise UserError if this rule cannot stop a run.
+
+        `run` is a `harness.evaluate.spec.Spec`: a run that is about to begin, its settings opened.
+        """
 
     @abstractmethod
     def planned_looks(self, layouts: int) -> Sequence[int]:
-        """Return after how many of a run's `layouts` the rule looks, ascending; the last is all."""
+        """Return after how many of a run's `layouts` the rule looks, ascending; the last is all.
+
+        At a look, after some of its layouts, a rule says whether these are enough.
+        """
 
     @abstractmethod
     def enough(self, grid: "Grid", episodes: "Sequence[Episode]") -> bool:
         """Return whether a run may stop, by its episodes so far.
 
         `grid` has the conditions, seeds and layouts so far; `episodes` are in its order: by
-        condition, seed and layout.
+        condition, seed and layout. A condition is a named set of settings of channel, asking and
+        fusion. A layout is one start situation of a scenario.
         """
 
     @abstractmethod
     def record(self, looks: InterimLooks) -> dict[str, Any]:
-        """Return what a run's manifest states of this rule and of the looks, as plain values."""
+        """Return what a run's manifest states of this rule and of the looks, values by name.
+
+        At a look, after some of its layouts, a rule says whether these are enough.
+        """
 
     @abstractmethod
     def looks(self, record: Mapping[str, Any]) -> InterimLooks:
         """Return the looks of a run that has ended, given what its manifest states (`record`).
 
-        Raises ValueError if it states none that can be.
+        At a look, after some of its layouts, the rule said whether these were enough. A layout is
+        one start situation of a scenario. Raises ValueError if `record` states no looks that can
+        be.
         """
 
     @abstractmethod
@@ -92,42 +110,55 @@ class StoppingRule(ABC):
         """Yield a sentence on each statement of a run's last look that its episodes contradict.
 
         `record` is what its manifest states; `episodes` are all of the run, in the order of the
-        grid: by condition, seed and layout.
+        grid: by condition, seed and layout. At a look, after some of its layouts, a rule says
+        whether these are enough.
         """
 
     def unchecked(self, record: Mapping[str, Any]) -> str | None:
-        """Return what nobody can check of the looks that a run states, as a sentence, or None."""
+        """Return what nobody can check of the looks that a run states, as a sentence, or None.
+
+        `record` is what its manifest states. At a look, after some of its layouts, a rule says
+        whether these are enough.
+        """
         return None
 
     @abstractmethod
     def sentence(self, record: Mapping[str, Any]) -> str:
         """Return a sentence on when a run was looked at, and which of its intervals hold.
 
-        `record` is what its manifest states.
+        `record` is what its manifest states. At a look, after some of its layouts, a rule says
+        whether these are enough.
         """
 
     @abstractmethod
     def scores(self, grid: "Grid", episodes: "Sequence[Episode]") -> "Iterator[Score]":
         """Yield the further scores of a run that may stop, by intervals that hold at every look.
 
-        `episodes` are in the order of the grid: by condition, seed and layout.
+        `grid` has the run's conditions, seeds and layouts; `episodes` are in its order: by
+        condition, seed and layout. A condition is a named set of settings of channel, asking and
+        fusion. A layout is one start situation of a scenario. At a look, after some of its layouts,
+        a rule says whether these are enough.
         """
 
     @abstractmethod
     def difference(self, success: "Success", a: "Floats", b: "Floats") -> "Estimate":
         """Return the difference in success a - b, with an interval that holds at every look.
 
-        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes,
-        and are paired by episode. `success` says how episodes are averaged.
+        `a` and `b` are the success of the same episodes, 0 or 1, (S, E), by S channel seeds and E
+        episodes, and are paired by episode. `success` says how episodes are averaged. At a look,
+        after some of its layouts, a rule says whether these are enough.
         """
 
 
 def looked_otherwise(
     rule: StoppingRule, looks: InterimLooks, grid: "Grid", episodes: "Sequence[Episode]"
 ) -> Iterator[str]:
-    """Yield where a run that has ended was looked at, or stopped, otherwise than a rule says.
+    """Yield a sentence for each way in which a run's interim looks are not what a rule makes of it.
 
-    `episodes` are all of the run, in the order of the grid.
+    `rule` is the run's stopping rule, and `looks` are what the run states: after how many layouts
+    it was looked at, and whether it stopped. `episodes` are all of the run, in the order of the
+    grid: by condition, seed and layout. A condition is a named set of settings of channel, asking
+    and fusion. A layout is one start situation of a scenario.
     """
     planned = tuple(rule.planned_looks(looks.layouts)[: len(looks.at)])
     if looks.at != planned:
@@ -151,6 +182,7 @@ STOPPING_RULES = ShippedChoices[StoppingRule]("swarmdrive.stopping_rules", Stopp
 def rule_of(record: Any) -> StoppingRule | None:
     """Return the stopping rule by which a run was looked at; None for a run without looks.
 
+    At a look, after some of its layouts (start situations), a rule says whether these are enough.
     `record` is what the run's manifest states of them. Raises UserError if the rule's extension is
     not installed.
     """

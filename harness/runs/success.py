@@ -32,17 +32,20 @@ Setting = TypeVar("Setting")
 class Success:
     """Define how success of E episodes is averaged: plainly, or balanced over danger and none.
 
-    A danger is a vehicle that would meet an ego which keeps its speed. Balanced success is the mean
-    of two shares: of the successes among episodes with one, and among those without.
+    A danger is a vehicle that would meet an ego which keeps its speed; `dangerous`, (E,), says
+    which episodes have one, none for a plain mean. Balanced success is the mean of two shares: of
+    the successes among episodes with one, and among those without.
     """
 
     dangerous: Bools  # whether each episode has a danger, (E,); all false for a plain mean
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], headline_metric: str) -> "Success":
-        """Return the rule for E episodes, given one record of each and the metric's name.
+        """Return the rule for E episodes, given one record of each and the name of a metric.
 
-        `headline_metric` is plain or balanced success.
+        `headline_metric` is that of plain success, or of balanced; the rule is balanced only if it
+        names that, and there are episodes with a danger and without. A danger is a vehicle that
+        would meet an ego which keeps its speed.
         """
         return cls(
             np.array(
@@ -104,9 +107,10 @@ class Success:
     def most(self, successes: Mapping[str, Floats]) -> list[str]:
         """Return the name with the highest success, then those not significantly below it.
 
-        `successes` has by name the success of the same episodes, (S, E), by S channel seeds and E
-        episodes. Not below it are names whose paired difference from the best has a p above
-        `LEVEL`, by Holm's method for all pairs since the best was picked, or that have no p.
+        `successes` has by name, such as that of a condition, the success of the same episodes, (S,
+        E), by S channel seeds and E episodes. Not below it are names whose paired difference from
+        the best has a p above `LEVEL`, by Holm's method for all pairs since the best was picked, or
+        that have no p.
         """
         best = max(successes, key=lambda name: self.mean(successes[name]))
         rest = [name for name in successes if name != best]
@@ -117,10 +121,11 @@ class Success:
         return [best, *close]
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
-        """Return how much the difference in success b - a varies between episodes.
+        """Return how much the difference in success b - a varies between episodes, by group.
 
         `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes.
-        `counts` (..., E) says how often each episode counts in a bootstrap resample.
+        `counts` (..., E) says how often each episode counts in a bootstrap resample. Groups are all
+        episodes, or those with a danger and those without.
         """
         differences, parts = known_mean(b - a, 0), self.parts
         variances = [variance(differences[part], counts[..., part]) for part in parts]
@@ -129,7 +134,9 @@ class Success:
     def resampled(self, draws: np.random.Generator, times: int) -> Ints:
         """Return how often each of E episodes counts in bootstrap resamples, (1 + times, E).
 
-        The first row is the sample itself. Episodes with and without a danger are resampled apart.
+        There are `times` resamples after a first row, the sample itself. Episodes with and without
+        a danger are resampled apart. `draws` is the generator of random numbers. A danger is a
+        vehicle that would meet an ego which keeps its speed.
         """
         counts = np.empty((1 + times, len(self.dangerous)), dtype=np.int64)
         for part in self.parts:
@@ -137,9 +144,9 @@ class Success:
         return counts
 
     def weights(self, counts: Ints) -> Floats:
-        """Return each episode's weight in the mean, (..., E), if it counts `counts` times.
+        """Return the weight of each of E episodes in the mean, (..., E), if it counts so often.
 
-        The last axis has the E episodes of the rule, in `counts` as well.
+        `counts`, (..., E), says how often, as in a bootstrap resample.
         """
         shares = sum(part / (len(self.parts) * part.sum()) for part in self.parts)
         return np.asarray(counts * shares)
@@ -149,7 +156,8 @@ class Success:
         """Return the masks (E,) of the groups of E episodes that are averaged first.
 
         It is one of all, or those with a danger and those without. The mean by this rule is the
-        mean of the groups' means.
+        mean of the groups' means. A danger is a vehicle that would meet an ego which keeps its
+        speed.
         """
         halves = [self.dangerous, ~self.dangerous]
         return halves if self.metric == BALANCED else [np.ones_like(self.dangerous)]
@@ -165,15 +173,21 @@ def by_condition(
 ) -> tuple[Success, dict[str, Floats]]:
     """Return how success of a run's episodes is averaged, and their success by condition, (S, E).
 
-    Success is 1 or 0, by S channel seeds and E episodes. `episodes` are in the order of the grid:
-    by condition, seed and number; `headline_metric` is plain or balanced success.
+    Success is 1 or 0, by S channel seeds and E episodes. `grid` has the run's conditions, seeds and
+    episodes, and `episodes` are in its order: by condition, seed and number; `headline_metric` is
+    the name of plain or of balanced success. A condition is a named set of settings of channel,
+    asking and fusion.
     """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
     return Success.of(episodes[: len(grid.episodes)], headline_metric), values
 
 
 def is_gain(score: Score, conditions: Container[str]) -> bool:
-    """Return whether a score is a paired gain over `BASELINE` between two of these conditions."""
+    """Return whether a score is a gain, paired by episode, over the condition without a radio.
+
+    `conditions` are names; it is none if the score's condition or that without a radio (`BASELINE`)
+    is not among them. A condition is a named set of settings of channel, asking and fusion.
+    """
     has_conditions = score.condition in conditions and BASELINE in conditions
     return has_conditions and score.interval == PAIRED and score.metric in GAINS.values()
 
@@ -187,7 +201,8 @@ class Plays(Generic[Setting]):
     """Hold the success of the same episodes under several settings, by family of scenes.
 
     A setting is what is compared, such as a condition's name; a family is the scenes of one
-    scenario.
+    scenario. `families` has for each how its success is averaged, and by setting the success of its
+    episodes, 1 or 0, (S, E), by S channel seeds and E episodes.
     """
 
     # for each family how its success is averaged, and by setting the success of its episodes, 1 or
@@ -208,7 +223,10 @@ class Plays(Generic[Setting]):
         return [(rule, success[setting], success[base]) for rule, success in self.families]
 
     def difference(self, setting: Setting, base: Setting) -> Estimate:
-        """Return the mean over families of success of `setting` minus `base`, paired by episode."""
+        """Return the mean over families of success of `setting` minus `base`, paired by episode.
+
+        A family is the scenes of one scenario; both settings are keys of `families`.
+        """
         return mean_difference(self.pairs(setting, base))
 
 
@@ -229,7 +247,10 @@ def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
 def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
     """Return the mean over families of success a - b in episodes with a danger, or without.
 
-    `pairs` is as `mean_difference` takes it; `dangerous` chooses the episodes with a danger.
+    A family is the scenes of one scenario. `pairs` has for each how its success is averaged, and
+    the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes. `dangerous`
+    chooses the episodes with a danger. A danger is a vehicle that would meet an ego which keeps its
+    speed.
     """
     parts = [known_mean(a - b, 0)[success.dangerous == dangerous] for success, a, b in pairs]
     return paired_difference(parts)
@@ -238,15 +259,17 @@ def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
 def p_of_mean(pairs: Pairs) -> float | None:
     """Return the p-value of no mean difference over families; None without an interval.
 
-    `pairs` is as `mean_difference` takes it.
+    A family is the scenes of one scenario. `pairs` has for each how its success is averaged, and
+    the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes.
     """
     return multiplicity.p_value(lambda level: mean_difference(pairs, level))
 
 
 def alike(successes: Sequence[Success]) -> list[Success]:
-    """Return the rules of several families, so that all average success in one way.
+    """Return rules of averaging success for several families, one each, which all are of one kind.
 
-    They are balanced if every given rule is, and else plain.
+    They are balanced if every given rule is, and else plain. A family is the scenes of one
+    scenario.
     """
     balanced = all(success.metric == BALANCED for success in successes)
     return [success if balanced else success.plain for success in successes]

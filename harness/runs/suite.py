@@ -28,13 +28,13 @@ SUMMARY = "summary.csv"  # the means over families
 class Contents(msgspec.Struct, frozen=True, kw_only=True):
     """Hold the content of `suite.json`: the suite's name, and the folder of each family's run.
 
-    A family is the scenes of one scenario; `families` maps its name to a folder's name.
+    A suite is a run on each of several families, a family the scenes of one scenario.
     """
 
-    format: str
-    name: str
-    description: str
-    families: dict[str, str]
+    format: str  # the format of the file, such as `swarmdrive-suite/1`
+    name: str  # the suite's name
+    description: str  # the suite's purpose
+    families: dict[str, str]  # by family, the name of the folder of its run
 
     def __post_init__(self) -> None:
         if not self.families or not all(map(own_name, self.families.values())):
@@ -45,8 +45,9 @@ class Contents(msgspec.Struct, frozen=True, kw_only=True):
 class SuiteRun:
     """Hold the finished runs of one model on all families of a suite.
 
-    A family is the scenes of one scenario, as one dataset. The runs have the same conditions and
-    seeds.
+    A family is the scenes of one scenario, as one dataset; `runs` has a run by its name, and `path`
+    is the folder that holds the runs' folders. The runs have the same conditions and seeds. A
+    condition is a named set of settings of channel, asking and fusion.
     """
 
     path: Path  # the folder that holds the runs' folders
@@ -81,7 +82,10 @@ class SuiteRun:
 
     @property
     def variant(self) -> Variant:
-        """Return model, prompts (of all families) and answer mode, as names for tables."""
+        """Return model, prompts (of all families) and answer mode, as names for tables.
+
+        A family is the scenes of one scenario; each may have a prompt of its own.
+        """
         prompts = dict.fromkeys(run.manifest.variant.prompt for run in self.runs.values())
         first = self.manifest.variant
         return Variant(first.model, " and ".join(prompts), first.answer)
@@ -125,7 +129,11 @@ class SuiteRun:
         return Score.of(score.condition, score.metric, gain, PAIRED)
 
     def score(self, condition: str, metric: str) -> Score | None:
-        """Return a metric's mean over families in a condition; None if a family has no value."""
+        """Return a metric's mean over families in a condition; None if a family has no value.
+
+        A family is the scenes of one scenario; condition and metric are names. A condition is a
+        named set of settings of channel, asking and fusion.
+        """
         of_metric = (s for s in self.scores if (s.condition, s.metric) == (condition, metric))
         return next((s for s in of_metric if s.value is not None), None)
 
@@ -133,7 +141,9 @@ class SuiteRun:
 def plays(runs: Iterable[Run], headline_metric: str) -> Plays[str]:
     """Return the success of episodes by condition in runs that are each on another family.
 
-    A family is the scenes of one scenario. `headline_metric` is plain or balanced success.
+    A family is the scenes of one scenario. `headline_metric` is the name of the metric by which the
+    runs are read: that of plain success or of balanced. A condition is a named set of settings of
+    channel, asking and fusion.
     """
     return Plays([by_condition(run.grid, run.episodes, headline_metric) for run in runs])
 
@@ -152,7 +162,8 @@ def mean(scores: Sequence[Score]) -> Score:
 def contents_of(path: Path) -> Contents:
     """Return the content of a suite folder's `suite.json`.
 
-    Raises UserError if there is none, or it is broken or of another version.
+    A suite is a run on each of several scenarios. Raises UserError if there is none, or it is
+    broken or of another version.
     """
     contents = folder.whole(
         path / SUITE, lambda file: msgspec.json.decode(text_of(file, "record"), type=Contents)
@@ -165,8 +176,9 @@ def contents_of(path: Path) -> Contents:
 def read(path: Path) -> SuiteRun:
     """Read a suite's folder and return its runs.
 
-    Raises UserError if it holds no suite, or a run is not finished or has another model, other
-    conditions or other seeds than the first.
+    A suite is a run on each of several scenarios. A condition is a named set of settings of
+    channel, asking and fusion. Raises UserError if it holds no suite, or a run is not finished or
+    has another model, other conditions or other seeds than the first.
     """
     contents = contents_of(path)
     runs = {family: folder.read(path / name) for family, name in contents.families.items()}

@@ -50,10 +50,13 @@ from harness.runs.reliability import Judged, estimates
 
 @dataclass(frozen=True)
 class Figures:
-    """Hold all that a run's scores are computed from, for some of its episodes.
+    """Hold all that a run's scores are computed from, for some of its E episodes.
 
-    An episode is played under C conditions, operating points of the run, and with S seeds of the
-    channel's draws.
+    An episode is played under C conditions, named sets of settings of channel, asking and fusion,
+    and with S seeds of the channel's random numbers. `values` has each metric by name, (C, S, E),
+    and `latency_ms` the latencies of all decisions, an array (n,) for each condition and seed.
+    `judged` has for each condition its decisions with exactly one optimal action; `answers` come
+    with the number of their episode.
     """
 
     grid: Grid  # the conditions, seeds and episodes
@@ -77,9 +80,16 @@ class Figures:
         episodes: Sequence[Episode],
         answers: Iterable[Answer | AnswerFacts],
     ) -> "Figures":
-        """Compute the figures of a run in a world, `frozen` or `closed-loop`.
+        """Compute the figures of a run in a world, `frozen` (recorded scenes) or `closed-loop`.
 
-        `episodes` are in the order of the grid: by condition, seed and number.
+        A condition is a named set of settings of channel, asking and fusion.
+
+        Args:
+            world: the kind of world, which says what metrics there are.
+            grid: the run's conditions, seeds and episodes.
+            decisions: those of all episodes, in any order.
+            episodes: how each ended, in the order of the grid: by condition, seed and number.
+            answers: all answers that the decisions are made of.
         """
         cells, latency_ms = grid.places(decisions), decisions["latency_ms"]
         places = cells // len(grid.episodes)
@@ -99,7 +109,7 @@ class Figures:
 
     @classmethod
     def joined(cls, parts: Sequence["Figures"]) -> "Figures":
-        """Join the figures of parts of a run, which have different episodes."""
+        """Join the figures of parts of a run, which have different episodes, in their order."""
         episodes = tuple(chain.from_iterable(part.grid.episodes for part in parts))
         values = {}
         for name in parts[0].values:
@@ -118,9 +128,9 @@ class Figures:
     def scores(self, older: bool = False) -> list[Score]:
         """Return the scores of all metrics, each with its intervals, as lines of `summary.csv`.
 
-        `older` computes figures of calibration (how sure policies are, and how often right) as a
-        run of figures' version 1 states them (`harness.core.versions.FIGURES`): from any number of
-        episodes, and of an interval without width where all resamples are alike.
+        `older` computes figures of calibration (how sure policies are, and how often right) as the
+        oldest runs did (version 1 of `harness.core.versions.FIGURES`): from any number of episodes,
+        and of an interval without width where all resamples are alike.
         """
         names = known_in(self.values)
         return [
@@ -158,7 +168,9 @@ def of_conditions(
 def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
     """Yield the scores of each condition's latency percentiles, in ms, as means over seeds.
 
-    `latency_ms` has an array (n,) for each condition and seed, in the order of the grid.
+    `latency_ms` has an array of n decisions, (n,), for each condition and seed: all seeds of the
+    first condition, then of the second. A condition is a named set of settings of channel, asking
+    and fusion.
     """
     names = {m.percentile: m.name for m in METRICS.values() if m.percentile}
     all_percentiles = np.array([percentiles(latencies) for latencies in latency_ms])
@@ -174,8 +186,9 @@ def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
     """Return for each condition its decisions with exactly one optimal action.
 
     An action is optimal if success is still possible after it, where it is possible at all. `cells`
-    (n,) is the flat index of each decision's condition, seed and episode in the grid
-    (`Grid.places`).
+    has for each of n decisions, (n,), the index of its condition, seed and episode in a flattened
+    array (C, S, E) of the C conditions, S seeds and E episodes of `grid` (`Grid.places`). A
+    condition is a named set of settings of channel, asking and fusion.
     """
     fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
     condition, _, episode = np.unravel_index(cells, grid.shape)
@@ -239,9 +252,11 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
 
 
 def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:
-    """Return the episodes in the order of the grid, with the columns computed from decisions.
+    """Return the episodes with the columns that are computed from decisions.
 
-    These are counts and means such as messages, latency in ms and deadline misses.
+    These are counts and means such as messages, latency in ms and deadline misses. `episodes` and
+    the result are in the order of the grid: by condition (named set of settings), channel seed and
+    number.
     """
     ordered, places = grid.ordered(episodes), grid.places(decisions)
     n = len(ordered)

@@ -42,8 +42,9 @@ PLACE = ["scene", "episode", "step", "danger"]
 
 @dataclass(frozen=True)
 class Tables:
-    """Hold a finished run, frozen or closed-loop, as pandas tables.
+    """Hold a finished run, on frozen (recorded) scenes or in closed loop, as pandas tables.
 
+    `path` is its folder, `config` the content of its `run.json`, and `source` the run's records.
     Each table is read on first use, and raises UserError if its file is missing or broken.
     """
 
@@ -53,12 +54,18 @@ class Tables:
 
     @cached_property
     def summary(self) -> "pd.DataFrame":
-        """Return `summary.csv`: one row for each condition, metric and kind of interval."""
+        """Return `summary.csv`: one row for each condition, metric and kind of interval.
+
+        A condition is a named set of settings of channel, asking and fusion.
+        """
         return self._csv("summary.csv")
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """Return `episodes.csv`: one row for each episode, condition and seed."""
+        """Return `episodes.csv`: one row for each episode, condition and seed.
+
+        A condition is a named set of settings of channel, asking and fusion.
+        """
         return self._csv("episodes.csv")
 
     @cached_property
@@ -85,7 +92,10 @@ class Tables:
 
     @cached_property
     def decisions(self) -> "pd.DataFrame":
-        """Return `decisions.parquet`: one row for each decision point, condition and seed."""
+        """Return `decisions.parquet`: one row for each decision point, condition and seed.
+
+        A condition is a named set of settings of channel, asking and fusion.
+        """
         return self.source.decisions.frame()
 
     @cached_property
@@ -136,7 +146,7 @@ class Tables:
 
 
 def tables_of(run: Path, kind: type[T]) -> T:
-    """Load a run from its folder as pandas tables, an object of the class `kind`.
+    """Load the run in the folder `run` as pandas tables, an object of the class `kind`.
 
     `kind` is `Tables` or a subclass. Raises UserError if the folder holds no finished run, or one
     of another format version.

@@ -24,9 +24,11 @@ class Timer(ABC):
     """Time each answer of a run by itself, as from a device's tokens a second; a base class.
 
     Without a timer all answers of a role take one time, which `--latency` states. A timer also says
-    how many joules decisions take. Objects do not change. The one that is registered has opened no
-    files: it makes those that have (`opened`, `recorded`), and reads speeds. A speed is how fast an
-    agent, a model with its prompt, answers: an object of the timer's own.
+    how many joules decisions take. `chosen_by` names the settings that choose it, and `adds` the
+    columns that it adds to the table of decisions. Objects do not change. The one that is
+    registered has opened no files: it makes those that have (`opened`, `recorded`), and reads
+    speeds. A speed is how fast an agent, a model with its prompt, answers: an object of the timer's
+    own.
     """
 
     option: ClassVar[str]  # what is typed to choose it, such as the name of an option
@@ -38,32 +40,37 @@ class Timer(ABC):
 
     @abstractmethod
     def opened(self, settings: Mapping[str, Any]) -> "Timer | None":
-        """Return the timer that a run's settings of extensions, by name, choose; None for none."""
+        """Return the timer that a run's settings choose; None for none.
+
+        `settings` are those of extensions, values by name. Raises UserError for a value that is not
+        allowed.
+        """
 
     @abstractmethod
     def recorded(self, manifest: "Manifest") -> "Timer | None":
         """Return the timer that a run's manifest states; None if it took over another run's times.
 
-        Raises ValueError if it states none that can be read.
+        It has the files' content as the run states it. Raises ValueError if the manifest states
+        none that can be read.
         """
 
     @abstractmethod
     def speed(self, stated_speed: Any) -> Any:
-        """Return the speed that a run's record states, in plain values, as an object.
+        """Return the speed that a run's record states, given its plain values, `stated_speed`.
 
-        Raises ValueError if it is none.
+        A speed is how fast a model answers. Raises ValueError if it is none.
         """
 
     @abstractmethod
     def speeds(self, models: Sequence[str]) -> tuple[Any, ...]:
-        """Return the speed of each of a run's agents, given the names of their models' cards.
+        """Return the speed of each of a run's agents, given their models' names, the ego's first.
 
-        Both have the ego's first. Raises UserError for a model that it cannot time.
+        Raises UserError for a model that it cannot time.
         """
 
     @abstractmethod
     def changed(self) -> str | None:
-        """Return what differs here from what the run stated of this timer; None if nothing does.
+        """Return a phrase on what differs here from what a run stated; None if nothing does.
 
         Such is a file of rates that has changed since.
         """
@@ -72,20 +79,23 @@ class Timer(ABC):
     def answer_s(self, speed: Any, answer: "Answer") -> float:
         """Return the seconds that an answer takes at a speed; NaN if the engine failed.
 
-        A repair turn, a second question after a failed answer, is included. Raises UserError if the
-        answer does not say enough, such as its number of tokens.
+        A repair turn, a second question after a failed answer, is included. The engine is what runs
+        the model. Raises UserError if the answer does not say enough, such as its number of tokens.
         """
 
     @abstractmethod
     def check(self, run: Any) -> None:
         """Raise UserError if a run has settings that do not go with this timer.
 
-        `run` is a `harness.evaluate.spec.Spec`.
+        `run` is a `harness.evaluate.spec.Spec`: a run that is about to begin, its settings opened.
         """
 
     @abstractmethod
     def obstacle(self, point: "OperatingPoint") -> str | None:
-        """Return why a condition cannot be played with this timer; None if it can."""
+        """Return why a condition cannot be played with this timer, as a phrase; None if it can.
+
+        `point` is the condition: its settings of channel, asking and fusion.
+        """
 
     @abstractmethod
     def latency(self, agents: Sequence[Any]) -> "Latency":
@@ -116,9 +126,14 @@ class Timer(ABC):
     ) -> dict[str, Floats]:
         """Return the columns that this timer adds to n decisions, by name, (n,) each.
 
-        `decided` has the decisions, in order, in parts of one condition each (`Decided` of
-        `harness.evaluate.walk`). `answers` has the run's answers by id of their request, and
-        `latency` is the run's.
+        An agent is a model, its prompt and how it answers. A condition is a named set of settings
+        of channel, asking and fusion.
+
+        Args:
+            latency: the run's record of times, with each agent's speed.
+            decided: the decisions, in order, in parts of one condition each
+                (`harness.evaluate.walk.Decided`).
+            answers: the run's answers by id of their request.
         """
 
     @abstractmethod
@@ -131,18 +146,19 @@ class Timer(ABC):
     ) -> Floats:
         """Return the joules of each vehicle's answer in n scenes, (n, 1+H), NaN if unknown.
 
-        The ego comes first, then the H helpers. `latency` is the run's and `point` the condition;
-        `scenes` are `harness.dataset.load.Scene`, and `answers` has the run's answers by id of
-        their request.
+        The ego comes first, then the H helpers. `latency` is the run's and `point` the condition,
+        its settings of channel, asking and fusion; `scenes` are `harness.dataset.load.Scene`, and
+        `answers` has the run's answers by id of their request.
         """
 
     @abstractmethod
     def energy_j(self, point: "OperatingPoint", heard: "Exchange", joules: Floats) -> Floats:
         """Return the joules of n decisions, (n,): of the answers that were made, and of the radio.
 
-        Those of a fusion call, a second question to the ego's model, are left out. `joules` are of
-        each vehicle's answer, (n, 1+H), the ego's first; `heard` says which helpers answered, and
-        what was sent.
+        Those of a fusion call, a second question to the ego's model, are left out. `point` is the
+        condition, its settings of channel, asking and fusion; `joules` are of each vehicle's
+        answer, (n, 1+H), the ego's first, then those of H helpers; `heard` says which helpers
+        answered, and what was sent.
         """
 
 
@@ -152,7 +168,8 @@ TIMERS = ShippedChoices[Timer]("swarmdrive.timers", Timer, {})
 def timer(source: str) -> Timer:
     """Return the timer of a name, the `source` that a run's latency states.
 
-    Raises ValueError if there is none of this name, and UserError if its extension is gone.
+    Raises ValueError if there is none of this name, and UserError if the extension that added it is
+    not installed.
     """
     if source in TIMERS:
         return TIMERS[source]

@@ -49,7 +49,8 @@ class Tally:
         """Return the roles with too many unanswered requests, so that a run has no valid result.
 
         Any is too many for the ego and for fusion calls; of helpers' a share of `MOST_LOST`, since
-        one of theirs counts as a lost message.
+        one of theirs counts as a lost message. A fusion call asks the ego's model again, with the
+        messages that it heard.
         """
         lost = sum(n for role, n in self.unanswered.items() if is_helper(role))
         helper_requests = sum(n for role, n in self.asked.items() if is_helper(role))
@@ -95,9 +96,9 @@ def lacking(run: Run) -> Iterator[Answer]:
 
 
 def why(path: Path) -> str | None:
-    """Return why a run's folder has no valid result because its model did not answer; else None.
+    """Return why a run has no valid result because its model did not answer; None if it has one.
 
-    The run may be finished or not.
+    `path` is the run's folder; the run may be finished or not.
     """
     if (path / "run.json").is_file():
         counts = tally(read(path))

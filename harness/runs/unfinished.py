@@ -19,7 +19,12 @@ from harness.runs.formats import LOOKS
 
 @dataclass(frozen=True)
 class Extent:
-    """Hold how far an unfinished run is, as `extent` reads it from its folder."""
+    """Hold how far an unfinished run is, as `extent` reads it from its folder.
+
+    `done` of `due` episodes are at their end, and `answers` is the number of answers kept for the
+    others; `due` is None for a part of a run. `going` says whether a process works on it now, and
+    `early` whether it may stop once it has seen enough.
+    """
 
     going: bool  # whether a process works on it now
     done: int  # number of episodes that are at their end in all conditions and seeds
@@ -33,8 +38,8 @@ class Extent:
 def extent(run: Path) -> Extent:
     """Return how far an unfinished run in a folder is; broken files and links count as not done.
 
-    Episodes count once their part of the run, which has many, is written; `answers` counts those
-    stored for parts that are not.
+    Episodes count once their part of the run, a folder of some episodes, is written; `answers`
+    counts those stored for parts that are not.
     """
     work = run / WORK
     names = _names(work)
