@@ -20,7 +20,11 @@ ImageMode = Literal["own", "blank", "another", "none"]
 class Agent:
     """Describe who answers for a vehicle: a model, its prompt, and how it is asked.
 
-    Raises UserError for settings that the model or the prompt does not support.
+    `card` is the model's description, `prompt` the prompt version, and `answer` how the model
+    answers: free `json`, `constrained` to the schema, a `readout` of letters, or a `decision`.
+    `image` is the picture that an image prompt shows, `sums` what becomes of numbers that do not
+    sum to 1, and `flip` whether read-outs are asked once more with the actions reversed. Raises
+    UserError for settings that the model or the prompt does not support.
     """
 
     card: Card  # the model
@@ -124,9 +128,10 @@ class Agent:
 
     @property
     def samples(self) -> bool:
-        """Return whether its answers are drawn at a temperature.
+        """Return whether its answers are texts that are drawn at a temperature.
 
-        A read-out and a decision are not: they are probabilities already.
+        Those of a read-out (one letter per action) and of a decision (a typed question) are
+        probabilities.
         """
         return self.can.samples and self.answer not in BARE
 
@@ -136,12 +141,15 @@ class Agent:
         return f"{self.card.name} · {self.prompt.version} · {self.answer}"
 
     def most_tokens(self, role: Role) -> int:
-        """Return the most tokens of one answer in a role, a thought before it included."""
+        """Return the most tokens of one answer in a role, a thought before it included.
+
+        The role is what a vehicle is asked as, such as `ego` or `helper`.
+        """
         answer = self.card.max_new_tokens or self.prompt.most_answer_tokens(role)
         return answer + (self.card.thinking_tokens if self.thinking else 0)
 
     def blank(self, role: Role, actions: tuple[str, ...]) -> Request:
-        """Return a request without all that differs from scene to scene.
+        """Return a request to the model without all that differs from scene to scene.
 
         The caller fills in `id`, `messages` and the like (`Request.alike`). `role` is whom the
         prompt addresses, `ego` or `helper`; `actions` are the names of the meta-actions, in order.
@@ -168,16 +176,18 @@ class Agent:
         words: Mapping[str, str],
         heard: Sequence[Mapping[str, Any]] = (),
     ) -> dict[str, Any]:
-        """Return the fields of a request that hold its prompt, by field name.
+        """Return the fields of a request to the model that hold its prompt, by field name.
 
-        They are `messages`; for a read-out in several orders of its list of actions also `orders`
-        and `flips`; and for a decision its `question`.
+        They are `messages`, the chat; for a read-out (one letter per action) in several orders of
+        its list of actions also `orders` and `flips`; and for a decision (a typed question) its
+        `question`.
 
         Args:
-            graph: scene graph of the vehicle that is asked.
+            graph: scene graph of the vehicle that is asked: what it knows of the scene.
             actions: names of the actions, in order.
             words: the scenario's words, which templates take by name.
-            heard: helpers' messages to show, as `fusion.messages_of` returns them.
+            heard: helpers' messages to show, as dicts with `sender`, `intent` and the fields of the
+                helper's answer (`fusion.messages_of`).
         """
         rendered = self.rendered(graph, actions, heard, words)
         if self.answer != "decision":
@@ -198,9 +208,10 @@ class Agent:
     ) -> dict[str, Any]:
         """Return a chat for each order of the list of actions to be asked, as fields of a request.
 
-        A read-out of letters is asked with the actions in several orders, since a model may prefer
-        a letter. `chat` makes the messages for one order. The fields are `messages`, and where
-        there are further orders `orders`, and with `flip` the same of the reversed list, `flips`.
+        A read-out of letters (one per action) is asked with the actions in several orders, since a
+        model may prefer a letter. `actions` are their names, in order, and `chat` makes the
+        messages for the names in one order. The fields are `messages`, and where there are further
+        orders `orders`, and with `flip` the same of the reversed list, `flips`.
         """
 
         def each(listed: tuple[str, ...]) -> list[tuple[Mapping[str, str], ...]]:
@@ -224,7 +235,11 @@ class Agent:
     ) -> tuple[Mapping[str, str], ...]:
         """Return the chat messages that `chats` begins with, before the answer mode changes them.
 
-        Arguments are those of `chats`.
+        Args:
+            graph: scene graph of the vehicle that is asked: what it knows of the scene.
+            actions: names of the actions, in order.
+            heard: helpers' messages to show, as dicts (`fusion.messages_of`).
+            words: the scenario's words, which templates take by name.
         """
         return sent_messages(
             self.image, self.prompt.render(graph, actions, heard, words, self.answer in BARE)
@@ -247,7 +262,11 @@ class Agent:
 def sent_messages(
     image: str, messages: Sequence[Mapping[str, str]]
 ) -> tuple[Mapping[str, str], ...]:
-    """Return a prompt's chat messages, without their pictures if `image` is `none`."""
+    """Return a prompt's chat messages as they are sent: without pictures if `image` is `none`.
+
+    `messages` have the keys `role` and `content`, and `image` is which picture the prompt shows
+    (`Agent.image`).
+    """
     if image != "none":
         return tuple(messages)
     without = []
@@ -268,7 +287,8 @@ def in_mode(
 
     In `readout`, the examples answer by a letter, too, and the question is for one. In `decision`,
     what the chat says of the scene stays, and the scenario's `words` ask. Other modes change
-    nothing.
+    nothing. `graph` is what the vehicle knows of the scene, and `actions` are the names of the
+    actions, in order.
     """
     if answer == "decision":
         question = decision.question(messages, graph, actions, words)

@@ -11,9 +11,9 @@ from harness.evaluate.walk import Decided
 def broken_words(decided: Decided[Any]) -> Floats:
     """Return for n agents' decisions whether each contradicts the plan that the agent sent, `(n,)`.
 
-    An agent is a vehicle that decides for itself, and a plan what it says it will do. It is 1 if
-    the action taken is not the likeliest of the plan that some receiver last got, else 0; NaN for
-    an agent whose plan nobody received.
+    An agent is a vehicle that decides for itself, and a plan what it says it will do. `decided` has
+    the decisions and what was sent. It is 1 if the action taken is not the likeliest of the plan
+    that some receiver last got, else 0; NaN for an agent whose plan nobody received.
     """
     broken, intents = np.full(len(decided.due.at), np.nan), decided.said.intents
     if decided.due.senders is None or intents.plans is None:

@@ -22,10 +22,17 @@ def intents_of(
 ) -> Intents:
     """Return what vehicles answered in n scenes as arrays, `(n, ...)`, of intents and their cost.
 
-    An intent is the probabilities that a vehicle gives to the ego's actions. `answers` has for each
-    scene the ego's answer first, then the helpers' in order of `Scene.viewers`; None for one that
-    was not asked yet. An answer that is missing or did not parse is a row of NaN. `latency` says
-    how long each answer took. Arrays have room for `width` vehicles at least, the ego included.
+    An intent is the probabilities that a vehicle gives to the ego's actions. Arrays have room for
+    `width` vehicles at least, the ego included; an answer that is missing or did not parse is a row
+    of NaN.
+
+    Args:
+        spec: the evaluation, which says whose model answers for whom.
+        latency: how long each answer took.
+        scenes: the n decision points.
+        answers: for each scene the ego's answer first, then the helpers' in order of
+            `Scene.viewers`; None for one that was not asked yet.
+        width: least number of vehicles.
     """
     width = max([width, *[len(row) for row in answers]])
     unknown = (math.nan,) * len(spec.actions)
@@ -67,9 +74,10 @@ def intents_of(
 def models_of(spec: Spec, scene: Scene, width: int) -> list[int]:
     """Return for each vehicle in a scene the number of the model that answers for it.
 
-    Number 0 is the ego's model; from 1 on, the helpers' models take turns (`Latency.speed`). The
-    order is that of `Scene.viewers`. If these are fewer than `width` vehicles, the rest have their
-    own index.
+    The order is that of `Scene.viewers`, the ego first. Number 0 is the ego's model; helpers count
+    from 1, and those with models of their own take these in turn (`Latency.speed`). If the scene
+    has fewer than `width` vehicles, the list is filled up with their indices. `spec` says whether
+    helpers have models of their own.
     """
     there = range(len(scene.viewers))
     places = [scene.place(n) for n in there] if spec.helpers else [*there]

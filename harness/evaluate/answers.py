@@ -15,7 +15,11 @@ _TEXTS = msgspec.json.Encoder(order="sorted")  # as `canonical_bytes`, where the
 
 
 def answer_of(request: Request, completion: Completion) -> Answer:
-    """Return the answer that a completion of a request gives: its text parsed, with its facts."""
+    """Return the answer that a model's completion of a request gives, its text parsed.
+
+    It has the completion's facts, too, such as its tokens, its time in s and why it ended. If the
+    text cannot be parsed, the status says why.
+    """
     raw = completion.text
     scene, _, viewers = request.id.partition("/")
     key, *heard = viewers.split("+")
@@ -67,7 +71,7 @@ def answer_of(request: Request, completion: Completion) -> Answer:
 
 
 def digests(request: Request) -> tuple[str, str | UnsetType]:
-    """Return SHA-256 digests of a request's chat and of its picture; unset without a picture."""
+    """Return SHA-256 digests, in hex, of a request's chat and picture; unset without one."""
     return sha256_bytes(_TEXTS.encode(request.messages)), request.image_sha256 or UNSET
 
 

@@ -98,8 +98,9 @@ def _say_unread(card: Card, prompt: str) -> None:
 class Asker:
     """Ask models for the answers that a run still lacks, and give answers as arrays.
 
-    At each decision point the loop `walk.walk` gets the vehicles' intents from it (`walk.Ask`). A
-    question that got no answer is never kept, so that it is asked again when the work goes on.
+    At each decision point the loop over decision points, `walk.walk`, gets the vehicles' intents
+    from it (`walk.Ask`): the probabilities that each gives to the ego's actions. A question that
+    got no answer is never kept, so that it is asked again when the work goes on.
 
     Attributes:
         spec: the evaluation: agents, scenes, conditions and settings.
@@ -148,9 +149,9 @@ class Asker:
     def ask(self, requests: Sequence[Request]) -> None:
         """Ask the requests whose answers are missing, each once, and keep each chunk of answers.
 
-        Raises Unanswered if a question of the ego or a fusion call got no answer, once all others
-        of these were asked; or if none of the first questions was answered, or none of the last
-        `IN_A_ROW`.
+        A chunk, a run of requests, is written to a file at once. Raises Unanswered if a question of
+        the ego or a fusion call got no answer, once all others of these were asked; or if none of
+        the first questions was answered, or none of the last `IN_A_ROW`.
         """
         if self._kept:  # another process may have asked, too
             recalled = self._recalled(cut=True)
@@ -239,7 +240,10 @@ class Asker:
         return name in self.answers and name not in self._unasked
 
     def asked_answers(self) -> dict[str, Answer]:
-        """Return all answers by request id, without kept ones that nothing asked for here."""
+        """Return all answers by request id, without kept ones that nothing asked for here.
+
+        Kept answers are those of an earlier, stopped run.
+        """
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
     def settle(self) -> None:
@@ -324,15 +328,19 @@ class Asker:
         return self.laid_out(scenes)
 
     def whole(self, scenes: Sequence[Scene]) -> Intents:
-        """Return the intents of n scenes after asking every vehicle in them, helpers included."""
+        """Return the intents of n scenes after asking every vehicle in them, helpers included.
+
+        An intent is the probabilities that a vehicle gives to the ego's actions; NaN where it
+        failed.
+        """
         self._ask_at(scenes)
         return self.laid_out(scenes)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
         """Return the intents of n scenes where helpers are asked another question, `(n, ...)`.
 
-        Only the scenes at the indices `at` are asked, and only if a run asks all helpers; NaN
-        elsewhere.
+        `question` is what they are asked in place of what the ego should do as they see it. Only
+        the scenes at the indices `at` are asked, and only if a run asks all helpers; NaN elsewhere.
         """
         if self.spec.asks_all:
             self._ask_at([scenes[n] for n in at.tolist()], question=question)
@@ -343,7 +351,8 @@ class Asker:
     ) -> Intents:
         """Ask some helpers, those marked in `wanted`, `(n, H)`, of n scenes with H helpers.
 
-        Returns the intents of the scenes in which a helper is marked, in their order.
+        `question` is what they are asked; by default the plain one, what the ego should do as they
+        see it. Returns the intents of the scenes in which a helper is marked, in their order.
         """
         scenes, places = wanted_in(scenes, wanted)
         self._ask_at(scenes, places, question)
@@ -355,10 +364,11 @@ class Asker:
         question: Question = PLAIN,
         places: Places | None = None,
     ) -> list[bool]:
-        """Return for each scene whether an answer is missing.
+        """Return for each scene whether an answer to a question is missing.
 
         `places` restricts this to some vehicles of each scene, by their index in `Scene.viewers`,
-        the ego at 0; None for all. With another than the ordinary `question`, only helpers count.
+        the ego at 0; None for all. With another `question` than the plain one, what the ego should
+        do, only helpers count.
         """
         return list(self._lacking(scenes, self._has, question, places))
 
@@ -400,7 +410,8 @@ class Asker:
     ) -> Intents:
         """Return the answers that there are, of n scenes, as arrays of at least `width` vehicles.
 
-        Nothing is asked. A vehicle without an intent has NaN.
+        Nothing is asked. `question` is what helpers were asked; a vehicle without an intent has
+        NaN.
         """
         answers = [self._answers_in(scene, question) for scene in scenes]
         return intents_of(self.spec, self.latency, scenes, answers, width)
@@ -459,8 +470,9 @@ class Asker:
     ) -> list[Request]:
         """Return the requests that ask egos once more, with each set of messages that one heard.
 
-        `codes`, `(K,)`, has for each set an integer that says in which scene who was heard
-        (`fusion.codes_of`), with the scenes in this order; `rewrites` says how messages are shown.
+        `codes`, `(K,)`, has for each of K sets an integer that says in which scene who was heard
+        (`fusion.codes_of`), by index in `scenes`; `rewrites` says how messages are changed and
+        shown.
         """
         sets = list(heard_sets(scenes, codes, rewrites))
         lacks = [not self._has(fusion_id(*each)) for each in sets]
@@ -480,7 +492,10 @@ class Asker:
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:
-        """Announce requests to `more`, and ask those whose answers are missing; raises as `ask`."""
+        """Call `more` with the number of requests, and ask those whose answers are missing.
+
+        Raises Unanswered if a question of the ego or a fusion call got no answer, or many in a row.
+        """
         # Requests whose answers were kept stay, so that the chunks begin at the same places as
         # before.
         requests_to_ask = [request for request in requests if request.id not in self._given]

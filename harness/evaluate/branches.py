@@ -21,7 +21,9 @@ from harness.world.world import Target, World
 class Decision:
     """Hold one agent's chosen action and the simulation frame in which it takes effect.
 
-    An agent is a vehicle that decides for itself.
+    An agent is a vehicle that decides for itself. `acted` says whether it has taken effect, and
+    `ttc_s` and `pet_s` how near others came in time, s, until the agent's next decision: least time
+    to collision and least post-encroachment time, inf if nothing is near.
     """
 
     action: str  # name of the meta-action
@@ -38,11 +40,13 @@ class Decision:
 class Course:
     """Hold one episode under one condition and channel seed, while it is driven.
 
-    Agents, vehicles that decide for themselves, are numbered by their place among the vehicles of
-    the world; 0 is the ego.
+    `point` is the condition: its settings of channel, asking and fusion. Agents, vehicles that
+    decide for themselves, are numbered by their index among the vehicles of the world; 0 is the
+    ego. `open` has by agent the decision that has not taken effect yet, `last` the latest one, and
+    `skipped` counts those that did not begin, since one was still open.
     """
 
-    point: OperatingPoint  # the condition
+    point: OperatingPoint  # the condition: its settings of channel, asking and fusion
     seed: int  # seed of the channel's draws
     # by agent its decision that has not taken effect yet; until then the agent keeps to its last
     # action
@@ -54,7 +58,12 @@ class Course:
 
 @dataclass
 class Trajectory:
-    """Hold a simulated world and the episodes that still share it, having acted alike so far."""
+    """Hold a simulated world and the episodes that still share it, having acted alike so far.
+
+    `number` is that of the layout's episode in the run, and `courses` are the episode under each
+    condition and channel seed that shares the world. A condition is a named set of settings of
+    channel, asking and fusion. A layout is one start situation of a scenario.
+    """
 
     number: int  # number of the layout's episode in the run
     world: World  # the simulated world
@@ -75,7 +84,7 @@ class Trajectory:
         """Add how near others came to each agent to its latest decision, and count anew.
 
         That is the least time to collision and the least post-encroachment time, in s, since the
-        last call.
+        last call. An agent is a vehicle that decides for itself.
         """
         for agent, journey in self.world.journeys.items():
             for decision in (course.last[agent] for course in self.courses if agent in course.last):
@@ -86,7 +95,8 @@ class Trajectory:
     def act(self) -> list["Trajectory"]:
         """Apply decisions whose frame has come, and return a trajectory for each way to go on.
 
-        Episodes that now aim at different speeds or lanes part: the world is copied for each.
+        A trajectory is a simulated world that several episodes share. Those that now aim at
+        different speeds or lanes part: the world is copied for each.
         """
         world, agents = self.world, tuple(self.world.journeys)
         now = tuple(world.target(agent) for agent in agents)
@@ -128,8 +138,9 @@ class Trajectory:
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
     """Simulate each trajectory to a frame, or to its end, and apply decisions in their frames.
 
-    A trajectory whose episodes take different actions parts into several. Returns all that there
-    are then, in the order of those given.
+    A trajectory is a simulated world that several episodes share; if these take different actions
+    it parts into several. `until_frame` is the number of the simulation frame, from 0. Returns all
+    trajectories that there are then, in the order of those given.
     """
     running: list[tuple[tuple[int, ...], Trajectory]] = [
         ((n,), t) for n, t in enumerate(trajectories)

@@ -16,7 +16,9 @@ Form = Literal["json", "readout"]
 class Asking:
     """Describe how single vehicles are asked outside of a run, without messages of others.
 
-    Raises UserError if the prompt shows pictures or does not fit the scenario.
+    `scenario` is that of the scenes to ask about, `prompt` the prompt version, and `answer` is
+    `json`, or `readout`: one letter. Raises UserError if the prompt shows pictures or does not fit
+    the scenario.
     """
 
     scenario: Scenario  # the scenario of the scenes, whose actions and words the chats have
@@ -38,10 +40,10 @@ class Asking:
 
     @classmethod
     def of(cls, scenario: Scenario, prompt: str | None, answer: str) -> "Asking":
-        """Return an `Asking` with a prompt version by name, or the scenario's own if None.
+        """Return an `Asking` for a scenario's scenes, with a prompt version by name.
 
-        `answer` is `json` or `readout`. Raises UserError if there is no such version, or it cannot
-        be used.
+        None is the scenario's own version. `answer` is `json` or `readout`. Raises UserError if
+        there is no such version, or it cannot be used.
         """
         return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
 

@@ -24,14 +24,20 @@ if TYPE_CHECKING:
 
 
 class Follower(Protocol):
-    """Describe what an extension is told of one run while it goes, such as to a tracker."""
+    """Describe what an extension, such as one for a tracker, is told of one run while it goes."""
 
     def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
-        """Return a function of a number of new answers that calls `progress`, too."""
+        """Return a function that takes a number of new answers and also calls `progress` with it.
+
+        `progress` is what the run would call without this extension.
+        """
         ...
 
     def end(self, done: "Evaluated") -> None:
-        """Take note that the run is finished, with its page."""
+        """Take note that the run is finished and has its page.
+
+        `done` has its folder, manifest and scores.
+        """
         ...
 
 
@@ -47,6 +53,8 @@ class CommandOption(ABC):
     """Describe an option of `harness eval` and `harness drive` that changes nothing of a run.
 
     It may tell others of the runs while they go (`follow`), or stop them (`guard`); a base class.
+    `kind` is the type of its value, `metavar` what the help calls it, and `follows` says whether it
+    follows whole runs.
     """
 
     kind: ClassVar[Any]  # of its value: str, int, float, bool or list[str]
@@ -55,21 +63,25 @@ class CommandOption(ABC):
     follows: ClassVar[bool] = False  # whether it follows whole runs
 
     def follow(self, value: Any, instead: str) -> Follow | None:
-        """Return what follows each run of the command; None for nothing.
+        """Return what is to be told of each run of the command, a function; None for nothing.
 
-        `value` is what is typed, None where nothing is. `instead` names what the command makes in
-        place of whole runs, such as a shard, which nothing follows; it is empty for runs. Raises
-        UserError for a value that is not allowed.
+        The function takes the run's folder and its settings as in `run.json`, and returns a context
+        with a `Follower`; if the context is left by an error, the run was stopped. `value` is what
+        is typed, None where nothing is. `instead` names what the command makes in place of whole
+        runs, such as a shard (a part of one), of which nothing is told; it is empty for runs.
+        Raises UserError for a value that is not allowed.
         """
         return None
 
     def guard(
         self, value: Any, specs: "Sequence[Spec]", workers: "Workers"
     ) -> AbstractContextManager[Guard | None]:
-        """Enter a context with what may refuse to ask in the command's evaluations; None for
-        nothing.
+        """Enter a context with a function that may stop the evaluations' asking, or None.
 
-        `value` is as in `follow`. Raises UserError for a value that is not allowed.
+        The function takes a model's card and backend, and returns the backend wrapped so that it
+        may refuse to ask, by Unanswered. `value` is what is typed, None where nothing is; `specs`
+        are the evaluations, and `workers` what runs them. Raises UserError for a value that is not
+        allowed.
         """
         return nullcontext()
 
@@ -78,9 +90,12 @@ OPTIONS = Shipped[CommandOption]("swarmdrive.options", CommandOption, {})
 
 
 def follows(typed: Mapping[str, Any], instead: str = "") -> Sequence[Follow]:
-    """Return what follows each run of a command, by what is typed for options of extensions.
+    """Return what is to be told of each run of a command, a function for each option typed.
 
-    `instead` is as in `CommandOption.follow`. Raises UserError for a value that is not allowed.
+    A function takes the run's folder and its settings as in `run.json`, and returns a context with
+    a `Follower`. `typed` has the values of extensions' options by name. `instead` names what the
+    command makes in place of whole runs, such as a shard; it is empty for runs. Raises UserError
+    for a value that is not allowed.
     """
     each_follows = []
     for name, option in OPTIONS.usable().items():
@@ -93,9 +108,10 @@ def follows(typed: Mapping[str, Any], instead: str = "") -> Sequence[Follow]:
 def guarded(
     typed: Mapping[str, Any], specs: "Sequence[Spec]", workers: "Workers"
 ) -> "Iterator[list[Spec]]":
-    """Enter a context with a command's evaluations, guarded by what is typed.
+    """Enter a context with a command's evaluations, to which what may stop their asking is added.
 
-    Raises UserError for a value that is not allowed.
+    `typed` has the values of extensions' options by name (`CommandOption.guard`), and `workers` is
+    what runs the evaluations. Raises UserError for a value that is not allowed.
     """
     guards = list[Guard]()
     with ExitStack() as stack:

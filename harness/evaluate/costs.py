@@ -25,17 +25,24 @@ FILE = "costs.jsonl"
 
 
 class Asked(msgspec.Struct, frozen=True):
-    """Hold the token counts of completions that one model was asked for in one call."""
+    """Hold the token counts of completions that one model was asked for in one call.
+
+    `asked` counts the completions, of which `uncounted` have no token counts; `read` and `written`
+    are the tokens of the others' prompts and answers.
+    """
 
     model: str  # name of the model's card
     asked: Whole  # number of completions
     uncounted: Whole  # how many of them have no token counts: failed ones, as a rule
-    read: Whole  # tokens of the others' prompts
+    read: Whole  # tokens of the prompts of those that are counted
     written: Whole  # tokens of their answers
 
     @classmethod
     def of(cls, model: str, completions: Sequence[Completion]) -> "Asked":
-        """Return the counts of a model's completions."""
+        """Return the token counts of a model's completions; `model` is the name of its card.
+
+        A card is the file that describes the model.
+        """
         counted = [
             (each.prompt_tokens, each.completion_tokens)
             for each in completions
@@ -50,9 +57,10 @@ def metered(
 ) -> list[Backend]:
     """Return agents' backends, wrapped so that the cost of those with a price is counted.
 
-    A price stands in a model's card; `cards` and `backends` are in the order of the agents. Counts
-    go to a file in the working folder `work`; nothing is counted with None. `guards`, which may
-    refuse to ask, wrap each backend, too.
+    A backend is the code that runs a model, an agent the model with its prompt. A price stands in
+    the model's card, the file that describes it; `cards` and `backends` are in the order of the
+    agents. Counts go to a file in the working folder `work`; nothing is counted with None.
+    `guards`, functions that may make a backend refuse to ask, wrap each one, too.
     """
     models = []
     for card, backend in zip(cards, backends, strict=True):
@@ -63,7 +71,10 @@ def metered(
 
 
 class Metered:
-    """Wrap a backend and count the tokens of its completions; all else is as in the backend."""
+    """Wrap a backend, the code that runs a model, and count the tokens of its completions.
+
+    Counts are appended to a file in a working folder; all else is as in the backend.
+    """
 
     def __init__(self, backend: Backend, model: str, work: Path) -> None:
         self._backend, self._model, self._work = backend, model, work
@@ -81,7 +92,8 @@ class Metered:
 def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]:
     """Return what the questions counted in working folders cost, by model name.
 
-    `settings` are a run's record. A model without a price or without a question is left out.
+    `settings` are a run's record, the content of its `run.json`, with the prices; `works` are the
+    folders. A model without a price or without a question is left out.
     """
     prices = {}
     for model in (settings["model"], *(helper["model"] for helper in settings["helpers"])):

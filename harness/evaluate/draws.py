@@ -21,12 +21,13 @@ def _channel_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> 
 
 
 def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
-    """Return the channel's random draws for n decisions, by their keys.
+    """Return the channel's random draws for n decisions: whether messages are lost, and how late.
 
-    The keys are the seed of the channel's draws, the seed of the episode's layout and the number of
-    the decision in its episode, `(n,)` each; so every condition, prompt and model has the same
-    draws. Episodes have at most `steps` decisions, and each decision has draws for the links to
-    `helpers` helpers. Whether a link is up is drawn once an episode, jitter at each step.
+    The draws' keys are the seed of the channel, the seed of the episode's layout (start situation)
+    and the number of the decision in its episode, `(n,)` each; so every condition, prompt and model
+    has the same draws. Episodes have at most `steps` decisions, and each decision has draws for the
+    links to `helpers` helpers. Whether a link is up is drawn once an episode, jitter at each step.
+    A condition is a named set of settings of channel, asking and fusion.
     """
     seeds, seed_index = np.unique(seed, return_inverse=True)
     layouts, layout_index = np.unique(layout_seed, return_inverse=True)
@@ -55,8 +56,9 @@ def tie_draws(draws: Draws, ties: str) -> TieDraws | None:
     """Return the function that draws among equally likely actions, for n decisions.
 
     It takes a mask, `(n,)`, of the decisions that have such a tie and returns a number in [0, 1)
-    for each of these. None if `ties` is `first`, or the draws are of no layouts: the first such
-    action is then taken. Keys are those of `draws`: seed, layout and step, as in `channel_draws`.
+    for each of these. None if `ties` is `first` (not `drawn`), or the draws are of no layouts: the
+    first such action is then taken. Keys are those of `draws`: channel seed, layout seed and the
+    decision's number in its episode.
     """
     trips = draws.trips
     if ties == "first" or trips is None:

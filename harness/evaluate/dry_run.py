@@ -19,10 +19,11 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     """Return how many requests an evaluation would make, and how long and dear its prompts are.
 
     The dict has the settings, `requests`, `requests_by_role`, `scenes`, `prompt_tokens` by role
-    (None if no tokenizer is found) and, if a card has a price, `cost` by model, with answers as
-    long as they may be. Tokens are counted by the file `tokenizer`; None takes the ego's. Who asks
-    a helper depends on answers, so numbers of helpers' requests and fusion calls are the most
-    possible unless all are asked. `cost` has no fusion calls and no repair turns.
+    (None if no tokenizer is found) and, if a model has a price, `cost` by model, with answers as
+    long as they may be. Tokens are counted by the file `tokenizer`; None takes that of the ego's
+    model. Who asks a helper depends on answers, so numbers of helpers' requests and fusion calls
+    are the most possible unless all are asked. `cost` has no fusion calls (second questions with
+    the messages heard) and no repair turns (second questions after a failed answer).
     """
     tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}
@@ -68,8 +69,9 @@ def lacking(
 ) -> dict[str, int]:
     """Return how many questions about some scenes have no answer yet, by role.
 
-    `scenes` are ids, `answers` request ids. All questions count that any condition may ask there,
-    whoever is heard.
+    `scenes` are ids of scenes of the dataset, `answers` the ids of requests that have one. All
+    questions count that any condition may ask there, whoever is heard. A condition is a named set
+    of settings of channel, asking and fusion.
     """
     lacks, sends = (
         Counter[str](),

@@ -16,13 +16,17 @@ STEP = 1.5e-6
 def wanted(request: Request, answer: Answer) -> bool:
     """Return whether a read-out is to be asked again with its list of actions reversed.
 
-    That needs an answer to compare with, and a request that has the reversed chats (`flips`).
+    A read-out is an answer by one letter per action. That needs an answer to compare with, and a
+    request that has the reversed chats (`flips`).
     """
     return bool(request.flips) and answer.intent is not None and answer.flipped is UNSET
 
 
 def mirror_request(request: Request) -> Request:
-    """Return the request that asks the same with the list of actions reversed."""
+    """Return the request that asks the same with the list of actions reversed.
+
+    The request must have the reversed chats (`flips`).
+    """
     messages, *orders = request.flips
     return request.alike(
         messages=messages, orders=tuple(orders), flips=(), actions=request.actions[::-1]
@@ -32,7 +36,8 @@ def mirror_request(request: Request) -> Request:
 def compared(answer: Answer, mirror: Answer) -> Answer:
     """Return `answer` with `flipped` set: whether its likeliest action differs in `mirror`.
 
-    `mirror` is the answer to the reversed list. `answer` stays as it is if either did not parse.
+    `mirror` is the answer to the same question with the list of actions reversed. `answer` stays as
+    it is if either did not parse.
     """
     if answer.intent is None or mirror.intent is None:
         return answer

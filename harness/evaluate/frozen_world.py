@@ -33,11 +33,16 @@ MOST_KNOWN = 20
 
 @dataclass(frozen=True)
 class FrozenSource:
-    """Describe the recorded scenes to evaluate on: some or all episodes of a dataset."""
+    """Describe the recorded scenes to evaluate on: some or all episodes of a dataset.
+
+    `dataset` is cut to the episodes that are used; these were the first `limit` of what `choice`
+    chose, None for all.
+    """
 
     dataset: Dataset  # the dataset, cut to the episodes that are used
-    limit: int | None = None  # how many were asked for, from the first; None for all
-    choice: Choice | None = None  # what chose them before that; None for all
+    limit: int | None = None  # how many episodes were asked for, from the first; None for all
+    # what chose some of the dataset's episodes before that; None for all
+    choice: Choice | None = None
     kind: ClassVar[World] = "frozen"
 
     def __post_init__(self) -> None:
@@ -80,7 +85,7 @@ class FrozenSource:
         return self.dataset.episodes
 
     def first(self, count: int) -> "FrozenSource":
-        """Return this source with at most so many of its episodes, from the first."""
+        """Return this source with at most `count` of its episodes, from the first."""
         numbers, limit = self.dataset.episodes[:count], self.limit
         if len(numbers) < len(self.dataset.episodes):
             limit = len(numbers)
@@ -110,9 +115,10 @@ class FrozenSource:
         ]
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
-        """Yield the first scene of each of up to `most` episodes.
+        """Yield the first scene of each of up to `most` episodes, such as to time a model on.
 
-        It has what every vehicle knows, its scene graph, also with `ego_alone`.
+        It has what every vehicle knows, its scene graph, even if only the ego is asked
+        (`ego_alone`).
         """
         forest = self.dataset.forest
         for root in forest.root[:most].tolist():
@@ -151,12 +157,12 @@ class _Layout(NamedTuple):
 
 
 class FrozenWorld(SceneWorld):
-    """Play recorded scenes: walk the decision tree of each layout under all conditions.
+    """Play recorded scenes: go through the decision tree of each layout under all conditions.
 
     A decision tree has every scene that decisions can lead to from one start situation, the layout,
-    and how each course ends. There is one walk for each episode, condition and channel seed. An
-    action takes effect one decision lag of the dataset after its scene, however long the decision
-    took.
+    and how each course ends. A condition is a named set of settings of channel, asking and fusion;
+    there is one course (walk) for each episode, condition and channel seed. An action takes effect
+    one decision lag of the dataset after its scene, however long the decision took.
     """
 
     def __init__(
@@ -177,7 +183,11 @@ class FrozenWorld(SceneWorld):
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return a condition's decisions in the scenes just shown, one for each open walk."""
+        """Return a condition's decisions in the scenes just shown, one for each course still open.
+
+        There is a course for each episode and channel seed; `point` is the condition, its settings
+        of channel, asking and fusion.
+        """
         walks, forest = self._walks[point], self._forest
         undecided = walks.at >= 0
         seed_index, tree = np.nonzero(undecided)
@@ -203,9 +213,11 @@ class FrozenWorld(SceneWorld):
         return self._luck
 
     def leave_out(self, point: OperatingPoint, at: Bools) -> None:
-        """End the walks of a condition at some of the scenes just shown, and drop their results.
+        """End the courses of a condition at some of the scenes just shown, and drop their results.
 
-        `at` says of each scene whether it is one of them.
+        There is a course for each episode and channel seed. `point` is the condition, and the mask
+        `at` says of each scene whether it is one of them. A condition is a named set of settings of
+        channel, asking and fusion.
         """
         walks = self._walks[point]
         undecided = walks.at >= 0
@@ -229,9 +241,11 @@ class FrozenWorld(SceneWorld):
     def columns(self) -> dict[str, Any]:
         """Return what each decision and its alternatives were worth, as columns by name, `(n,)`.
 
-        The n decisions are in the order of the calls of `step`. Columns are whether success was
-        possible (`value`), whether the action was safe, its regret, delay in s, misses and false
-        alarms, how near others came in time, and safety and delay of every action.
+        The n decisions are in the order of the calls of `step`, which plays them. `value` is
+        whether success was possible, `safe` whether it still is, `regret` whether the action gave
+        it away; `delay_s` by how much it puts off the earliest success, s; `miss` and `false_alarm`
+        whether it made harm inevitable, or success alone impossible. Others are how near vehicles
+        came in time, s, and safety and delay of every action.
         """
         at, action, latency_s = map(np.concatenate, zip(*self._decided, strict=True))
         forest, p = self._forest, self.scenario.parameters
@@ -258,7 +272,8 @@ class FrozenWorld(SceneWorld):
         """Return how each episode of a condition ended, by name of a metric, `(S, E)`.
 
         Values are 0 or 1, by S channel seeds and E episodes; NaN where one was left out. Success
-        with a danger and without is NaN in the other episodes as well.
+        with a danger is NaN in episodes without one, and the other way round. `point` is the
+        condition, its settings of channel, asking and fusion.
         """
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])

@@ -30,7 +30,12 @@ FROM = "from:"  # in a key, before the id of the other scene that a message come
 
 @dataclass(frozen=True)
 class FusionAnswers:
-    """Hold what the ego answered to K sets of messages that it may hear, with A actions."""
+    """Hold what egos answered to K sets of messages that they may hear, with A actions.
+
+    Each is a fusion call: the ego's model is asked again, with the messages in its prompt. `codes`,
+    (K,), says of each set in which scene who was heard (`codes_of`); `intents`, (K, A), are the
+    probabilities of actions after it, and `seconds`, (K,), the time of the call.
+    """
 
     # the decision point of each set and who was heard in it (`codes_of`), ascending, (K,)
     codes: Ints
@@ -38,12 +43,12 @@ class FusionAnswers:
     seconds: Floats  # time of each fusion call, (K,)
 
     def at(self, points: Ints, attackers: Bools | None = None) -> FusionCall:
-        """Return a function that answers n decisions, given who was heard in each, `(n, H)`.
+        """Return a function that answers n decisions, given who of H helpers was heard, `(n, H)`.
 
-        `points`, `(n,)`, has each decision's point in the codes, and `attackers`, `(n, H)`, who
-        attacks, if the prompt depends on it. The function returns intents `(n, A)` and seconds
-        `(n,)`, NaN where nobody was heard; it raises LookupError for a set of messages that the ego
-        was never asked about.
+        `points`, `(n,)`, has the index of each decision's scene, as in `codes`, and `attackers`,
+        `(n, H)`, who attacks, if the prompt depends on it. The function returns intents,
+        probabilities of A actions, `(n, A)`, and seconds `(n,)`, NaN where nobody was heard; it
+        raises LookupError for a set of messages that the ego was never asked about.
         """
         return partial(self._of_heard, points, attackers)
 
@@ -68,19 +73,20 @@ class FusionAnswers:
 def codes_of(on_time: Bools, points: Ints, attackers: Bools | None = None) -> Ints:
     """Return an integer for each of n decisions, `(n,)`, that says where it is and who was heard.
 
-    `on_time`, `(n, H)`, says which of H helpers were heard, and `points`, `(n,)`, is the index of
-    the decision point. With `attackers`, `(n, H)`, the integer also says which of those heard
-    attack. `heard_in` decodes it.
+    `on_time`, `(n, H)`, says which of H helpers were heard in time, and `points`, `(n,)`, is the
+    index of the decision's scene in a list of the caller's. With `attackers`, `(n, H)`, the integer
+    also says which of those heard attack. `heard_in` decodes it.
     """
     flags = on_time if attackers is None else np.concatenate([on_time, on_time & attackers], axis=1)
     return np.asarray(points << flags.shape[1] | flags @ (1 << np.arange(flags.shape[1])))
 
 
 def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list[int], list[int]]:
-    """Decode an integer of `codes_of`: return the decision point, who was heard and who attacks.
+    """Decode an integer of `codes_of`: return the decision's scene, who was heard and who attacks.
 
-    The point is an index, as are the helpers in the two lists, from 0 to `helpers` - 1. `attacked`
-    says whether the code was made with `attackers`.
+    `code` says where a decision is and whom it heard. The scene is an index in the list that the
+    codes were made for, and the two lists have indices of helpers, from 0 to `helpers` - 1.
+    `attacked` says whether the code was made with `attackers`.
     """
     bits = helpers * (1 + attacked)
     heard = [h for h in range(helpers) if code >> h & 1]
@@ -90,11 +96,12 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
 def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> str:
     """Return the text that names a helper's message, and how it is shown, in a fusion call's id.
 
-    A fusion call asks the ego's model again, with the messages. `rewrites` says how messages are
-    changed and shown; with `attacks`, changes by an attack are named, too. Such as `v2`, `v2~blind`
-    (another question), `v3!liar&schema` (changed by attack and defence), `v2!text` where it holds
-    words alone, `v2!objects` where the ego's graph has its objects, or `v2!objects&from:00012-3`
-    where it comes from the scene `source`.
+    A fusion call asks the ego's model again, with the messages. `helper` is the sender's id, and
+    `rewrites` says how messages are changed and shown; with `attacks`, changes by an attack are
+    named, too. Such as `v2`, `v2~blind` (another question), `v3!liar&schema` (changed by attack and
+    defence), `v2!text` where it holds words alone, `v2!objects` where the ego's scene graph has its
+    objects, or `v2!objects&from:00012-3` where it comes from the scene `source`. A scene graph is
+    what one vehicle knows of a scene.
     """
     of_attackers, of_all = rewrites.changes
     changed = [*([of_attackers] if attacks and of_attackers else []), *of_all]
@@ -109,9 +116,11 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
 def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools) -> list[str]:
     """Return the texts that name the plans that one agent has heard, for its fusion call's id.
 
-    The agent is that of `row` in `intents`; `on_time`, `(H,)`, says whom it heard. Such as
-    `v2!plan:1:0.10,0.70,0.20:3.4:0.0`: the sender's number, its intent, and the seconds in which it
-    reaches the conflict, and that it has lost.
+    An agent is a vehicle that decides for itself; here it is that of index `row` in `intents`.
+    `helpers` are the ids of the H other vehicles, and `on_time`, `(H,)`, says whom it heard. A text
+    is such as `v2!plan:1:0.10,0.70,0.20:3.4:0.0`: the sender's id and number, its intent, and the
+    seconds in which it reaches the conflict, and that it has lost. A fusion call asks the ego's
+    model again, with the messages that it heard.
     """
     plans = intents.plans
     assert plans is not None
@@ -150,7 +159,12 @@ def _plan_of(key: str) -> dict[str, Any] | None:
 
 
 class Marks(NamedTuple):
-    """Hold what the key of a message that the ego heard (`key_of`) says after the sender's name."""
+    """Hold what the key of a message that the ego heard (`key_of`) says after the sender's name.
+
+    `changes` names what attacks and defences changed of the message, and `whole` says whether the
+    prompt showed all of it. `call` is the kind of question in which only objects or words of it are
+    shown, None if the prompt just has the message.
+    """
 
     changes: list[str]  # names of what attacks and defences changed of it, in order
     # the second question to the ego's model that shows objects or words of it; None if the prompt
@@ -160,7 +174,10 @@ class Marks(NamedTuple):
 
 
 def marks_of(key: str) -> Marks:
-    """Return what the key of a message that the ego heard says of how it was shown."""
+    """Return what the key of a message that the ego heard says of how it was shown.
+
+    The key (`key_of`) is a text such as `v3!liar&schema`: sender, attack and defence.
+    """
     changes, call, whole, named = [], None, False, calls()
     for mark in filter(None, key.partition(REWRITTEN)[2].split("&")):
         if mark == WHOLE:
@@ -175,7 +192,8 @@ def marks_of(key: str) -> Marks:
 def source_of(scene: str, senders: Sequence[str]) -> str:
     """Return the id of the scene whose helpers sent what an ego heard, by the messages' keys.
 
-    That is `scene`, the ego's own, unless a key says otherwise.
+    `senders` are these keys (`key_of`). The scene is `scene`, the ego's own, unless a key says
+    otherwise.
     """
     changes = (change for key in senders for change in key.partition(REWRITTEN)[2].split("&"))
     return next((change.removeprefix(FROM) for change in changes if change.startswith(FROM)), scene)
@@ -190,7 +208,8 @@ def messages_of(
     `actions` are the names of the meta-actions, in order. A message has `sender`, `intent` and the
     fields of its answer; one of words alone `sender` and `evidence`, in one line. An agent's plan
     has `sender`, `number`, `intent`, `reaches_s` (None if it stands or has passed) and `lost_s`. A
-    message whose objects are in the ego's graph, or whose answer failed, is left out.
+    message whose objects are in the ego's graph, or whose answer failed, is left out. An agent is a
+    vehicle that decides for itself.
     """
     messages = []
     for sender in senders:

@@ -22,7 +22,8 @@ _DECODER, _ENCODER = msgspec.json.Decoder(Answer), msgspec.json.Encoder()
 class KeptAnswers:
     """Read and append a stopped run's answers in a file, a JSON line each, in chunks.
 
-    Only one process at a time may append.
+    A chunk is what is written at once, and is read whole or not at all. Only one process at a time
+    may append.
     """
 
     def __init__(self, file: Path) -> None:
@@ -67,5 +68,8 @@ class KeptAnswers:
 
 
 def read_kept(file: Path) -> dict[str, Answer]:
-    """Return the answers in a file by request id; raises as `KeptAnswers.recall`."""
+    """Return the answers in a file of `KeptAnswers` by request id; engine errors are left out.
+
+    Raises UserError if the file is damaged.
+    """
     return KeptAnswers(file).recall()

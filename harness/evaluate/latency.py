@@ -31,8 +31,9 @@ def chosen_latency(
 ) -> Latency | None:
     """Return the inference times that `--latency` chooses for agents; None if they are measured.
 
-    `choice` is what was typed. Without it each agent has its own: those of the run that it replays,
-    else what its model's card declares, else the paper's. `backends` are those of `agents`, in
+    An agent is a model with its prompt. `choice` is what was typed. Without it each agent has its
+    own: those of the run that it replays, else what its model's card (the file that describes it)
+    declares, else the paper's. `backends`, the code that runs the models, are those of `agents`, in
     their order, the ego's first.
     """
     if choice not in (None, *NAMES):
@@ -57,8 +58,9 @@ def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
 def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
     """Return the ego's inference times with the helpers' replaced by those of their own models.
 
-    `helpers` has the times of each agent that answers for helpers; without any the ego's stay.
-    Raises UserError if one of them times each answer by itself.
+    `helpers` has the times of each agent that answers for helpers; without any the ego's stay. An
+    agent is a model, its prompt and how it answers. Raises UserError if one of them times each
+    answer by itself.
     """
     if not helpers:
         return ego
@@ -81,8 +83,9 @@ def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:
 def declared(text: str) -> Latency:
     """Return the latency of a text such as `ego=0.171,helper=0.164,fusion=0.2`, in seconds.
 
-    A role left out has the ego's time. Several agents of helpers have one time each:
-    `helper=0.164:0.2`. Raises UserError for any other text.
+    Fusion is a second question to the ego's model, with the messages that arrived. A role left out
+    has the ego's time. Several models of helpers have one time each: `helper=0.164:0.2`. Raises
+    UserError for any other text.
     """
     pairs = [part.partition("=") for part in text.split(",")]
     seconds: dict[str, list[float]] = {}
@@ -108,12 +111,15 @@ def declared(text: str) -> Latency:
 
 
 def same_times(one: Latency, other: Latency) -> bool:
-    """Return whether two latencies are of one source and give every answer the same seconds."""
+    """Return whether two latencies are of one source and give every answer the same seconds.
+
+    Where the times come from, in words, does not count.
+    """
     return replace(one, basis="", sample={}) == replace(other, basis="", sample={})
 
 
 def as_declared(latency: Latency) -> str:
-    """Return the text of inference times that `declared` reads as these."""
+    """Return inference times as `--latency` takes them: `ego=0.171,helper=0.164,fusion=0.2`."""
     helpers = ":".join(map(str, latency.helpers_s or (latency.helper_s,)))
     return f"ego={latency.ego_s},helper={helpers},fusion={latency.fusion_s}"
 
@@ -144,11 +150,11 @@ def inference_s(
 
 
 def fusion_s(latency: Latency, answers: Sequence[Answer], places: Sequence[int]) -> Floats:
-    """Return the seconds of K fusion calls, `(K,)`, counted as in `inference_s`.
+    """Return the seconds of K fusion calls, `(K,)`, a repair turn and declared delays included.
 
-    A fusion call is a second question to a deciding vehicle's model. `places` has the number of the
-    model that answers each, 0 the ego's. A vehicle with a helper's model takes as long as for any
-    other answer.
+    A fusion call is a second question to a deciding vehicle's model, with the messages that it
+    heard; `answers` has the answer of each. `places` has the number of the model that answers each,
+    0 the ego's. A vehicle with a helper's model takes as long as for any other answer.
     """
     if latency.speeds:
         return np.array([latency.answer_s(n, a) for n, a in zip(places, answers, strict=True)])

@@ -25,7 +25,11 @@ from harness.runs.stopping import STOPPING_RULES, InterimLooks
 
 
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
-    """Hold what a run begins with, kept in its working folder so that it resumes alike."""
+    """Hold what a run begins with, kept in its working folder so that it resumes alike.
+
+    `identity` is all that decides the models' answers, `latency` how long these take, `versions`
+    those of packages and code, and `command` the words of the command that repeats the run.
+    """
 
     created: str  # when the run began, UTC, ISO 8601
     command: tuple[str, ...] = ()  # words of the command that repeats the run
@@ -41,7 +45,7 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
         msgspec.structs.force_setattr(self, "versions", formats.versions(self.versions))
 
     def facts(self) -> dict[str, Any]:
-        """Return what must be equal in all shards of a run, by the name that an error gives it."""
+        """Return what must be equal in all shards (parts) of a run, by its name for errors."""
         versions = {
             f"version of {name}": v for name, v in self.versions.items() if name != "platform"
         }
@@ -73,10 +77,15 @@ def begin(
 ) -> RunStart:
     """Return the record of what a run begins with, or `run_start` if it resumes.
 
-    `run_start` is the record that a stopped run kept in the folder `out`, None without one.
-    `identity`, all that decides the models' answers, and `latency` are those of the models opened
-    now; `shard` is the part of a run, such as `1/3`, empty for all of it. Raises UserError if the
-    run was begun with a model of another identity.
+    Args:
+        spec: the evaluation.
+        out: the run's folder.
+        run_start: the record that a stopped run kept in the folder; None without one.
+        identity: all that decides the answers of the models opened now.
+        latency: how long these models take to answer.
+        shard: the part of a run, such as `1/3`; empty for all of it.
+
+    Raises UserError if the run was begun with a model of another identity.
     """
     if run_start is None:
         return RunStart(
@@ -98,7 +107,10 @@ def begin(
 
 
 def another_model(spec: Spec) -> str:
-    """Return the words of an error that a model is not the one that a run began with."""
+    """Return a phrase for errors: the model is not the one that a run began with, and how so.
+
+    `spec` is the evaluation, whose models it names.
+    """
     names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
     return f"another model behind {names} (its files, package versions or device differ)"
 
@@ -106,8 +118,9 @@ def another_model(spec: Spec) -> str:
 def as_finished(spec: Spec, run_start: RunStart, looks: InterimLooks | None = None) -> RunStart:
     """Return the record of a run as it finishes, to write into its manifest.
 
-    It has the tags of all commands, the dataset's present path, and measured times as declared
-    ones. A run that stopped early (`looks`) also states after how many layouts.
+    It has the tags of all commands that worked on it, the dataset's present path, and the times
+    that were measured as if they had been typed, so that a repeat measures none. A run that stopped
+    early (`looks`) also states after how many layouts.
     """
     spec = spec.changed(tag=tuple(dict.fromkeys((*run_start.tags, *spec.settings.tag))))
     # A repeat must not measure: other times would make other rows.
@@ -125,10 +138,10 @@ def as_finished(spec: Spec, run_start: RunStart, looks: InterimLooks | None = No
 
 
 def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
-    """Return the record of a stopped run in a folder; None if there is none.
+    """Return the record of a stopped run in a folder, which it began with; None if there is none.
 
-    `shard` is the part of the run, such as `1/3`, empty for all of it. Raises UserError if it is a
-    run with other settings.
+    `spec` is the evaluation now; `shard` is the part of the run, such as `1/3`, empty for all of
+    it. Raises UserError if it is a run with other settings.
     """
     run_start = work.start_of(out, RunStart)
     if run_start:
@@ -150,8 +163,9 @@ def _options(spec: Spec, command: str) -> str:
 
 
 def rules(versions: Mapping[str, str]) -> dict[str, str]:
-    """Return the versions of the rules that make decisions of answers:
-    parts of a run have the same.
+    """Return, of `versions` by name, those of the rules that make decisions of answers.
+
+    Parts of a run have the same.
     """
     return {f"version of {name}": versions[name] for name in formats.VERSIONS}
 
@@ -159,7 +173,8 @@ def rules(versions: Mapping[str, str]) -> dict[str, str]:
 def resumable(spec: Spec, out: Path) -> bool:
     """Return whether this command can go on with the work in `out`, and no process works there.
 
-    That is this run, stopped, or any run that was stopped before its first answer.
+    `spec` is the command's evaluation. The work is that of this run, stopped, or of any run that
+    was stopped before its first answer.
     """
     try:
         return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)
@@ -189,10 +204,11 @@ def finished(spec: Spec, out: Path) -> Evaluated:
 def finished_with(
     settings: Mapping[str, Any], out: Path, typed: Callable[[str], str] = lambda command: ""
 ) -> Evaluated:
-    """Return the finished run in a folder, compared with settings as `Spec.record` returns them.
+    """Return the finished run in a folder, compared with the settings of an evaluation.
 
-    Raises UserError if they differ or the run is damaged. `typed` takes the run's command and
-    returns in which options this one differs, for the error.
+    `settings` are plain values by name, such as `Spec.record` returns. `typed` takes the run's
+    command line and returns a phrase on the options in which this command differs, for the error.
+    Raises UserError if the settings differ or the run is damaged.
     """
     run = folder.read(out)
     stored = msgspec.json.decode(msgspec.json.encode(run.manifest))

@@ -46,15 +46,16 @@ from harness.world.world import World
 class LiveSource:
     """Describe the layouts of a scenario to drive in closed loop, as `harness drive` does.
 
-    A layout is one start situation, drawn by its seed; episode e has layout seed `first_seed` + e.
-    With a `choice`, only those of the episodes are driven.
+    A layout is one start situation, drawn by its seed; episode e of the `episodes` has layout seed
+    `first_seed` + e. `scenario_name` is the scenario's name, with settings as they are typed. With
+    a `choice`, only those of the episodes are driven.
     """
 
     first_seed: int  # layout seed of episode 0
     episodes: int  # number of episodes
     # name of the scenario, with settings as they are typed, such as `NAME:beacon_loss=0.3`
     scenario_name: str = scenarios.DEFAULT
-    choice: Choice | None = None  # what chose some of the episodes; None for all
+    choice: Choice | None = None  # what chose some of the episodes, such as a sample; None for all
     name: ClassVar[str] = "drive"
     kind: ClassVar[metrics.World] = "closed-loop"
 
@@ -64,7 +65,7 @@ class LiveSource:
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Return the numbers of the episodes to drive; a run that stops early has the first."""
+        """Return the numbers of the episodes to drive; a run that stops early drives the first."""
         return self.choice.numbers if self.choice else range(self.episodes)
 
     @property
@@ -88,7 +89,7 @@ class LiveSource:
         )
 
     def first(self, count: int) -> "LiveSource":
-        """Return this source with at most so many episodes, from the first; it has no `choice`."""
+        """Return this source with at most `count` episodes, from the first; it has no `choice`."""
         return replace(self, episodes=min(count, self.episodes))
 
     def settings(self) -> DriveSettings:
@@ -101,7 +102,8 @@ class LiveSource:
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
         """Yield one decision point of each of up to `most` episodes, at different times.
 
-        With `ego_alone` it has no scene graph of a helper.
+        With `ego_alone` it has no scene graph of a helper. A scene graph is what one vehicle knows
+        of a scene.
         """
         p = self.scenario.parameters
         for number in self.numbers[:most]:
@@ -115,8 +117,9 @@ class LiveSource:
 class LiveWorld(SceneWorld):
     """Simulate the episodes of layouts under all conditions and channel seeds.
 
-    Episodes of one layout, a start situation, that have acted alike so far share a simulation. A
-    decision takes effect in the first frame after its latency.
+    A condition is a named set of settings of channel, asking and fusion. Episodes of one layout, a
+    start situation, that have acted alike so far share a simulation. A decision takes effect in the
+    first frame after its latency.
     """
 
     def __init__(
@@ -262,9 +265,10 @@ class LiveWorld(SceneWorld):
     def columns(self) -> dict[str, Any]:
         """Return when each decision took effect, and how near others came, by column, `(n,)`.
 
-        The n decisions are in the order of the calls of `step`. Columns are `acts_at_s`, the time
-        in s at which it takes effect, `acted`, whether it did, and the least time to collision and
-        post-encroachment time in s until the agent's next decision.
+        The n decisions are in the order of the calls of `step`, which plays them. Columns are
+        `acts_at_s`, the time in s at which it takes effect, `acted`, whether it did, and the least
+        time to collision and post-encroachment time in s until the agent's next decision. An agent
+        is a vehicle that decides for itself.
         """
         ttc_s = np.array([decision.ttc_s for decision in self._decisions])
         pet_s = np.array([decision.pet_s for decision in self._decisions])
@@ -282,9 +286,11 @@ def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episod
     """Return the record of each ended episode, one for each course of each trajectory.
 
     A trajectory is a simulated world, a course an episode of it under one condition and channel
-    seed. A success is late if it takes too long against a full-view driver whose decisions act
-    after the lag. Where several agents decide nobody is late: no such driver exists for all of them
-    together.
+    seed. A success is late if it takes too long against a driver that sees everything and whose
+    decisions act after the lag (the dataset's time from a decision to its action). Where several
+    agents decide nobody is late: no such driver exists for all of them together. A condition is a
+    named set of settings of channel, asking and fusion. An agent is a vehicle that decides for
+    itself.
     """
     if agent_share(scenario):
         alone_s = alone(scenario, list(dict.fromkeys(t.world.seed for t in trajectories)))

@@ -35,8 +35,8 @@ DRIVER = "driver"  # the engine of what has no model and no prompt
 def spec_of(run: Run, source: FrozenSource) -> Spec:
     """Return the evaluation by which a finished run's recorded scenes were answered.
 
-    It has no conditions; `source` has the scenes. Raises UserError if a prompt of it is not
-    installed here.
+    It has the run's models, prompts and settings, and no conditions; `source` has the scenes.
+    Raises UserError if a prompt of it is not installed here.
     """
     manifest = run.manifest
     ego, *helpers = (_agent(run, record) for record in (manifest.agent(0), *manifest.helpers))
@@ -54,7 +54,7 @@ def card_here(card: Card) -> Card:
 
 
 def points_of(run: Run) -> dict[str, OperatingPoint]:
-    """Return a run's operating points by condition name.
+    """Return the settings of a run's conditions, of channel, asking and fusion, by condition name.
 
     Raises UserError if a channel, network, schedule or other file that they name has changed since.
     """

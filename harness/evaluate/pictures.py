@@ -47,9 +47,10 @@ def blank(size_px: tuple[int, int]) -> Image:
 
 
 def another(spec: Spec, scene: Scene) -> Scene:
-    """Return a random scene of the same step in another episode, always the same for a scene's id.
+    """Return a random scene of another episode, to show its picture as a control.
 
-    Raises UserError if there is none.
+    It is as many decisions into its episode, and always the same for a scene's id. Raises UserError
+    if there is none.
     """
     assert isinstance(spec.source, FrozenSource), "Spec refuses another scene in the closed loop"
     dataset = spec.source.dataset

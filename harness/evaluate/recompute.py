@@ -74,9 +74,10 @@ REPLAY = "replay"  # the engine of stored answers
 
 
 class Held:
-    """Ask a rule-based model, and count its answers that a run states otherwise: a backend.
+    """Ask a rule-based model in a run's place, and count the run's answers that differ: a backend.
 
-    `wrong` is that count. Identity and latency are the run's.
+    A backend is the code that gives answers. `wrong` is that count. Identity and latency are the
+    run's.
     """
 
     def __init__(self, rule: Backend, kept: Kept) -> None:
@@ -98,7 +99,8 @@ def computed(run: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -
     """Compute a run again from its stored answers into folder `out`.
 
     Returns the new run, and how many stored answers differ from those of the rule-based model
-    installed here; 0 for other models. `progress` gets the number of answers.
+    installed here; 0 for other models. `spec` is the run's evaluation, and `progress` is called
+    with the number of answers that were read.
     """
     kept, held = Kept(run), list[Held]()
 
@@ -123,10 +125,10 @@ def computed(run: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -
 def differences(
     run: Run, dataset: Dataset, out: Path, progress: Callable[[int], None]
 ) -> tuple[list[str], list[str]]:
-    """Compute a run of frozen scenes again, in an empty folder, and compare.
+    """Compute a run of recorded scenes again, in an empty folder, and compare.
 
     Returns two lists of sentences: what the run's tables say otherwise than the new ones, and which
-    columns it lacks, as a run by older rules may.
+    columns it lacks, as a run of an earlier version may.
 
     Args:
         run: the run, which is not changed.
@@ -191,10 +193,10 @@ def _unchecked_choice(record: Mapping[str, Any]) -> Iterator[str]:
 
 
 def refuse_otherwise(run: Run, spec: Spec) -> None:
-    """Raise UserError if a finished run is not what its own answers make under its evaluation.
+    """Raise UserError if a finished run's tables are not what its answers make, computed again.
 
-    For a run that work goes on from, and that anybody may have written. No model is asked; of a
-    driven run a few episodes are driven again.
+    For a run that work goes on from, and that anybody may have written. `spec` is its evaluation.
+    No model is asked; of a run in the simulator a few episodes are driven again.
     """
     looks = run.manifest.interim_looks
     if not isinstance(spec.source, FrozenSource):
@@ -263,7 +265,7 @@ def _null(table: Any, name: str) -> bool:
 
 
 def texts_otherwise(run: Run) -> Iterator[str]:
-    """Yield sentences on what answers.jsonl says otherwise than its texts.
+    """Yield a sentence for each field of answers that is not what parsing their texts again gives.
 
     Raises UserError if a prompt of the run is neither here nor kept in it.
     """
@@ -273,7 +275,7 @@ def texts_otherwise(run: Run) -> Iterator[str]:
 
 
 def driven_otherwise(run: Run) -> Iterator[str]:
-    """Yield sentences on what a closed-loop run's latency and episodes.csv get wrong.
+    """Yield sentences on what a closed-loop run's latency and `episodes.csv` get wrong.
 
     A few episodes are simulated again with the recorded actions. Raises UserError if the scenario
     is not here as it was.
@@ -341,10 +343,10 @@ def _of_card(run: Run, card: Card) -> Iterator[str]:
 
 
 def asked_card(run: Run) -> Card:
-    """Return the card of the model that was asked, as the run states it;
-    of answers that are replayed, that of the first run.
+    """Return the card (description) of the model that was asked, as the run states it.
 
-    Raises UserError if it states none.
+    Of answers that are replayed it is that of the first run. Raises UserError if the run states
+    none.
     """
     model: Any = run.manifest.model
     identity: Any = run.manifest.identity
@@ -358,7 +360,10 @@ def asked_card(run: Run) -> Card:
 
 
 def of_card(run: Run) -> Iterator[str]:
-    """Yield a sentence if a run's latency is said to be its card's, and the card here differs."""
+    """Yield a sentence if a run's latency is said to be its card's, and the card here differs.
+
+    A card is the file that describes a model.
+    """
     latency, name = run.manifest.latency, asked_card(run).name
     if latency.source != "card" or name not in cards.names():
         return

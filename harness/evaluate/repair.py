@@ -23,7 +23,9 @@ _CONTROL = re.compile(r"[<＜](?=\S)|[\[［](?=/?[A-Za-z])")
 def wanted(request: Request, answer: Answer, prompt: Prompt) -> bool:
     """Return whether to ask again because no intent could be parsed from a free-text answer.
 
-    The prompt must have a repair turn for the role, and the engine must not have failed.
+    The prompt must have a text for such a second question (a repair turn) in the role, and the
+    engine must not have failed. A role is what a vehicle is asked as: ego, helper or, after
+    messages, merge.
     """
     return (
         request.answer == "json"
@@ -63,9 +65,11 @@ def as_text(text: str) -> str:
 
 
 def together(first: Answer, second: Answer) -> Answer:
-    """Return the second answer with the first one's text, and tokens, time and retries of both.
+    """Return the answer of a repair turn, with the first one's text, and both ones' costs in sum.
 
-    The times to the first and between tokens describe one request, so they are left out.
+    A repair turn is a second question, after an answer that cannot be parsed. Costs are tokens,
+    time and retries. The times to the first and between tokens describe one request, so they are
+    left out.
     """
     turn = FirstTurn(**{name: getattr(first, name) for name in FirstTurn.__struct_fields__})
     return structs.replace(

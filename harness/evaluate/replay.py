@@ -30,7 +30,11 @@ AT_ONCE = 128  # decision points that are replayed together, which bounds memory
 
 @dataclass(frozen=True)
 class ReplayedEpisode:
-    """Hold the recorded decisions of one episode of a finished closed-loop run."""
+    """Hold the recorded decisions of one episode of a closed-loop run, to play it again.
+
+    `layout_seed` draws its start situation, `seed` is that of the channel's random numbers,
+    `condition` the name of the settings under which it was driven, and `manifest` the run's.
+    """
 
     manifest: Manifest  # the run's manifest
     condition: str  # name of the condition
@@ -45,7 +49,11 @@ class ReplayedEpisode:
 
 
 def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode:
-    """Return one episode of a closed-loop run, which must have it, with its decisions."""
+    """Return one episode of a closed-loop run, which must have it, with its decisions.
+
+    `episode` is its number, `condition` the name of a set of settings, and `seed` the channel's. In
+    closed loop a simulator plays the episodes.
+    """
     world, table = run.manifest.world, run.decisions
     assert isinstance(world, ClosedLoop)
     is_episode = (table.whole("episode") == episode) & (table.whole("seed") == seed)
@@ -60,7 +68,8 @@ def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode
 def scenes_of(run: Run, names: Sequence[str]) -> list[Scene]:
     """Return the scenes of decision points by id, simulating an episode that reaches each.
 
-    A returned scene has its id only if this simulator behaves as the run's did.
+    `names` are the ids, and the scenes are in their order. A returned scene has its id only if this
+    simulator behaves as the run's did.
     """
     return [
         scene
@@ -99,7 +108,10 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
 
 
 def due_frame(world: World, decision: Decision) -> int:
-    """Return the simulation frame in which a decision begins."""
+    """Return the number of the simulation frame, from 0, in which a decision begins.
+
+    Its vehicle may decide later than others, by an offset that the world's seed fixes.
+    """
     offset = offset_of(world.scenario, world.seed, _place(world, decision.agent))
     return world.scenario.parameters.due_frame(decision.step) + offset
 
@@ -115,12 +127,18 @@ def actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:
 
 
 def acting_frame(decision: Decision, p: Parameters) -> int:
-    """Return the simulation frame in which a decision took effect; 0 if it never did."""
+    """Return the number of the simulation frame in which a decision took effect; 0 if it never did.
+
+    `p` are the scenario's parameters, with the frames a second.
+    """
     return round((decision.acts_at_s or 0.0) * p.simulation_hz)
 
 
 def act(world: World, decisions: Sequence[Decision]) -> None:
-    """Let agents, the vehicles that decide in a world, take the actions of some decisions."""
+    """Let vehicles of a world take the actions of some decisions now.
+
+    Each decision names the id of its vehicle, or none for the ego.
+    """
     for decision in decisions:
         world.take(decision.action, _place(world, decision.agent))
 
@@ -133,7 +151,7 @@ def _place(world: World, agent: str | None) -> int:
 def driven_again(played: ReplayedEpisode) -> Episode:
     """Simulate an episode with the recorded actions to its end, and return how it ended.
 
-    The record lacks what follows from decisions alone.
+    The record lacks what follows from decisions alone, such as numbers of messages.
     """
     world = World.start(played.scenario, played.layout_seed)
     for frame, acting in actions_by_frame(played).items():

@@ -33,9 +33,9 @@ def requests(
 ) -> Iterator[Request]:
     """Yield the requests to the models of vehicles in scenes, the ego's first in each scene.
 
-    With another `question` than the ordinary one, what the ego should do as they see it, only
-    helpers are asked. `places` has for each scene the indices in `Scene.viewers` of the vehicles to
-    ask, the ego at 0; None asks all.
+    With another `question` than the plain one, what the ego should do as they see it, only helpers
+    are asked. `places` has for each scene the indices in `Scene.viewers` of the vehicles to ask,
+    the ego at 0; None asks all.
     """
     agents, actions = spec.agents, spec.actions
     privileged, sees = (
@@ -80,7 +80,11 @@ def wanted_in(scenes: Sequence[Scene], wanted: Bools) -> tuple[list[Scene], Plac
 
 
 def request_id(scene: Scene, viewer: str, question: Question) -> str:
-    """Return the id of the request that asks a vehicle a question in a scene."""
+    """Return the id of the request that asks a vehicle a question in a scene.
+
+    `viewer` is the vehicle's id. It is the scene's id, the vehicle's and, if it is not the plain
+    one, the question's name.
+    """
     return f"{scene.id}/{asked_key(viewer, question.name)}"
 
 
@@ -102,11 +106,14 @@ def fusion_request(
 ) -> Request:
     """Return the request of a fusion call: it asks the ego once more, with what it has heard.
 
+    A scene graph is what one vehicle knows of a scene.
+
     Args:
         spec: the evaluation.
         scene: the ego's scene.
-        answers: helpers' answers by key, without what says how a message is shown.
-        senders: keys of the messages that the ego has heard (`fusion.key_of`).
+        answers: helpers' answers by key: the vehicle's id and the question (`asked_key`).
+        senders: keys of the messages that the ego has heard (`fusion.key_of`), which also say how
+            each is changed and shown.
         graph: scene graph to show instead of the ego's own; None for its own.
     """
     heard = messages_of(answers, senders, spec.actions)
@@ -126,9 +133,9 @@ def fusion_request(
 
 
 def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
-    """Return the id of the request that asks the ego of a scene once more, by what it has heard.
+    """Return the id of a fusion call: the request that asks the ego of a scene once more.
 
-    `senders` are the keys of the messages (`fusion.key_of`).
+    It names what the ego has heard: `senders` are the keys of the messages (`fusion.key_of`).
     """
     return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
 
@@ -138,9 +145,10 @@ def heard_sets(
 ) -> Iterator[tuple[Scene, list[str]]]:
     """Yield for each set of heard messages the ego's scene and the keys of the messages.
 
-    `codes`, `(K,)`, has for each set an integer that says in which scene who was heard
-    (`fusion.codes_of`), with `scenes` in this order; `rewrites` says how the messages are shown,
-    which their keys (`fusion.key_of`) state.
+    `codes`, `(K,)`, has for each of K sets an integer that says in which scene, by index in
+    `scenes`, which helpers were heard (`fusion.codes_of`). `rewrites` says how the messages are
+    changed and shown. A key is a text that names a message: its sender, and how it is shown
+    (`fusion.key_of`).
     """
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():

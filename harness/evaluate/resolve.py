@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 def spec(settings: Settings, source: Source) -> Spec:
     """Return the evaluation that a run's settings describe, with all files that they name opened.
 
-    `source` has the scenes: recorded ones of a dataset, or layouts to drive.
+    `source` has the scenes: recorded ones of a dataset, or layouts to drive. A layout is one start
+    situation of a scenario.
 
     Raises UserError for a name that there is not, or settings that are not allowed together.
     """
@@ -75,9 +76,9 @@ def frozen(settings: Settings, dataset: str) -> FrozenSource:
 def driven(settings: Settings, scenario: str | None = None) -> "LiveSource":
     """Return the layouts to drive in closed loop, by default those of the shipped dataset.
 
-    `scenario` is a name, in place of that in the settings. Raises UserError if an episode or seed
-    is out of range or mixed with those of another purpose, or if the scenario is an environment
-    that cannot be driven.
+    A layout is one start situation of a scenario. `scenario` is a name, in place of that in the
+    settings. Raises UserError if an episode or seed is out of range or mixed with those of another
+    purpose, or if the scenario is an environment that cannot be driven.
     """
     # A base install evaluates without the simulator.
     from harness.evaluate.live_world import LiveSource
@@ -143,11 +144,12 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
 def points(
     conditions: Sequence[str], settings: Mapping[str, Any] | None = None
 ) -> tuple[OperatingPoint, ...]:
-    """Return the operating points that conditions name, each once, and the counterparts of these.
+    """Return the conditions that texts name, each once, with the counterparts of these.
 
-    An operating point is the settings of radio, asking and fusion, such as `6g:window_s=0.4`; a
-    counterpart differs from it in one setting, such as a control. `settings` are a run's settings
-    of extensions, values by name. Raises UserError for an unknown name.
+    A condition is a set of settings of radio, asking and fusion, such as `6g:window_s=0.4`; a
+    counterpart differs from it in one setting, such as a control, which replaces what helpers say.
+    `settings` are a run's settings of extensions, values by name. Raises UserError for an unknown
+    name.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
     return tuple(dict.fromkeys((*named, *counterparts(named, settings or {}))))

@@ -160,8 +160,10 @@ def evaluate_shard(
     """Drive one shard of a closed-loop run, or resume it; return its number of episodes.
 
     A shard is one of several parts of a run that are made apart; `harness run merge` combines them.
-    `progress` counts episodes, those that a stopped shard kept included. Raises UserError as
-    `evaluate`, or if the latency is to be measured or the run may stop early.
+    `spec` is the whole run's evaluation, `out` the shard's folder. `progress` is called with
+    numbers of episodes, those that a stopped shard kept included; `workers` are processes or a
+    cluster. Raises UserError if the folder holds something else, the model is not available, the
+    latency is to be measured or the run may stop early.
     """
     metrics_of(spec.source.kind)
     refuse_finished(out)
@@ -185,8 +187,9 @@ def evaluate_shard(
 def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     """Combine the shards of a closed-loop run into one run, byte for byte as without shards.
 
-    Raises UserError if the folders are not all the shards of one run, a shard is unfinished, two
-    hold different bytes for the same part, or `out` holds something else.
+    In closed loop a simulator plays the episodes. Raises UserError if the folders are not all the
+    shards of one run, a shard is unfinished, two hold different bytes for the same part, or `out`
+    holds something else.
     """
     run_starts = shards.read(folders, RunStart)
     with shards.made_whole(folders, out):
@@ -368,8 +371,9 @@ def _open_again(part: Path) -> None:
 def spreadable(spec: Spec, workers: Workers) -> Workers:
     """Return the workers by which recorded scenes can be evaluated, 1 for this process alone.
 
-    More than one serve where rules answer (all of `workers`), or models on servers, of which there
-    are no more than a server may have requests at once (`batch_size`).
+    `workers` is a number of processes, or a cluster. More than one serve where rules answer (all of
+    `workers`), or models on servers, of which there are no more than a server may have requests at
+    once (`batch_size`).
     """
     if _reproducible(spec):
         return workers
@@ -718,10 +722,20 @@ def read_or_evaluate(
     opens: Opens,
     given: Mapping[str, Answer] = NOTHING,
 ) -> folder.Run:
-    """Return the run in a folder, which `evaluate` makes first unless it is finished.
+    """Return the run in a folder, which is evaluated first unless it is finished.
 
-    For studies of several runs; arguments are those of `evaluate`. Raises UserError if a finished
-    one is another evaluation or contradicts itself; else as `evaluate`.
+    For studies of several runs.
+
+    Args:
+        spec: what is evaluated.
+        out: the run's folder.
+        progress: called with the number of new answers, or of episodes just driven.
+        cache: completion cache for language models, a file; None for no cache.
+        opens: opens a model's backend, the code that runs it, in place of `open_backend`.
+        given: answers by request id that need not be asked for.
+
+    Raises UserError if a finished run there is another evaluation or contradicts itself, or what
+    `evaluate` refuses; and Unanswered if too many questions got no answer.
     """
     if (out / "run.json").is_file() and not (out / WORK).is_dir():
         return finished_run(spec, out)

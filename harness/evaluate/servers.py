@@ -16,7 +16,7 @@ FILE = "servers.jsonl"
 
 
 def lines(served: Iterable[Served]) -> bytes:
-    """Return one JSON line for each answer, with the server that gave it."""
+    """Return one JSON line for each answer, with the server that gave it, as bytes."""
     return msgspec.json.Encoder().encode_lines(list(served))
 
 

@@ -29,7 +29,7 @@ def shared_graphs(
     Args:
         scenario: the scenario as the ego plays it.
         sets: for each set the ego's scene and the keys of the messages heard (`fusion.key_of`), all
-            of which hold the same kind of content.
+            of which hold the same kind of content: words, intents or objects.
         scenes: the scenes that the messages come from, by id.
     """
     graphs: list[SceneGraph | None] = [None] * len(sets)
@@ -82,11 +82,11 @@ def as_asked(
 
     A helper may have been asked another question, with another scene graph; an ego that was asked
     again may have had the objects of others, of the scene `source` (`fusion.source_of`) if messages
-    came from elsewhere.
+    came from elsewhere. A scene graph is what one vehicle knows of a scene.
 
     Raises:
-        UserError: the answer names a sender or an attack that there is not,
-            as only a stranger's can.
+        UserError: the answer names a sender or an attack that there is not, as only a stranger's
+            can.
     """
     if answer.question:
         question = questions()[answer.question]
@@ -106,10 +106,11 @@ def as_asked(
 
 
 def listed(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
-    """Return how many objects each helper lists, and their size in bits as JSON, both `(n, H)`.
+    """Return how many objects helpers list in n scenes, and their size in bits, both `(n, H)`.
 
-    Each object has its id, class, place in metres to one decimal, heading in degrees, speed and
-    indicator; each region the share that is in sight. Both are 0 where there is no helper.
+    H is the greatest number of helpers; both are 0 where there is no helper. The size is as JSON:
+    each object has its id, class, place in metres to one decimal, heading in degrees, speed and
+    indicator; each region the share that is in sight.
     """
     counts, bits = np.zeros((2, len(scenes), max(len(scene.viewers) for scene in scenes) - 1))
     for n, scene in enumerate(scenes):

@@ -17,8 +17,9 @@ from harness.radio.profiles import CHANNELS
 def sources(spec: Spec) -> dict[str, bytes]:
     """Return the content of the files that an evaluation is made of, by their path in a project.
 
-    They are prompts, answer schemas, cards, channels, networks, schedules and a timer's. What is in
-    no file, such as the card of a hub id or a package's channel, only `run.json` has.
+    They are prompts, answer schemas, cards (models' descriptions), channels, networks, schedules
+    and a timer's. What is in no file, such as the card of a hub id or a package's channel, only
+    `run.json` has.
     """
     texts: dict[str, bytes] = {}
     paths: dict[str, Path | None] = {}

@@ -52,7 +52,10 @@ ASKS = ("used", "all")  # what --ask takes, the default first
 
 
 class Source(Protocol):
-    """Describe where the scenes of an evaluation come from: a dataset, or layouts to drive."""
+    """Describe where the scenes of an evaluation come from: a dataset, or layouts to drive.
+
+    A layout is one start situation of a scenario.
+    """
 
     @property
     def kind(self) -> World:
@@ -61,7 +64,7 @@ class Source(Protocol):
 
     @property
     def name(self) -> str:
-        """Return the word for the source in the name of a run's folder."""
+        """Return the word for the source in the name of a run's folder: a dataset's, or `drive`."""
         ...
 
     @property
@@ -74,7 +77,10 @@ class Source(Protocol):
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Return the numbers of the episodes to evaluate; a run that stops early has the first."""
+        """Return the numbers of the episodes to evaluate, of which a run that stops early has some.
+
+        These are the first.
+        """
         ...
 
     @property
@@ -83,7 +89,7 @@ class Source(Protocol):
         ...
 
     def first(self, count: int) -> "Source":
-        """Return this source with at most so many of its episodes, from the first."""
+        """Return this source with at most `count` of its episodes, from the first."""
         ...
 
     @property
@@ -100,7 +106,8 @@ class Source(Protocol):
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
         """Yield one scene of each of up to `most` episodes, such as to time a model on.
 
-        With `ego_alone`, what helpers know, their scene graphs, may be left out.
+        With `ego_alone`, only the ego will be asked, and what helpers know, their scene graphs, may
+        be left out.
         """
         ...
 
@@ -109,12 +116,18 @@ class Source(Protocol):
 class Spec:
     """Describe one evaluation completely: agents, scenes, conditions, seeds and settings.
 
-    Raises UserError for what is not allowed, or does not go together.
+    It holds opened what `settings`, those typed, name: `ego` and `helpers` are models with their
+    prompts, the latter empty if the ego's answers for helpers, `source` has the scenes, and
+    `points` are the conditions, each a named set of settings of channel, asking and fusion. `seeds`
+    are of the channel's random numbers. `timer` and `stopping_rule` time answers and end the run
+    early, None without; `guards` may refuse to ask. Raises UserError for what is not allowed, or
+    does not go together.
     """
 
-    ego: Agent  # the agent that answers for the ego
-    source: Source  # the world that is walked
-    points: tuple[OperatingPoint, ...]  # the conditions, each an operating point
+    ego: Agent  # the agent that answers for the ego: a model, its prompt and how it is asked
+    source: Source  # the scenes: a dataset's, or those of layouts to drive
+    # the conditions, each a named set of settings of channel, asking and fusion
+    points: tuple[OperatingPoint, ...]
     seeds: tuple[int, ...]  # seeds of the channel's draws
     # the agents that answer for the helpers. Helpers take them in turn, in the order in which they
     # were spawned. Empty if the ego's agent answers for the helpers, too
@@ -317,7 +330,11 @@ class Spec:
 
     @property
     def fusion_obstacle(self) -> str | None:
-        """Return why the ego's prompt cannot show helpers' messages; None if it can."""
+        """Return why the ego's prompt cannot show helpers' messages, as a phrase; None if it can.
+
+        It must, where a condition asks the ego's model again with the messages (fusion call). A
+        condition is a named set of settings of channel, asking and fusion.
+        """
         if bare := [agent.answer for agent in self.agents if agent.answer in BARE]:
             return f"a {bare[0]} gives no messages to fuse; use --answer json or constrained"
         return role_agents.of_helpers().unlike(self) if self.helpers else None
@@ -335,7 +352,10 @@ class Spec:
         return tuple(agent.card.at(self.settings.server) for agent in self.agents)
 
     def scenario_of(self, scene: Scene) -> Scenario:
-        """Return the scenario from the view of the vehicle that decides in a scene."""
+        """Return the scenario from the view of the vehicle that decides in a scene.
+
+        Its words are those of that vehicle's prompt.
+        """
         return scene.seat or self.scenario
 
     def agent(self, place: int) -> int:
@@ -349,8 +369,9 @@ class Spec:
     def agent_of_answer(self, agent: int) -> int | UnsetType:
         """Return the index of an agent as an answer states it, unset where it follows without.
 
-        It follows from whose answer it is with one agent of helpers, or where every helper is asked
-        in turn, and for the ego unless other vehicles decide as well.
+        `agent` is the index in `agents`, 0 the ego's. It follows from whose answer it is with one
+        agent of helpers, or where every helper is asked in turn, and for the ego unless other
+        vehicles decide as well.
         """
         if self.several_decide and self.helpers:
             return agent
@@ -375,7 +396,7 @@ class Spec:
         """Return whether all helpers are asked, not only those whose answers a condition uses.
 
         It is so with `ask = "all"`, with a timer, which counts what all answers cost, and for a
-        driver (`ego_alone`).
+        driver (`ego_alone`). A condition is a named set of settings of channel, asking and fusion.
         """
         return self.settings.ask == "all" or self.ego_alone or self.timer is not None
 
@@ -400,7 +421,7 @@ class Spec:
         """Return a copy of this evaluation with other values of some of its `settings`.
 
         Keywords are the settings' names, such as `temperature`. Raises ValueError for one that
-        names a file or model, since a field of this object holds what was opened.
+        names a file or model: what it names is opened in another field, which is to be replaced.
         """
         spec = replace(self, settings=structs.replace(self.settings, **settings))
         if lost := [
@@ -412,7 +433,8 @@ class Spec:
     def stopped(self, looks: InterimLooks) -> "Spec":
         """Return this evaluation cut to the episodes after which its stopping rule ended a run.
 
-        `looks` says after how many layouts the run was looked at.
+        `looks` says after how many layouts the run was looked at. A layout is one start situation
+        of a scenario.
         """
         looks = replace(looks, layouts=len(self.source.numbers))
         return replace(self, source=self.source.first(looks.at[-1]), interim_looks=looks)
@@ -427,7 +449,7 @@ class Spec:
         return structs.replace(world, interim_looks=self.stopping_rule.record(looks))
 
     def record(self) -> dict[str, Any]:
-        """Return the settings and a record of all opened files, for a run's `run.json`."""
+        """Return the settings and a record of all opened files, values by name, for `run.json`."""
         settings = msgspec.to_builtins(self.settings)
         profiles = [point.radio.profile for point in self.points]
         schedules = {
@@ -538,7 +560,8 @@ class Spec:
 def replayed(ego: Agent) -> Manifest | None:
     """Return the manifest of the run whose answers the ego's model replays; None for others.
 
-    Also None for what is no run, which is refused when it is opened.
+    A replay scores a run's stored answers again. Also None for what is no run, which is refused
+    when it is opened.
     """
     if not ego.can.own_latency:
         return None

@@ -16,9 +16,10 @@ from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 @lru_cache(maxsize=1 << 10)
 def busy_ratio(point: OperatingPoint) -> float:
-    """Return the share of time, 0 to 1, that a point's channel is busy with others' packets.
+    """Return the share of time, 0 to 1, that a condition's channel is busy with others' packets.
 
-    NaN if the channel model does not know it.
+    `point` is the condition, its settings of channel, asking and fusion. NaN if the channel model
+    does not know it.
     """
     return point.physical.busy_ratio() if point.physical else float("nan")
 
@@ -26,8 +27,9 @@ def busy_ratio(point: OperatingPoint) -> float:
 def columns(decided: Decided[Any]) -> dict[str, Any]:
     """Return the numeric columns of the decision table for n decisions of one condition.
 
-    Arrays are `(n,)`, by column name, such as `messages`, `triggered`, `entropy_nats` and
-    `latency_ms`; NaN where unknown.
+    `decided` has the decisions, with their exchange of messages and results. Arrays are `(n,)`, by
+    column name, such as `messages`, `triggered`, `entropy_nats` and `latency_ms`; NaN where
+    unknown.
     """
     c, point = decided.result, decided.point
     anybody = any_of(c.on_time)
@@ -57,8 +59,9 @@ def table(
 ) -> Decisions:
     """Return a row for each decision, sorted by episode, step, decision point, condition and seed.
 
-    `decided` has n decisions in parts, in any order; `more` has further columns by name, `(n,)`, in
-    that order. `actions` are the names of the meta-actions, in order.
+    `decided` has n decisions in parts of one condition each, in any order; `more` has further
+    columns by name, `(n,)`, in that order. `actions` are the names of the meta-actions, in order. A
+    condition is a named set of settings of channel, asking and fusion.
     """
     points_by_id = {id(part.decision_points): part.decision_points for part in decided}
     lengths = [len(decision_points) for decision_points in points_by_id.values()]
@@ -135,7 +138,9 @@ def table(
 def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
     """Return one table of several, which have the same episodes under different channel seeds.
 
-    It is sorted as `table` sorts; `points` are the conditions, in the order of the rows.
+    Rows are sorted by episode, step, decision point, condition and seed; `points` are the
+    conditions, in the order of the rows. A condition is a named set of settings of channel, asking
+    and fusion.
     """
     if len(tables) == 1:
         return tables[0]

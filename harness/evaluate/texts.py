@@ -27,7 +27,8 @@ OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what
 def refuse_others(run: Run) -> None:
     """Raise UserError if an answer of a run states what its raw text does not say.
 
-    Also if a prompt of the run is neither here nor kept in it, so that nothing can be parsed again.
+    A file can state any intent beside a text. Also if a prompt of the run is neither here nor kept
+    in it, so that nothing can be parsed again.
     """
     for answer, field in others(run):
         raise _contradicts(run, answer, field)
@@ -36,8 +37,8 @@ def refuse_others(run: Run) -> None:
 def others(run: Run) -> Iterator[tuple[Answer, str]]:
     """Yield each answer of a run that states what its raw text does not say, and in which field.
 
-    It is the first such field. Raises UserError if a prompt of the run is neither here nor kept in
-    it.
+    Texts are parsed again. The field is the first of those that differ. Raises UserError if a
+    prompt of the run is neither here nor kept in it.
     """
     if gone := lacking(run):
         raise UserError(
@@ -63,8 +64,8 @@ def refuse_other_kept(
     """Raise UserError if an answer in `file` states what its raw text says by no agent's parsing.
 
     So a run that somebody else began goes on from what its answers say. Also if an answer states a
-    delay that no agent's model card declares. `agents` are those of the run, each a model with its
-    prompt, and `actions` the names of the meta-actions, in order.
+    delay that no agent's model card, the file that describes it, declares. `agents` are those of
+    the run, each a model with its prompt, and `actions` the names of the meta-actions, in order.
     """
     readers = []
     for agent in agents:
@@ -86,7 +87,8 @@ def refuse_other_kept(
 def same(name: str, stated_answer: Answer, here: Answer | Parsed) -> bool:
     """Return whether a stated and a newly parsed answer have the same value in the field `name`.
 
-    It is one of `OF_TEXTS`, what is read in a text; numbers are compared up to rounding.
+    It is one of `OF_TEXTS`, the fields that are read in a text; numbers are compared up to
+    rounding. `here` is the one that was parsed.
     """
     a, b = getattr(stated_answer, name), getattr(here, name)
     if isinstance(a, tuple) and isinstance(b, tuple):

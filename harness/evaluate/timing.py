@@ -53,9 +53,10 @@ def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
 def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
     """Measure how long a model takes to answer: the median seconds by role, each request alone.
 
-    A role in which no answer can be timed gets the ego's time. `backend` must be the model itself:
-    a cache would answer in no time. Raises Unanswered if the ego's requests got no answer, and
-    UserError if none of its answers could be timed.
+    `spec` is the evaluation, and `scenes` are those to ask about. A role in which no answer can be
+    timed gets the ego's time. `backend` must be the model itself: a cache would answer in no time.
+    Raises Unanswered if the ego's requests got no answer, and UserError if none of its answers
+    could be timed.
     """
     first = [replace(request, timed=True) for request in requests(spec, scenes)]
     backend.complete(first[:1])  # the first request of a process includes the warm-up
