@@ -15,10 +15,11 @@ T = TypeVar("T", bound=Manifest | Run | SuiteRun | Runs)
 
 
 def apart(thing: T, built_in: bool) -> T:
-    """Return a copy of `thing` for a package to read: its records are shared with nobody.
+    """Return a copy of a run or manifest for a package's code, which cannot change the original.
 
-    With `built_in`, for code of the harness, it is the thing itself. The tables of a copy cannot be
-    changed, and are those of the thing, so that none is read again.
+    With `built_in`, for code of the harness, it is `thing` itself. The copy's records are shared
+    with nobody. Tables cannot be changed at all, and a copy has those of the original, so that none
+    is read again.
     """
     copied: Any = thing
     if built_in:
@@ -38,9 +39,11 @@ def apart(thing: T, built_in: bool) -> T:
 def said_of(
     registry: Plugins[Callable[[Any], Iterable[str]]], name: str, thing: Manifest | Run | SuiteRun
 ) -> list[str]:
-    """Return the sentences that a plug-in of a registry has on a thing, which it cannot change.
+    """Return the sentences that a plug-in of a registry has on a run, suite or manifest, `thing`.
 
-    Raises UserError if the plug-in fails, or they are no texts.
+    `registry` has functions by name, which take such a thing and return texts; `name` is the one to
+    call. A package's gets a copy. A suite is a run on each of several scenarios. Raises UserError
+    if it fails, or returns anything but texts.
     """
     copied = apart(thing, registry.is_ours(name))
     return registry.ask(name, lambda of: texts(of(copied)))

@@ -35,7 +35,11 @@ _FAILED = {
 
 
 def stopped(run: Run) -> Iterator[str]:
-    """Yield when a run that might stop early was looked at, and which of its intervals hold."""
+    """Yield when a run that might stop early was looked at, and which of its intervals hold.
+
+    At a look, after some of its layouts (start situations), a rule says whether these are enough.
+    It yields nothing for other runs.
+    """
     record = run.manifest.world.interim_looks
     if record is not None and (rule := run.manifest.stopping_rule):
         yield rule.sentence(record)
@@ -54,7 +58,10 @@ def unread(run: Run) -> Iterator[str]:
 
 
 def causes(run: Run) -> Iterator[str]:
-    """Yield for each role how many answers could not be parsed, and the commonest reason."""
+    """Yield for each role how many answers could not be parsed, and the commonest reason.
+
+    A role is `ego`, `helper` or `merge` (the ego after it heard messages).
+    """
     meanings = {str(status): status.meaning for status in Status}
     for role, (whose, _) in _FAILED.items():
         rate = run.score(ALL, f"failed_rate_{role}")
@@ -71,7 +78,10 @@ def causes(run: Run) -> Iterator[str]:
 
 
 def unanswered(run: Run) -> Iterator[str]:
-    """Yield the engine's errors if unanswered requests leave a run without a valid result."""
+    """Yield the engine's errors if unanswered requests leave a run without a valid result.
+
+    The engine is what runs the model; too many questions to the ego or to helpers got an error.
+    """
     if (tallied := tally(run)).missing:
         yield f"{tallied}: the model could not be asked, so that this is no result."
 
@@ -87,7 +97,8 @@ def few(run: Run) -> Iterator[str]:
 def saturated(run: Run) -> Iterator[str]:
     """Yield a sentence if success with a danger, or without, is always 0 or always 100 %.
 
-    It must be so under every condition, of two or more.
+    A danger is a vehicle that would meet an ego which keeps its speed. It must be so under every
+    condition (set of settings that the run scores), of two or more.
     """
     halves = zip(entry(BALANCED).halves, ("With a danger", "Without a danger"), strict=True)
     for name, where in halves:
@@ -104,7 +115,11 @@ def saturated(run: Run) -> Iterator[str]:
 
 
 def earlier_gains(run: Run) -> Iterator[str]:
-    """Yield a sentence if the gains have the wider intervals of an earlier harness version."""
+    """Yield a sentence if a run of an earlier version of the harness has wider intervals of gains.
+
+    A gain is a condition's success less that of the condition without a radio. A condition is a
+    named set of settings of channel, asking and fusion.
+    """
     gains = [score for score in run.scores if score.metric in GAINS.values()]
     if any(score.interval == pinned.KIND for score in gains):
         yield "Gains have the wider intervals of an earlier version, as the run wrote them."
@@ -121,7 +136,10 @@ def sampled(run: Run) -> Iterator[str]:
 
 
 def divided(run: Run) -> Iterator[str]:
-    """Yield for each role how many answers did not sum to 1 and were divided by their sum."""
+    """Yield for each role how many answers did not sum to 1 and were divided by their sum.
+
+    A role is `ego`, `helper` or `merge` (the ego after it heard messages).
+    """
     for role, (whose, _) in _FAILED.items():
         if run.manifest.sums == "divide" and (score := run.score(ALL, f"divided_rate_{role}")):
             yield (
@@ -131,7 +149,10 @@ def divided(run: Run) -> Iterator[str]:
 
 
 def flipped(run: Run) -> Iterator[str]:
-    """Yield for each role how many read-outs change when the list of actions is reversed."""
+    """Yield for each role how many read-outs change when the list of actions is reversed.
+
+    A read-out is an answer by one letter per action. A role is `ego` or `helper`.
+    """
     for role, (whose, _) in _FAILED.items():
         if score := run.score(ALL, f"flip_rate_{role}"):
             yield (
@@ -141,19 +162,28 @@ def flipped(run: Run) -> Iterator[str]:
 
 
 def lost_messages(run: Run) -> Iterator[str]:
-    """Yield the engine's errors if helpers' answers are missing but count as lost messages."""
+    """Yield the engine's errors if helpers' answers are missing but count as lost messages.
+
+    The engine is what runs the model.
+    """
     if (tallied := tally(run)).words and not tallied.missing:
         yield f"{tallied}: each counts as a lost message."
 
 
 def retried(run: Run) -> Iterator[str]:
-    """Yield how many requests to the engine failed and were repeated."""
+    """Yield how many requests to the engine failed and were repeated.
+
+    The engine is what runs the model.
+    """
     if retries := run.manifest.retries:
         yield f"The engine had errors: {retries} attempts were repeated."
 
 
 def controls(run: Run) -> Iterator[str]:
-    """Yield the conditions that are controls: their messages are replaced, to test cooperation."""
+    """Yield the conditions that are controls: helpers' messages are replaced, to test cooperation.
+
+    A condition is a named set of settings of channel, asking and fusion.
+    """
     for kind in more_parts().values():
         for control, words in kind.controls.items():
             if names := doubts.under(run.manifest.conditions, control):
@@ -163,8 +193,8 @@ def controls(run: Run) -> Iterator[str]:
 def lagging(run: Run) -> Iterator[str]:
     """Yield the conditions whose decisions mostly take longer than the dataset's lag.
 
-    A condition is an operating point by its name. The lag is the time from a decision to its
-    action, for which the dataset knows what follows.
+    A condition is a named set of settings of channel, asking and fusion. The lag is the time from a
+    decision to its action for which the dataset knows the outcome.
     """
     if off := doubts.lagging(_off_lag(run)):
         yield (
@@ -188,11 +218,11 @@ def unmeasured(run: Run) -> Iterator[str]:
 
 
 def doubted(*runs: Run) -> set[str]:
-    """Return the names of the conditions (operating points) of some runs that have a warning.
+    """Return the names of the conditions of some runs that have a warning.
 
-    These are controls (helpers' messages are replaced), conditions with another lag from decision
-    to action than the dataset's, and radios outside the range for which their channel model was
-    validated.
+    A condition is a named set of settings of channel, asking and fusion. A warning have controls
+    (helpers' messages are replaced), conditions with another lag from decision to action than the
+    dataset's, and radios outside the range for which their channel model was validated.
     """
     names = set[str]()
     for run in runs:
@@ -226,7 +256,8 @@ def of_extensions(run: Run) -> Iterator[str]:
 def by_letter(run: Run) -> Iterator[str]:
     """Yield a sentence for each role whose read-outs follow the option's letter, not its action.
 
-    It is known only of read-outs averaged over cyclic orders of the options.
+    A read-out is an answer by one letter per action. It is known only of those that were averaged
+    over several (cyclic) orders of the options.
     """
     for role, (whose, _) in _FAILED.items():
         share = run.score(ALL, f"letter_share_{role}")
@@ -241,7 +272,11 @@ def by_letter(run: Run) -> Iterator[str]:
 
 
 def unheard(run: Run) -> Iterator[str]:
-    """Yield the conditions under which messages arrive, but all after the decision window."""
+    """Yield the conditions under which messages arrive, but all after the decision window.
+
+    A condition is a named set of settings of channel, asking and fusion; the window is the seconds
+    from a decision's start in which replies count.
+    """
     d = run.decisions
     delivered, on_time = d.of_messages("delivered") == 1.0, d.of_messages("on_time") == 1.0
     conditions = d.codes("condition", run.conditions)
@@ -257,7 +292,8 @@ def unheard(run: Run) -> Iterator[str]:
 def lost_at_once(run: Run) -> Iterator[str]:
     """Yield how many episodes end in a collision before the ego's first action takes effect.
 
-    These are episodes in which it is so under every condition and seed.
+    These are episodes in which it is so under every condition and channel seed. A condition is a
+    named set of settings of channel, asking and fusion.
     """
     world = run.manifest.world
     if isinstance(world, ClosedLoop):
@@ -277,7 +313,7 @@ def lost_at_once(run: Run) -> Iterator[str]:
 
 
 def moved_system(run: Run) -> Iterator[str]:
-    """Yield each model whose system text was put into the first user turn.
+    """Yield a sentence on each model whose system text was put into the first user turn.
 
     Its chat template has no system role.
     """
@@ -290,7 +326,10 @@ def moved_system(run: Run) -> Iterator[str]:
 
 
 def beyond_sources(run: Run) -> Iterator[str]:
-    """Yield each condition with radio parameters outside its channel model's validated range."""
+    """Yield each condition with radio parameters outside its channel model's validated range.
+
+    A condition is a named set of settings of channel, asking and fusion.
+    """
     for name, sentence in doubts.beyond(run.manifest.conditions, _channels(run.manifest)):
         yield f"{printable(name)}: {sentence}"
 

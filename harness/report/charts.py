@@ -65,11 +65,12 @@ def success_latency(
     """Return a scatter plot of success over latency in ms: a point for each run and condition.
 
     Args:
-        rows: as `panels.success` returns them, with the run's name as `run`.
+        rows: one for each point, with `run`, `condition`, `latency_ms`, `success`, the ends of
+            their intervals and `n` (`panels.success`).
         references: success, from 0 to 1, of each reference driver (a rule without a model) by its
             label, drawn as horizontal lines.
         window_ms: decision windows, the times in which replies count, drawn as vertical lines.
-        label: the headline metric in words.
+        label: the metric of success in words, such as balanced success.
     """
     untitled = {"legend": {"orient": "top", "title": None}}
     several_runs = len({row["run"] for row in rows}) > 1
@@ -146,9 +147,10 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
 
 
 def statuses(rows: Rows) -> Spec:
-    """Return a chart of parse statuses: one stacked bar for each run and role.
+    """Return a chart of how answers were parsed: one stacked bar for each run and role.
 
-    `rows` are those of `panels.statuses`, with the run's name as `run`.
+    `rows` have the run's name as `run`, and `role`, `status`, `count` and `share`
+    (`panels.statuses`).
     """
     statuses: dict[str, dict[str, None]] = {verdict: {} for verdict in VERDICTS}
     for row in rows:
@@ -165,7 +167,8 @@ def statuses(rows: Rows) -> Spec:
 def policies(actions: Sequence[str]) -> Spec:
     """Return a bar chart of the probability distributions in one decision, before and after fusion.
 
-    It has no data: the page's script fills in rows of `who`, `what`, `action` and `p`.
+    `actions` are the names of the actions, in order. It has no data: the page's script fills in
+    rows of `who`, `what`, `action` and `p`.
     """
     scale = {"domain": list(actions), "range": list(colours.actions(actions).values())}
     return {
@@ -191,7 +194,8 @@ def policies(actions: Sequence[str]) -> Spec:
 def timeline() -> Spec:
     """Return a chart of the phases of one decision over time, in ms.
 
-    It has no data: the page's script fills in rows of `who`, `what`, `from` and `to`, and `window`.
+    It has no data: the page's script fills in rows of `who`, `what`, `from` and `to`, and a row
+    with `window`, the time in which replies count.
     """
     spans: Spec = {
         "mark": {"type": "bar", "height": 9, "cornerRadius": 2},
@@ -216,9 +220,9 @@ def stacked(
 ) -> Spec:
     """Return a chart of stacked bars: one for each run and value of the rows' field `by`.
 
-    A bar's segments are the values of the field `field`, in the order and colours of `colours`;
-    their lengths are the rows' field `amount`, by default shares on a scale in percent. `what` is
-    the axis title.
+    Rows have the run's name as `run`. A bar's segments are the values of the field `field`, in the
+    order and colours of `colours`, a colour by value; their lengths are the rows' field `amount`,
+    by default shares on a scale in percent. `what` is the axis title.
     """
     several_runs, order = len({row["run"] for row in rows}) > 1, list(colours)
     bars = []
@@ -254,8 +258,9 @@ def shares(
 ) -> Spec:
     """Return a line chart of the rows' `share` over a numeric field, with intervals.
 
-    There is one line for each condition. `title` and `what` are the titles of the x and y axes,
-    `rules` the x of vertical lines; `diagonal` adds the line on which x and y are equal.
+    There is one line for each value of the rows' field `condition`. `field` is the name of the
+    numeric one, `title` and `what` are the titles of the x and y axes, `rules` the x of vertical
+    lines; `diagonal` adds the line on which x and y are equal.
     """
     x, y = x_axis(field, title), share_axis("share", what)
     condition, shape = condition_colours(rows), shapes_of(rows, "condition")
@@ -327,9 +332,10 @@ def named(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) -> Spec:
-    """Return a chart of layers that share one table of rows.
+    """Return a chart of layers, Vega-Lite specifications, that share one table of rows.
 
-    `choose` adds a selector of the run if the rows are of several; `height` is in pixels.
+    `choose` adds a selector of the run if the rows are of several, by their field `run`; `height`
+    is in pixels.
     """
     runs = list(dict.fromkeys(str(row["run"]) for row in rows if "run" in row))
     data = {"name": "values", "values": list(rows)}
@@ -342,7 +348,10 @@ def layered(*layers: Spec, rows: Rows, height: int = 260, choose: bool = False) 
 
 
 def x_axis(field: str, title: str) -> Spec:
-    """Return the Vega-Lite encoding of a numeric field on the x axis, which need not begin at 0."""
+    """Return the Vega-Lite encoding of a numeric field on the x axis, which need not begin at 0.
+
+    `field` is its name in the rows of the chart, and `title` that of the axis.
+    """
     axis = {"labelOverlap": True, "tickCount": 8}
     return {
         "field": field,
@@ -354,7 +363,10 @@ def x_axis(field: str, title: str) -> Spec:
 
 
 def share_axis(field: str, title: str) -> Spec:
-    """Return the Vega-Lite encoding of a field from 0 to 1 on the y axis, shown in percent."""
+    """Return the Vega-Lite encoding of a field from 0 to 1 on the y axis, shown in percent.
+
+    `field` is its name in the rows of the chart, and `title` that of the axis.
+    """
     return {
         "field": field,
         **NUMBER,
@@ -367,7 +379,7 @@ def share_axis(field: str, title: str) -> Spec:
 def colour(field: str, colours: Mapping[str, str]) -> Spec:
     """Return the Vega-Lite encoding of a field by colour; the legend has no title.
 
-    `colours` maps each value of the field to its colour.
+    `field` is its name in the rows of the chart, and `colours` maps each value of it to its colour.
     """
     return {
         "field": field,
@@ -380,7 +392,7 @@ def colour(field: str, colours: Mapping[str, str]) -> Spec:
 def condition_colours(rows: Rows) -> Spec:
     """Return the Vega-Lite encoding of the rows' field `condition` by colour.
 
-    A condition is an operating point by its name.
+    A condition is a named set of settings under which decisions are played; each has one colour.
     """
     shapes = shapes_of(rows, "condition")
     by_name = colours.conditions(shapes["scale"]["domain"])
@@ -390,7 +402,8 @@ def condition_colours(rows: Rows) -> Spec:
 def shapes_of(rows: Rows, field: str) -> Spec:
     """Return the Vega-Lite encoding of a field by the shape of points.
 
-    Its order and legend are those of `condition_colours`, so that both share one legend.
+    `field` is its name in `rows`; values are in the order of these. The legend is that of
+    `condition_colours`, so that a chart with both has one.
     """
     domain = list(dict.fromkeys(str(row[field]) for row in rows))
     return {
@@ -402,12 +415,18 @@ def shapes_of(rows: Rows, field: str) -> Spec:
 
 
 def names_axis(field: str) -> Spec:
-    """Return the Vega-Lite encoding of a field of names on the y axis, in the order of the rows."""
+    """Return the Vega-Lite encoding of a field of names on the y axis, in the order of the rows.
+
+    `field` is its name in the rows of the chart.
+    """
     return {"field": field, "type": "nominal", "sort": None, "title": None}
 
 
 def point(size: int, **encoding: Spec | list[Spec]) -> Spec:
-    """Return a layer with a filled point for each row; `size` is its area in square pixels."""
+    """Return a layer with a filled point for each row; `size` is its area in square pixels.
+
+    `encoding` has the Vega-Lite encoding of each channel, such as `x`, `y` and `color`.
+    """
     return {
         "mark": {"type": "point", "filled": True, "size": size, "opacity": 1},
         "encoding": encoding,
@@ -428,7 +447,7 @@ def tooltip(rows: Rows) -> list[Spec]:
 def interval(**encoding: Spec) -> Spec:
     """Return a layer that draws a line for each row, from x to x2 or from y to y2.
 
-    `encoding` has the Vega-Lite encoding of each of these channels.
+    `encoding` has the Vega-Lite encoding of each of these channels, such as `x` and `x2`.
     """
     return {"mark": {"type": "rule", "strokeWidth": 1.4}, "encoding": encoding}
 
@@ -451,7 +470,8 @@ def band(start: float, end: float, what: str, named: bool = False) -> Spec:
 def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
     """Return layers with a vertical line at each x in `at`; none if there are none.
 
-    If `what` is given, a line is labelled with it and its x, in ms.
+    `field` is the name of the field on the x axis. If `what` is given, a line is labelled with it
+    and its x, in ms.
     """
     if not at:
         return []

@@ -46,7 +46,8 @@ class Commonest:
 def commonest(run: Run) -> Commonest | None:
     """Return which likeliest action a language model's ego answers most often in a run.
 
-    None if the ego's engine is no language model or fewer than `LEAST` answers are readable.
+    None if the ego's engine, what runs the model, is no language model's, or fewer than `LEAST`
+    answers are readable.
     """
     engine = ENGINES.get(run.manifest.model["engine"])
     if engine is None or not engine.capabilities.language_model:
@@ -88,9 +89,9 @@ def _like(run: Run, common: Commonest) -> str:
 
 
 def in_a_line(run: Run) -> Iterator[str]:
-    """Yield a line on what a language model's ego answers most often.
+    """Yield a line on which likeliest action a language model's ego answers most often.
 
-    It yields none where `ignores_input` has a warning.
+    It yields none if the answers are nearly all alike, of which `ignores_input` warns.
     """
     common = commonest(run)
     if common and not common.constant:
@@ -103,8 +104,8 @@ def in_a_line(run: Run) -> Iterator[str]:
 def tile(run: Run) -> list[dict[str, str]]:
     """Return a key figure for the page's top: how often the ego's commonest likeliest action comes.
 
-    An entry has `what`, `value`, `interval` and `n` as text; the list is empty where `commonest` is
-    None.
+    An entry has `what`, `value`, `interval` and `n` as text; the list is empty if the ego is no
+    language model, or few of its answers are readable.
     """
     common = commonest(run)
     if common is None:

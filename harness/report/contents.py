@@ -32,8 +32,8 @@ def _either(counts: Iterable[int]) -> str:
 def summary(run: Run) -> list[dict[str, Any]]:
     """Return the rows of a run's table of metrics: `name`, `meaning`, and `cells` by condition.
 
-    A condition is an operating point by its name. A cell has `value`, `interval` and `n` as text;
-    None where the metric has no value there.
+    A condition is a named set of settings of channel, asking and fusion. A cell has `value`,
+    `interval` and `n` as text; None where the metric has no value there.
     """
     metrics = dict.fromkeys(score.metric for score in run.scores if score.condition != "all")
     rows: list[dict[str, Any]] = []
@@ -50,10 +50,12 @@ def _cell(run: Run, condition: str, metric: str) -> dict[str, str] | None:
 
 
 def probabilities(runs: Runs) -> list[dict[str, Any]]:
-    """Return a row for each run and condition with scores of the fused policy's probabilities.
+    """Return a row for each run and condition with scores of the probabilities of its decisions.
 
-    `groups` holds two sets of decisions, each with `n` and `scores`: those where some action is
-    safe, and those with exactly one optimal action.
+    A row has `run` and `condition` by name, and `groups`: two sets of decisions, each with `n`, how
+    many, and `scores`. These are the decisions where some action is safe (leaves success possible),
+    and those with exactly one such action. A condition is a named set of settings of channel,
+    asking and fusion.
     """
     lines = []
     for name, run in zip(runs.names, runs.runs, strict=True):
@@ -76,7 +78,8 @@ def probabilities(runs: Runs) -> list[dict[str, Any]]:
 def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
     """Return the rows of the table of metrics on answers, which are the same under every condition.
 
-    A row is a metric's label and one cell for each run; None where the run has no value.
+    A row is a metric's label and one cell for each run; None where the run has no value. A
+    condition is a named set of settings of channel, asking and fusion.
     """
     scores = [score for run in runs.runs for score in run.scores]
     metrics = dict.fromkeys(score.metric for score in scores if score.condition == "all")
@@ -90,7 +93,8 @@ def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
 def examples(runs: Runs) -> list[dict[str, Any]]:
     """Return the first `EXAMPLES` answers of each parse status but `strict`, over all runs.
 
-    An entry has `status` and `answers`; each answer has the index of its `run`.
+    An entry has `status`, such as `bad_sum`, and `answers`; each of these has the index of its
+    `run` and the `answer`'s record.
     """
     by_status: dict[str, list[dict[str, Any]]] = {}
     for place, run in enumerate(runs.runs):
@@ -103,9 +107,10 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
 
 
 def sweeps(run: Run) -> list[dict[str, str]]:
-    """Return the SVG charts of the sweeps in a run's folder: `name`, and `src` as a data URI.
+    """Return the charts of the sweeps in a run's folder: `name`, and `src`, the SVG as a data URI.
 
-    A link that leads out of the folder is not followed.
+    A sweep scores the run's stored answers under other settings. A link that leads out of the
+    folder is not followed.
     """
     folder = run.path.resolve()
     manifests = sorted(run.path.glob("*/sweep.json"))

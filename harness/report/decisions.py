@@ -168,7 +168,10 @@ class Decisions:
         return lacks
 
     def parts(self) -> list[Part]:
-        """Return all scenes in chunks of `AT_ONCE`, each to be compressed by any process."""
+        """Return all scenes in chunks of `AT_ONCE`, each to be compressed by any process.
+
+        A scene is one decision point; a chunk holds scenes' ids and what their details are made of.
+        """
         starts = range(0, len(self.ids), AT_ONCE)
         return [Part(self._details, self.ids[start : start + AT_ONCE]) for start in starts]
 
@@ -225,7 +228,8 @@ def failures(run: Run) -> dict[str, int]:
     Each is given by its id, with a channel seed under which it is so. A layout is one drawn start
     situation; it begins to fail at the last decision point that its failed episodes share with one
     that succeeded, or if all fail, at the last of its first episode. With several agents (vehicles
-    that decide), there is one for each that decides then.
+    that decide), there is one for each that decides then. In closed loop a simulator plays the
+    episodes.
     """
     decisions = run.decisions
     failed = np.array([not episode.success for episode in run.episodes])
@@ -253,9 +257,10 @@ def failures(run: Run) -> dict[str, int]:
 def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
     """Return the ids of up to n decision points to show, in order; the choice is deterministic.
 
-    Up to a quarter each are points in `failed` (as `failures` returns them), points where
-    conditions act differently, and points with an answer that was repaired or failed to parse. The
-    rest is evenly spaced.
+    Up to a quarter each are points where a layout begins to fail (the keys of `failed`, as
+    `failures` returns them), points where conditions act differently, and points with an answer
+    that was repaired or failed to parse. The rest is evenly spaced. A layout is one start situation
+    of a scenario. A condition is a named set of settings of channel, asking and fusion.
     """
     decisions = run.decisions
     action, seeds = decisions.codes("action", run.actions), decisions.whole("seed")
@@ -278,7 +283,10 @@ def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
 
 
 def lost(run: Run) -> list[str]:
-    """Return the ids of a frozen run's scenes where some decision made success impossible."""
+    """Return the ids of the scenes, of a run on recorded ones, where a decision gave success away.
+
+    Before that decision success was still possible, after it no more.
+    """
     regret = np.nan_to_num(run.decisions["regret"]) == 1.0
     scenes = run.decisions.scenes
     return [scene for scene, rows in scenes.items() if regret[rows.start : rows.stop].any()]

@@ -139,17 +139,21 @@ def prompts_of(run: Run) -> Sent | None:
 class Details:
     """Collect what the page shows of single scenes: the world, answers, decisions and outcomes.
 
-    `replayed` has closed-loop scenes that could be simulated again, `framed` the ids of scenes
-    shown with camera pictures. `prompts` renders a run's prompts again, `full` adds those that a
-    rule did not read. `left_out` has for each run how answers change without one object or message.
+    A scene is one decision point. `replayed` has closed-loop scenes by id that could be simulated
+    again, `framed` the ids of scenes shown with camera pictures. `prompts` takes a run and returns
+    a function that renders its prompts again, `full` adds those that a rule did not read.
+    `left_out` has for each run how answers change without one object or message.
     """
 
     runs: Runs  # the runs
     replayed: Mapping[str, Scene]  # of closed-loop runs, the scenes that could be replayed
     framed: frozenset[str]  # scenes that have their cameras' pictures
-    prompts: Prompts  # as in `harness.report.page.write_report`
+    # of a run, a function of a scene, a viewer's id and the messages heard that returns the chat
+    # messages; None where they are unknown
+    prompts: Prompts
     full: bool  # whether prompts that a rule was given, and did not read, are among them
-    left_out: Sequence[LeftOut]  # of each run
+    # of each run, how answers change without one object or message, by scene
+    left_out: Sequence[LeftOut]
 
     def of_scenes(self, ids: Sequence[str]) -> "Details":
         """Return a copy with these scenes alone (by id), small enough to pickle."""
@@ -324,17 +328,18 @@ class Details:
 class Part:
     """Hold a chunk of scenes, by id, whose details one process prepares and compresses.
 
-    It is pickled with no more of the runs than these scenes need.
+    `details` has what the page shows of scenes, `ids` says of which. It is pickled with no more of
+    the runs than these scenes need.
     """
 
-    details: Details
-    ids: Sequence[str]
+    details: Details  # what the page shows of scenes
+    ids: Sequence[str]  # ids of the chunk's scenes
 
     def __reduce__(self) -> Any:
         return Part, (self.details.of_scenes(self.ids), self.ids)
 
     def packed(self) -> list[Markup]:
-        """Return the details of each block of scenes as compressed JSON, in base64."""
+        """Return the details of each block of `BLOCK` scenes as compressed JSON, in base64."""
         return [packed(block) for block in self.details.blocks(self.ids)]
 
 
@@ -463,10 +468,11 @@ def _vehicle(vehicle: VehicleState, danger: str | None) -> dict[str, Any]:
 
 
 def cameras(scenario: Scenario, scene: Scene) -> dict[str, Any]:
-    """Return by viewer id its rendered camera picture and the boxes of the objects in it.
+    """Return by viewer's id its rendered camera picture and the boxes of the objects in it, a dict.
 
-    `picture` is a PNG as a data URI, `size` (width, height) in pixels, `boxes` rows of an object's
-    id and its box as `Frame.boxes` gives it.
+    Keys are `picture`, a PNG as a data URI, `size`, (width, height) in pixels, and `boxes`, rows of
+    an object's id and the pixels of its box's edges (`Frame.boxes`). `scenario` is that of the
+    scene.
     """
     pictures = {}
     for viewer, graph in scene.graphs.items():

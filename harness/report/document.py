@@ -75,11 +75,12 @@ class Section:
     headline: Sequence[str] = ()  # the outcome in sentences
     # how it was made: n, what the intervals are over, and what the outcome is conditional on
     about: Sequence[str] = ()
-    tables: Sequence[Table] = ()
+    tables: Sequence[Table] = ()  # in the order of the page
     warnings: Sequence[str] = ()  # why the outcome is none; they stand above it
     caveats: Sequence[str] = ()  # what a reader must know first
-    numbers: Sequence[Mapping[str, str]] = ()  # what is read first, as `words.figures` gives it
-    # by name: address, width in rem
+    # what is read first: dicts with `what`, `value`, `interval` and `n` as text
+    numbers: Sequence[Mapping[str, str]] = ()
+    # by name: address (a URI), and width in rem
     pictures: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     more: Markup = field(default_factory=Markup)  # below the tables
 
@@ -104,7 +105,11 @@ def _plain(cell: str) -> str:
 
 
 def reach(bounded: Iterable[Bounded]) -> tuple[float, float]:
-    """Return the smallest and largest of all values and interval ends; (0, 1) if there are none."""
+    """Return the least and greatest of all values and interval ends; (0, 1) if there are none.
+
+    `bounded` has what has a `value`, and the ends `low` and `high` of its interval; what is unknown
+    is left out.
+    """
     numbers = list[float]()
     for each in bounded:
         ends = (number_or_none(each.value), number_or_none(each.low), number_or_none(each.high))

@@ -39,17 +39,18 @@ LAST = (Kind.PACE, Kind.ORIGIN)  # what stands below them
 class Finding:
     """Hold one sentence about a run, or about some of several runs, with its kind.
 
-    The kind says where pages and the terminal show it.
+    `kind` says where pages and the terminal show it, `sentence` is plain text.
     """
 
-    kind: Kind
-    sentence: str
+    kind: Kind  # says where pages and the terminal show it
+    sentence: str  # plain text
 
 
 def each(source: Source[Run]) -> Source[Runs]:
     """Turn a function that yields sentences about one run into one for several runs by name.
 
-    Of a sentence that is not true of all runs, the names of those it is true of come first.
+    `source` takes a run; the new function takes runs by the name that each is shown by. Of a
+    sentence that is not true of all runs, the names of those it is true of come first.
     """
     return partial(_merged, source)
 
@@ -112,13 +113,20 @@ OF_ONE: Mapping[Kind, Sequence[Source[Run | SuiteRun]]] = {
 
 
 def findings(run: Run | SuiteRun, *kinds: Kind) -> list[Finding]:
-    """Return all sentences about a run, or about a suite and its runs; only of `kinds` if given."""
+    """Return all sentences about a run, or about a suite and its runs; only of `kinds` if given.
+
+    A suite is a run on each of several scenarios. The sentences are in the order of the kinds.
+    """
     runs = run.runs if isinstance(run, SuiteRun) else {"": run}
     return [*of_runs(runs, *kinds), *_findings(OF_ONE, run, kinds)]
 
 
 def of_runs(runs: Runs, *kinds: Kind) -> list[Finding]:
-    """Return the sentences about runs shown side by side, by name; only of `kinds` if given."""
+    """Return the sentences about runs shown side by side; only of `kinds` if given.
+
+    `runs` are by the name that each is shown by. A sentence that is not true of all begins with the
+    names of those it is true of.
+    """
     return _findings(OF_RUNS, runs, kinds)
 
 

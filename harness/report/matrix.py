@@ -30,11 +30,13 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 class Behind:
     """Hold how far one run is behind the best one, over the episodes that both have.
 
-    `change` is its success minus that of the best; the p-value is of no difference, corrected by
-    Holm's method.
+    `change` is its success minus that of the best, with a 95 % interval; `p_value` is of no
+    difference, corrected by Holm's method. Success is balanced (mean of that with a danger and
+    without) if all runs have that, else plain. A danger is a vehicle that would meet an ego which
+    keeps its speed.
     """
 
-    # of its success minus the best one's, by the headline metric, with a 95 % interval over these
+    # its success minus the best one's, by the headline metric, with a 95 % interval
     change: Estimate
     # of no difference, by that interval, corrected by Holm's method for all pairs of runs
     p_value: float
@@ -51,17 +53,18 @@ Mark = tuple[str, Behind | None]  # of a run under a condition: the mark, and ho
 class Line:
     """Hold the results of one run under one condition: a row of the report's main table.
 
-    `name` is the run's, and `condition` the operating point's. `scores` has its scores by metric,
-    None where unknown. `mark` says whether it is the best run, not told from it, or worse, and
-    `behind` how far it is behind, None for the best. `headline` is the headline metric and `tokens`
+    `name` is the run's, and `condition` that of the condition, a set of settings of channel, asking
+    and fusion. `scores` has the run's scores by metric, None where unknown. `mark` says whether it
+    is the best run, not told from it, or worse, and `behind` how far it is behind, None for the
+    best. `headline` is the metric by which runs are read, balanced or plain success, and `tokens`
     the median numbers of prompt and answer tokens.
     """
 
-    name: str  # of the run
-    model: str  # of its card
-    prompt: str  # version
-    answer: str  # answer mode
-    condition: str  # operating point
+    name: str  # the run's name on the page
+    model: str  # name of its model
+    prompt: str  # its prompt version
+    answer: str  # its answer mode, such as `json`
+    condition: str  # name of the condition
     scores: Mapping[str, Score | None]  # metrics by name; None where the run has none
     # medians of a prompt and an answer; None where not counted
     tokens: tuple[float | None, float | None]
@@ -71,7 +74,10 @@ class Line:
 
     @property
     def success(self) -> Score | None:
-        """Return the headline metric's score; None where the run has none."""
+        """Return the score of the metric by which runs are read; None where the run has none.
+
+        It is balanced success if all runs have it, else plain.
+        """
         return self.scores[self.headline]
 
 
@@ -79,13 +85,13 @@ class Line:
 class Grid:
     """Hold success under one condition as a table, prompts across and models down.
 
-    A condition is an operating point by its name. `prompts` are the heads of the columns. A row is
-    a model's name and, for each prompt, the results of the runs with both: several if it was run
-    again.
+    A condition is a named set of settings of channel, asking and fusion. `prompts` are the heads of
+    the columns. A row is a model's name and, for each prompt, the results of the runs with both:
+    several if it was run again.
     """
 
-    condition: str  # operating point
-    # heads of the columns: version, and the answer mode where runs differ in it
+    condition: str  # the condition's name
+    # heads of the columns: prompt version, and the answer mode where runs differ in it
     prompts: tuple[str, ...]
     # a model, and what was run with each of these prompts: several if it was run again
     rows: tuple[tuple[str, tuple[tuple[Line, ...], ...]], ...]
@@ -105,7 +111,11 @@ METRICS = (
 
 
 def lines(runs: Runs) -> list[Line]:
-    """Return a row for each run and condition, by condition, then in the runs' order."""
+    """Return a row for each run and condition, by condition, then in the runs' order.
+
+    A row has the run's scores, and how it stands to the best run under the condition. A condition
+    is a named set of settings of channel, asking and fusion.
+    """
     lengths = [_tokens(run) for run in runs.runs]
     headline_metric = headline_of(*runs.runs)
     all_marks = _marks(runs, headline_metric)
@@ -146,7 +156,11 @@ def _marks(runs: Runs, headline_metric: str) -> dict[str, list[Mark]]:
 
 
 def grids(results: Sequence[Line]) -> list[Grid]:
-    """Return a table of models by prompts for each condition of these rows."""
+    """Return a table of models by prompts for each condition of these rows.
+
+    Each of `results` is a run's scores under a condition. A condition is a named set of settings of
+    channel, asking and fusion.
+    """
     modes = {line.answer for line in results}
     cells_of: dict[str, dict[tuple[str, str], list[Line]]] = {}  # by condition, model and prompt
     for line in results:
@@ -192,7 +206,8 @@ def marked(
     """Return for each condition the marks of all runs: best, not told from the best, or worse.
 
     A mark comes with the comparison with the best run, or None for the best itself; p-values are
-    corrected by Holm's method for all pairs of runs.
+    corrected by Holm's method for all pairs of runs. A condition is a named set of settings of
+    channel, asking and fusion.
 
     Args:
         conditions: for each condition the success (0 or 1) of each run, by episode's number and
@@ -271,9 +286,10 @@ def uneven(runs: Runs) -> str | None:
 
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
-    """Return the best run's headline metric under each condition, as text.
+    """Return the best run's success under each condition, as text.
 
-    An entry has `what`, `value`, `interval` and `n`.
+    An entry has `what`, `value`, `interval` and `n`. Each of `results` is a run's scores under a
+    condition. A condition is a named set of settings of channel, asking and fusion.
     """
     rows = []
     for line in results:
@@ -292,7 +308,11 @@ def _rank(best: Line, results: Sequence[Line]) -> str:
 
 
 def shared(results: Sequence[Line]) -> set[str]:
-    """Return the conditions under which some run cannot be told from the best one."""
+    """Return the names of the conditions under which some run cannot be told from the best one.
+
+    Each of `results` is a run's scores under a condition. A condition is a named set of settings of
+    channel, asking and fusion.
+    """
     return {line.condition for line in results if line.mark == CLOSE}
 
 
@@ -301,9 +321,11 @@ def _close(condition: str, results: Sequence[Line]) -> list[str]:
 
 
 def headline(results: Sequence[Line]) -> str:
-    """Return a sentence on the run with the most of the headline metric under each condition.
+    """Return a sentence on the run with the highest success under each condition.
 
-    Runs that cannot be told from it are named, too. Each of `results` is a run under a condition.
+    Success is balanced where all runs have that. Runs that cannot be told from the best are named,
+    too. Each of `results` is a run's scores under a condition. A condition is a named set of
+    settings of channel, asking and fusion.
     """
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):

@@ -22,9 +22,9 @@ NOTES: Plugins[Callable[[Shown], Iterable[str]]] = Plugins("swarmdrive.notes", C
 def pace(run: Shown) -> Iterator[str]:
     """Yield lines on how long prefill and decode take, by role, measured at batch size 1.
 
-    TTFT is the time to first token, TPOT the time for each further token, as medians and 95th
-    percentiles in ms. They are of the run's own answers, else of those its latency was measured
-    with.
+    Prefill is reading the prompt, decode writing the answer. TTFT is the time to first token, TPOT
+    the time for each further token, as medians and 95th percentiles in ms. They are of the run's
+    own answers, else of those its latency was measured with.
     """
     manifest = run.manifest
     measured_here = {role: took for role, took in manifest.answer_times.items() if took.first_token}
@@ -51,12 +51,15 @@ def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
 
 
 def latency(run: Shown) -> Iterator[str]:
-    """Yield the line on the assumed inference times and where they come from."""
+    """Yield a line on the inference times, in ms, that decide, and where they come from."""
     yield f"latency: {latency_source(run.manifest.latency)}"
 
 
 def latency_source(latency: Latency) -> str:
-    """Return the inference times of ego, helpers and fusion, in ms, and where they come from."""
+    """Return a phrase with the inference times of ego, helpers and fusion, in ms, and their source.
+
+    A time is that of one answer of the model; the source is such as the model's file or the paper.
+    """
     source = {
         "measured": "measured on the machine of the run, before it",
         "card": "stated by the model card, not measured here",
@@ -93,7 +96,8 @@ def of_extensions(run: Shown) -> Iterator[str]:
 def answer_times(run: Shown) -> Iterator[str]:
     """Yield a line for each role on how long its answers took when the run was made, in ms.
 
-    These times are not those that latency is computed from.
+    A role is who answered: `ego`, `helper` or `merge` (the ego after it heard messages). These
+    times are not those that latency is computed from.
     """
     for role, took in run.manifest.answer_times.items():
         median_ms = f"{1000 * took.median_s:.1f} ms"
@@ -121,7 +125,8 @@ def cached(run: Shown) -> Iterator[str]:
 def readings(run: Shown) -> Iterator[str]:
     """Yield lines on how each role's answers were parsed: shares by verdict, repairs and read-outs.
 
-    For a suite, shares are means over families.
+    A verdict is `strict`, `recovered` (after repairs) or `failed`; a read-out is an answer by one
+    letter per action. For a suite, runs on several scenarios, shares are means over these.
     """
     means = ", as means over families" if isinstance(run, SuiteRun) else ""
     for role in roles():

@@ -107,8 +107,8 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
 def save(pieces: Iterable[str], out: Path, option: str) -> None:
     """Write a page's pieces to a file, which is replaced only once it is whole.
 
-    Raises UserError, with the name of the command-line option, if the file cannot be written, or is
-    data of a run.
+    `pieces` are texts, one after the other. Raises UserError, with the name of the command-line
+    option (`option`), if the file cannot be written, or is data of a run.
     """
     refuse_data(option, out)
     try:
@@ -127,7 +127,18 @@ def render(
     progress: Callable[[int], None] = lambda done: None,
     full: bool = False,
 ) -> str:
-    """Return the HTML text of the report that `write_report` writes, with the same arguments."""
+    """Return the HTML text of the report on one run, or on several on the same scenes.
+
+    Args:
+        runs: the runs to report.
+        prompts: maps a run to a function that returns the chat messages for a scene, a viewer and
+            the messages that it had heard, or to None if they are unknown.
+        progress: called with the number of scenes just written.
+        full: whether to include prompts of engines that read none, and the camera pictures of every
+            decision instead of only those of models with vision.
+
+    Raises UserError if a scene of a run is not in its dataset.
+    """
     return "".join(_pieces(runs, Decisions(runs, prompts, full), progress, 1))
 
 

@@ -41,10 +41,10 @@ class Panel:
     """
 
     id: str  # its name in the page, and of the files it is saved as
-    part: Part  # of the page
+    part: Part  # the part of the page in which it stands
     title: str  # what is drawn over what
     caption: str  # how to read it, and what it is conditional on
-    spec: dict[str, Any]  # Vega-Lite
+    spec: dict[str, Any]  # the chart, a Vega-Lite specification
 
 
 @dataclass(frozen=True)
@@ -56,18 +56,19 @@ class AddedPanel:
     specification of all runs' rows.
     """
 
-    part: Part
-    title: str
-    caption: str
-    rows: Callable[[Run], Table]  # what is drawn of a run; nothing to draw if empty
-    spec: Callable[[Table], dict[str, Any]]  # of the rows of all runs
+    part: Part  # the part of the page in which it stands
+    title: str  # what is drawn over what
+    caption: str  # how to read it
+    # what is drawn of a run, dicts for Vega-Lite; nothing to draw if empty
+    rows: Callable[[Run], Table]
+    spec: Callable[[Table], dict[str, Any]]  # of the rows of all runs, the Vega-Lite specification
 
 
 PANELS = Shipped[AddedPanel]("swarmdrive.panels", AddedPanel, {})
 
 
 def panels(runs: Runs) -> Iterator[Panel]:
-    """Yield the charts of the runs; a chart without any data is left out."""
+    """Yield the charts of the runs, by the part of the page; one without any data is left out."""
 
     def joined(table_of: Callable[[Run], Table]) -> Table:
         rows = []
@@ -205,9 +206,10 @@ def _references(runs: Runs, metric: str) -> dict[str, Score]:
 
 
 def success(run: Run, metric: str) -> Table:
-    """Return a row for each condition with success and latency: values, interval ends (in ms), n.
+    """Return a row for each condition with success and latency: values, interval ends, n.
 
-    A condition is left out if one of the two is unknown.
+    Latencies are in ms, success by the metric of this name is 0 to 1. A condition, a named set of
+    settings that the run scores, is left out if one of the two is unknown.
     """
     rows = []
     for condition in run.conditions:
@@ -230,7 +232,12 @@ def success(run: Run, metric: str) -> Table:
 
 
 def statuses(run: Run) -> Table:
-    """Return a row for each role and parse status: count of answers and share of the role's."""
+    """Return a row for each role and parse status: count of answers and share of the role's.
+
+    A role is who answered: `ego`, `helper` or `fusion` (the ego after it heard messages); a status
+    is the outcome of parsing, such as `strict` or `bad_sum`. Keys are `role`, `status`, `verdict`,
+    `count`, `share` and `n`, the number of the role's answers.
+    """
     order = {str(status): n for n, status in enumerate(Status)}
     count = Counter[tuple[str, int, str, str]]()  # by role, the status's place, status and verdict
     total = Counter[str]()  # by role
@@ -251,7 +258,8 @@ def reliability(run: Run) -> Table:
 
     The policy is the distribution over actions from which the ego acts, its confidence the greatest
     probability. A row says how often the likeliest action was the only optimal one. Conditions with
-    fewer than `LEAST` decisions that have exactly one optimal action are left out.
+    fewer than `LEAST` decisions that have exactly one optimal action are left out. A condition is a
+    named set of settings of channel, asking and fusion.
     """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
@@ -279,7 +287,8 @@ def errors(run: Run) -> Table:
     """Return the share of unsafe decisions by condition and bin of the ego's entropy, in nats.
 
     The entropy says how unsure the ego's own answer is. After an unsafe decision success is no
-    longer possible, though it was.
+    longer possible, though it was. Keys are `condition`, `entropy_nats`, `share`, its interval's
+    ends and `n`. A condition is a named set of settings of channel, asking and fusion.
     """
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
@@ -312,7 +321,7 @@ def _shares(
 def entropies(run: Run) -> Table:
     """Return a histogram of the entropy of the ego's own answers, in nats; empty if none parsed.
 
-    The entropy says how unsure an answer is: 0 is sure.
+    The entropy says how unsure an answer is: 0 is sure. A row is a bin, with its start and `count`.
     """
     intents = [answer.intent for answer in run.answers if answer.role == "ego" and answer.intent]
     if not intents:
@@ -323,7 +332,10 @@ def entropies(run: Run) -> Table:
 
 
 def tokens(run: Run) -> Table:
-    """Return a histogram of prompt lengths in tokens for each role whose engine counts them."""
+    """Return a histogram of prompt lengths in tokens for each role whose engine counts them.
+
+    A role is who was asked: `ego`, `helper` or `fusion`. A row has the least length of its bin.
+    """
     by_role: dict[str, list[float]] = {}
     for answer in run.answers:
         if answer.prompt_tokens is not None:
@@ -335,7 +347,11 @@ def tokens(run: Run) -> Table:
 
 
 def replies(run: Run) -> Table:
-    """Return the counts and shares of requested replies by condition: on time, late, lost."""
+    """Return the counts and shares of requested replies by condition: on time, late, lost.
+
+    On time is within the decision window. A row has one of the three for one condition. A condition
+    is a named set of settings of channel, asking and fusion.
+    """
     d = run.decisions
     delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
     by_reply = {
@@ -359,7 +375,8 @@ def replies(run: Run) -> Table:
 def arrivals(run: Run) -> Table:
     """Return for each condition a histogram of replies' arrival, in ms from the decision's start.
 
-    Lost replies are not in it.
+    A row is a bin, with `condition`, its start and `count`. Lost replies are not in it. A condition
+    is a named set of settings of channel, asking and fusion.
     """
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)

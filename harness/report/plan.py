@@ -33,13 +33,16 @@ class Cost:
     those of prompts and answers, minutes those of all answers one after the other.
     """
 
-    requests: float  # to the model
+    requests: float  # number of requests to the model
     tokens: float | None  # of prompts and answers
     # of all answers, one after the other; known where some were asked alone, with `--batch-size 1`
     minutes: float | None
 
     def times(self, layouts: float) -> "Cost":
-        """Return the cost of this many layouts, where `self` is that of one."""
+        """Return the cost of this many layouts, where `self` is that of one.
+
+        A layout is one start situation of a scenario.
+        """
         tokens = self.tokens and self.tokens * layouts
         minutes = self.minutes and self.minutes * layouts
         return Cost(self.requests * layouts, tokens, minutes)
@@ -49,15 +52,17 @@ class Cost:
 class Planned:
     """Hold the sample size for one condition: the layouts needed to find a difference.
 
-    `layouts` is that number, with an interval over other pilots. `finds` is the smallest difference
-    that the asked number of layouts finds, NaN if none; `cost` is what the needed layouts take,
-    None without pilot runs.
+    A layout is one drawn start situation, with one episode; a condition is a named set of settings
+    of channel, asking and fusion; a pilot is a run before the study. `layouts` is the number
+    needed, with an interval over other pilots, `finds` the smallest difference (0 to 1) that the
+    asked number of layouts finds, NaN if none; `cost` is what the needed layouts take, None without
+    pilots.
     """
 
-    condition: str  # its name; empty for a stated rate
+    condition: str  # the condition's name; empty for a stated rate
     layouts: Estimate  # how many find it; the interval is over other pilots of as many layouts
     finds: float  # the difference that as many layouts find as are asked about; NaN if none up to 1
-    # of so many layouts under all conditions of the pilots; None for a stated rate
+    # what so many layouts take under all conditions of the pilots; None for a stated rate
     cost: Cost | None
 
 
@@ -71,7 +76,7 @@ class Plan:
 
     difference: str  # whose of what, in words
     basis: str  # what must hold for it, in words
-    rows: tuple[Planned, ...]
+    rows: tuple[Planned, ...]  # one for each condition
     layouts: int | None  # those of which `finds` is
 
 
@@ -79,6 +84,8 @@ def from_rate(
     rate: float, correlation: float, detect: float, power: float, layouts: int | None
 ) -> Plan:
     """Return the power analysis of a difference between two runs with success near an assumed rate.
+
+    A layout is one start situation of a scenario.
 
     Args:
         rate: success of both, from 0 to 1.
@@ -99,9 +106,16 @@ def from_rate(
 def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: int | None) -> Plan:
     """Return the power analysis by the variance in pilot runs, one row for each condition.
 
-    Of one pilot it is for the gain over `BASELINE`, of two for their difference. `detect` and
-    `power` are as in `from_rate`; without `layouts`, it is also computed what the pilots' own
-    number finds.
+    Of one pilot it is for the gain over the condition without a radio, of two for their difference.
+    A condition is a named set of settings of channel, asking and fusion. A layout is one start
+    situation of a scenario.
+
+    Args:
+        pilots: folders of one or two runs made before the study.
+        detect: the difference to find, from 0 to 1.
+        power: the probability to find it.
+        layouts: also compute the difference that so many layouts find; None takes the pilots' own
+            number.
 
     Raises UserError for runs that cannot be compared, one without the baseline or with no other
     condition, or pilots of fewer than two layouts of a kind.
@@ -192,7 +206,10 @@ def _sum(values: Iterable[float | None]) -> float | None:
 
 
 def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:
-    """Return a plan as plain values for JSON: differences from 0 to 1, unknown numbers as None."""
+    """Return a plan as plain values for JSON: differences from 0 to 1, unknown numbers as None.
+
+    `detect` is the difference to find and `power` the probability to find it, both 0 to 1.
+    """
     conditions = []
     for row in plan.rows:
         cost = row.cost

@@ -24,7 +24,8 @@ def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
     A reference driver is a rule that needs no model. A decision tree has every course that actions
     can lead to from one start situation, and how it ends. The result maps the driver's name to
     scores by metric: success rate and, where dangers are known, balanced success (mean over layouts
-    with and without a danger) and its halves.
+    with and without a danger) and its halves. A danger is a vehicle that would meet an ego which
+    keeps its speed.
     """
 
     def scores(reference: str, success: Floats) -> dict[str, Score]:
@@ -39,9 +40,10 @@ def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
 
 
 def driven(runs: Iterable[Run], metric: str) -> dict[str, Score]:
-    """Return a metric's score of each run whose engine is a reference driver, by the driver's name.
+    """Return a metric's score of each run that a reference driver decided, by the driver's name.
 
-    Runs of other engines, and runs without a value, are left out.
+    Such a driver is a rule that needs no model. Runs of models, and runs without a value, are left
+    out.
     """
     scores = {}
     for run in runs:
@@ -52,7 +54,11 @@ def driven(runs: Iterable[Run], metric: str) -> dict[str, Score]:
 
 
 def label(name: str, scenario: Scenario) -> str:
-    """Return a reference driver's display name; that of `constant` includes the action it takes."""
+    """Return a reference driver's display name; that of `constant` includes the action it takes.
+
+    A reference driver is a rule that needs no model; `name` is its name, and `scenario` says which
+    action that is.
+    """
     action = constant(scenario) if name == CONSTANT else None
     return f"{name} {action}" if action else name
 
@@ -60,7 +66,8 @@ def label(name: str, scenario: Scenario) -> str:
 def meaning(name: str, exact: bool = True) -> str:
     """Return a sentence on what a reference driver of `BESIDE` does, which looks at nothing.
 
-    `exact`: whether its success was computed from decision trees, and not estimated from a run.
+    Such a driver is a rule without a model; `name` is its name. `exact`: whether its success was
+    computed from decision trees (all that actions lead to), and not estimated from a run.
     """
     exactly = "by the trees; a run of it draws"
     return {

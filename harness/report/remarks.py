@@ -28,19 +28,26 @@ LeftOut = Mapping[str, Sequence[Mapping[str, Any]]]
 
 @runtime_checkable
 class Remarks(Protocol):
-    """Describe what an extension offers as remarks on single decision points of a run's page."""
+    """Describe what an extension offers as remarks on single decision points of a run's page.
+
+    A decision point is one situation in which decisions are due.
+    """
 
     def sentences(self, runs: Runs) -> Iterable[Markup]:
-        """Return sentences to show above the page's list of decision points.
+        """Return sentences, as HTML, to show above the page's list of decision points.
 
-        In them `<a data-scene=… data-run=…>` is a link to a decision point.
+        In them `<a data-scene=… data-run=…>` is a link to a decision point, by its id and the index
+        of its run.
         """
         ...
 
     def left_out(self, run: Run) -> LeftOut:
         """Return how answers and decisions change without one object or message, by decision point.
 
-        Each decision point has a list of entries, with the keys that `LeftOut` names.
+        Each decision point, by id, has a list of entries, dicts with `item`, what is left out;
+        `role`, `viewer`, `condition` and `seed`, whose answer or decision it is; `action`, the
+        likeliest with it; and, None without an answer, `instead`, the likeliest without it,
+        `change`, of that action's probability, and `shift`, of the distribution.
         """
         ...
 
@@ -72,8 +79,9 @@ def sentences(runs: Runs) -> list[Markup]:
 def left_out(run: Run) -> LeftOut:
     """Return what all extensions know of answers without one object or message, by decision point.
 
-    Each has a list of entries, one for an object or message. An extension that fails adds nothing.
-    Raises UserError if a file of the run is broken.
+    Each decision point, by id, has a list of entries, one for an object or message
+    (`Remarks.left_out`). An extension that fails adds nothing. Raises UserError if a file of the
+    run is broken.
     """
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:

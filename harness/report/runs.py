@@ -30,7 +30,10 @@ class Runs:
 
     @property
     def live(self) -> bool:
-        """Return whether the runs are closed-loop runs, which have no dataset."""
+        """Return whether the runs are closed-loop runs, which have no dataset.
+
+        In closed loop a simulator plays the episodes.
+        """
         return self.dataset is None
 
     @property
@@ -46,14 +49,20 @@ class Runs:
         return self.runs[0].manifest.scenario
 
     def of_scenes(self, ids: Collection[str]) -> "Runs":
-        """Return a copy with these scenes alone (by id) and their layouts' decision trees."""
+        """Return a copy with these scenes alone (by id) and their layouts' decision trees.
+
+        A layout is one start situation of a scenario.
+        """
         runs = tuple(run.of_scenes(ids) for run in self.runs)
         layouts = {number for run in runs for number in run.grid.episodes}
         return replace(self, runs=runs, dataset=self.dataset and self.dataset.of_episodes(layouts))
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Return the names of all conditions (operating points) of the runs, each once."""
+        """Return the names of all conditions of the runs, each once.
+
+        A condition is a named set of settings of channel, asking and fusion.
+        """
         return tuple(dict.fromkeys(name for run in self.runs for name in run.conditions))
 
 

@@ -22,8 +22,8 @@ SECTIONS: Plugins[Callable[[Run], Section | None]] = Plugins("swarmdrive.section
 def sections(runs: Runs) -> list[tuple[str, Markup]]:
     """Return title and HTML of each page section that extensions write for these runs.
 
-    An extension that fails gets a section with its error message instead; the rest of the page is
-    unaffected.
+    Every extension's function is called with each run. One that fails gets a section with its error
+    message instead; the rest of the page is unaffected.
     """
     written = [_written(name, run) for name in SECTIONS for run in runs.runs]
     return [section for section in written if section is not None]

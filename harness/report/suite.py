@@ -36,13 +36,15 @@ MEAN = "mean over families"
 class Cell:
     """Hold the result of one family of scenes (one scenario's dataset) under one condition.
 
-    `success` is balanced where dangers are known. `gain` is the success less that of the condition
-    without V2V, in which the ego hears nobody; `verdict` is `better` or `worse` if that is
-    significant.
+    A condition is a named set of settings of channel, asking and fusion. `success` is balanced (the
+    mean of that with a danger and without) where dangers are known. `gain` is the success less that
+    of the condition without V2V, in which the ego hears nobody; `verdict` is `better` or `worse` if
+    that is significant. A danger is a vehicle that would meet an ego which keeps its speed.
     """
 
     success: Score | None  # success rate, balanced where dangers are known
-    gain: Score | None  # over `BASELINE`, paired; None where there is none
+    # success over that of the condition without a radio, paired; None where there is none
+    gain: Score | None
     # `better` or `worse` where the gain is not chance, its p at most 0.05 by Holm's method
     verdict: str
 
@@ -51,11 +53,12 @@ class Cell:
 class Line:
     """Hold one row of the suite's table: the results of one family, or the mean over families.
 
-    A family is the scenes of one scenario; `run` is its run, None for the mean. `drivers` has the
-    success of reference drivers by name, `cells` the result by condition.
+    A suite is a run on each of several families, a family the scenes of one scenario; `name` is the
+    family's and `run` its run, None for the mean. `drivers` has the success of reference drivers
+    (rules without a model) by name, `cells` the result by condition.
     """
 
-    name: str  # the family's
+    name: str  # the family's name
     run: Run | None  # its run; None for the mean
     # success of each reference, which needs no model, in the same episodes
     drivers: Mapping[str, Score]
@@ -64,6 +67,8 @@ class Line:
 
 def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> list[Line]:
     """Return a row for each family of a suite, then one for their mean.
+
+    A family is the scenes of one scenario.
 
     Args:
         suite: the suite's finished run.
@@ -154,18 +159,20 @@ def seeds_of(run: Run) -> str:
 
 
 def write(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], out: Path) -> Path:
-    """Write the HTML page of the runs of one or several suites, each with its `lines`.
+    """Write the HTML page of the runs of one or several suites, and return the file.
 
-    Returns the file. Raises UserError if `out` cannot be written.
+    A suite is a run on each of several scenarios; it comes with its rows (`lines`). Raises
+    UserError if `out` cannot be written.
     """
     save([render(suites, beside(out))], out, "--out")
     return out
 
 
 def render(suites: Sequence[tuple[SuiteRun, Sequence[Line]]], place: Place) -> str:
-    """Return the HTML page of the runs of one or several suites, each with its `lines`.
+    """Return the HTML page of the runs of one or several suites, each with its rows (`lines`).
 
-    `place` returns the link to the page of a family's run, or None.
+    A suite is a run on each of several families (scenarios). `place` takes a run and returns the
+    link to its page, or None.
     """
     return document([_section(suite, rows, place) for suite, rows in suites])
 

@@ -46,9 +46,10 @@ def cell(score: Score | None) -> Markup:
 
 
 def headline(run: Run | SuiteRun) -> str:
-    """Return the result in one sentence: success under the best condition and without V2V.
+    """Return the result of a run or suite in one sentence: success at best and without V2V.
 
-    Without V2V the ego hears no other vehicle.
+    At best is under the condition (set of settings) with the most; without V2V the ego hears no
+    other vehicle. A suite is a run on each of several scenarios.
     """
     model = f"{run.manifest.variant.model}{run.manifest.variant.mix}"
     best, base = compared(run)
@@ -102,10 +103,11 @@ def judged(change: Estimate, p: float) -> str:
 
 
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
-    """Return the names of the best condition and of its baseline, by the headline metric.
+    """Return the names of the best condition and of its baseline, by balanced or plain success.
 
     The baseline is the first condition without V2V, in which the ego hears nobody, else the worst;
-    an empty string where there is none.
+    an empty string where there is none. A condition is a named set of settings of channel, asking
+    and fusion.
     """
     metric = headline_of(run)
     values = {}
@@ -123,7 +125,10 @@ def compared(run: Run | SuiteRun) -> tuple[str, str]:
 
 
 def figures(run: Run) -> list[dict[str, str]]:
-    """Return the key figures of a run, each as text: `what` it is, `value`, `interval` and `n`."""
+    """Return the key figures of a run, each as text: `what` it is, `value`, `interval` and `n`.
+
+    `n` is the number of episodes or the like behind it.
+    """
     best, base = compared(run)
     metric = headline_of(run)
     scores = {f"{IN_WORDS[metric]} under {best}": run.score(best, metric)}
@@ -156,9 +161,10 @@ def as_good_as(plain: Estimate, corrected: Estimate) -> str:
 def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
     """Return success adjusted for the layouts' difficulty, and a phrase on how much that gains.
 
-    A layout is one drawn start situation, one for each episode; how hard it is, is known before
-    anybody is asked. None with fewer than `SHOWN_FROM` layouts, and for a run whose intervals are
-    valid at any stopping time, since this one is not.
+    `metric` is the name of plain or balanced success, and `condition` that of a set of settings of
+    channel, asking and fusion. A layout is one drawn start situation, one for each episode; how
+    hard it is, is known before anybody is asked. None with fewer than `SHOWN_FROM` layouts, and for
+    a run whose intervals are valid at any stopping time, since this one is not.
     """
     plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
     if not plain or not better or plain.interval == ANY_TIME or plain.n < SHOWN_FROM:
@@ -169,7 +175,9 @@ def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
 def adjusted_lines(run: Run) -> Iterator[str]:
     """Yield a line on difficulty-adjusted success, and one on balanced success, by condition.
 
-    It yields none where no condition has an adjusted score.
+    It is adjusted for how hard the run's start situations are among all of its dataset. It yields
+    none where no condition has an adjusted score. A condition is a named set of settings of
+    channel, asking and fusion.
     """
     for metric, words in IN_WORDS.items():
         cells = []
@@ -182,10 +190,11 @@ def adjusted_lines(run: Run) -> Iterator[str]:
 
 
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
-    """Return the p-value of each other condition's gain over `base` in the headline metric.
+    """Return the p-value of each other condition's gain in success over the condition `base`.
 
-    For a suite, the gain is the mean over families. They are not corrected for multiplicity; 1
-    where the gain has no interval.
+    For a suite, a run on each of several families (scenarios), the gain is the mean over these.
+    They are not corrected for multiplicity; 1 where the gain has no interval. A condition is a
+    named set of settings of channel, asking and fusion.
     """
     played = plays(_runs(run), headline_of(run))
     p_values = {}

@@ -39,16 +39,16 @@ LOST_BY = ("B", "A", None)
 class DecisionFlip:
     """Hold a scene in which runs A and B take different actions, with the seeds where they do.
 
-    `scene` is the scene's id, `episode` the number of its episode, `seeds` are channel seeds, and
-    `a` and `b` the names of the actions. `lost_by` is the run whose action alone made success
-    impossible; None for neither, both or unknown.
+    `scene` is the id of the scene, one decision point, and `episode` the number of its episode.
+    `seeds` are those of the channel's random numbers, and `a` and `b` names of actions. `lost_by`
+    is the run whose action alone made success impossible; None for neither, both or unknown.
     """
 
-    scene: str  # its id
-    episode: int  # its episode's number
-    seeds: tuple[int, ...]  # in which they do
-    a: str  # action of A
-    b: str  # action of B
+    scene: str  # the scene's id
+    episode: int  # the number of the scene's episode
+    seeds: tuple[int, ...]  # channel seeds with which they do
+    a: str  # action that A takes
+    b: str  # action that B takes
     # the run whose action alone gave success away; None where neither, both or unknown
     lost_by: str | None
 
@@ -59,10 +59,11 @@ class Difference:
 
     `a` and `b` are its means in runs A and B, `change` is B - A with its 95 % interval. The
     p-values are of no difference: `p_value` as computed, `p_corrected` corrected for multiple
-    testing, which only primary metrics are; None where there is none.
+    testing, which only primary metrics (those that a comparison is judged by) are; None where there
+    is none. A condition is a named set of settings of channel, asking and fusion.
     """
 
-    metric: str  # its name
+    metric: str  # the metric's name
     # mean of A over the episodes and seeds in which both know it; of a latency percentile, itself
     a: float
     b: float  # mean of B over the same
@@ -75,7 +76,7 @@ class Difference:
 
     @property
     def primary(self) -> bool:
-        """Return whether the metric is a primary one, corrected for multiple testing."""
+        """Return whether a comparison is judged by the metric, corrected for multiple testing."""
         return entry(self.metric).primary
 
 
@@ -87,8 +88,8 @@ class Flip:
     runs: `success`, or the kind of failure.
     """
 
-    episode: int  # its number
-    seeds: tuple[int, ...]  # in which it does
+    episode: int  # the episode's number
+    seeds: tuple[int, ...]  # channel seeds with which it does
     a: str  # how it ends in A: `success`, or how it fails
     b: str  # how it ends in B
 
@@ -97,31 +98,32 @@ class Flip:
 class InCondition:
     """Hold what differs between runs A and B in one condition: metrics, episodes and decisions.
 
-    A condition is an operating point by its name. `gained` are episodes that fail in A and succeed
-    in B, `lost` the reverse; `decisions` counts those in both runs, and `flips` are those of them
-    with another action.
+    A condition is a named set of settings of channel, asking and fusion. `gained` are episodes that
+    fail in A and succeed in B, `lost` the reverse; `decisions` counts those in both runs, and
+    `flips` are those of them with another action.
     """
 
-    condition: str  # its name
-    differences: tuple[Difference, ...]  # metrics that both runs know
+    condition: str  # the condition's name
+    differences: tuple[Difference, ...]  # one for each metric that both runs know
     gained: tuple[Flip, ...]  # episodes from failure to success
     lost: tuple[Flip, ...]  # episodes from success to failure
-    decisions: int  # how many both runs have
-    flips: tuple[DecisionFlip, ...]  # those whose action is another; what B's gave away first
+    decisions: int  # how many decisions both runs have
+    flips: tuple[DecisionFlip, ...]  # those with another action; what B's gave away first
 
 
 @dataclass(frozen=True)
 class AnswersFlipped:
     """Hold the ids of requests whose answers changed from parse verdict `a` to verdict `b`.
 
-    A verdict is `strict`, `recovered` or `failed`: how run A's and run B's answer could be read.
-    `role` is that of the answers: `ego`, `helper` or `merge`.
+    A verdict is how run A's and run B's answer could be read: `strict` (as it is), `recovered`
+    (after repairs) or `failed`. `role` is that of the answers: `ego`, `helper` or `merge` (the ego
+    after it heard messages); `requests` are the ids.
     """
 
     role: str  # of who answered: `ego`, `helper` or `merge`
     a: str  # verdict in A: `strict`, `recovered` or `failed`
     b: str  # verdict in B
-    requests: tuple[str, ...]  # their ids; first where B gave success away, then where A did
+    requests: tuple[str, ...]  # ids; first where B gave success away, then where A did
 
 
 @dataclass(frozen=True)
@@ -132,11 +134,11 @@ class AnswerChanged:
     `verdicts` says how each was read: `strict`, `recovered` or `failed`.
     """
 
-    request: str  # its id
-    role: str  # of who answered, as in `AnswersFlipped`
+    request: str  # the request's id
+    role: str  # of who answered: `ego`, `helper` or `merge`
     a: str  # text of A's answer
-    b: str  # text of B's
-    verdicts: tuple[str, str]  # how A's and B's were read
+    b: str  # text of B's answer
+    verdicts: tuple[str, str]  # how A's and B's were read: `strict`, `recovered` or `failed`
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ class AnswersHeld:
 
     same: int  # how many questions were the same
     other: int  # how many were not, so that their answers are not compared
-    changed: tuple[AnswerChanged, ...]  # in the order of `AnswersFlipped.requests`
+    # answers that differ; first where B gave success away, then where A did
+    changed: tuple[AnswerChanged, ...]
 
     @property
     def verdicts(self) -> int:
@@ -162,26 +165,30 @@ class AnswersHeld:
 class Comparison:
     """Hold everything that differs between run A and run B, as `compare` finds it.
 
-    `pair` are the runs, and `conditions` what differs in each condition (operating point).
-    `settings` has the name of each that differs, with A's value and B's. `answers` has the answers
-    that changed their parse verdict, of the `answers_in_both` by role, and `held` those to the same
-    question that changed at all. `prompts` is what differs between the prompts: None for nothing, a
-    sentence if it is not known.
+    `pair` are the runs, and `conditions` has what differs in each condition, a named set of
+    settings of channel, asking and fusion. `settings` has the name of each that differs, with A's
+    value and B's. `answers` has the answers that changed their parse verdict (how they could be
+    read), of the `answers_in_both` by role, and `held` those to the same question that changed at
+    all. `prompts` is what differs between the prompts: None for nothing, a sentence if it is not
+    known.
     """
 
     pair: Pair  # the two runs
-    # that differ: name, A's value, B's, or None
+    # those that differ: name, A's value and B's, None where it has none
     settings: tuple[tuple[str, str | None, str | None], ...]
-    conditions: tuple[InCondition, ...]  # what changed in each
+    conditions: tuple[InCondition, ...]  # what changed in each condition that both have
     answers: tuple[AnswersFlipped, ...]  # which answers changed their verdict
     answers_in_both: dict[str, int]  # answers by role that both runs have
     held: AnswersHeld  # which answers to the same questions changed, in their text too
-    # what differs; None where nothing; a sentence why it is not known
+    # what differs in prompts; None where nothing; a sentence why it is not known
     prompts: PromptChange | str | None
 
 
 def compare(pair: Pair) -> Comparison:
-    """Return what differs from run A to B: settings, prompts, metrics, episodes and answers."""
+    """Return what differs from run A to B: settings, prompts, metrics, episodes and answers.
+
+    `pair` has both runs, on the same scenes.
+    """
     conditions = [_in_condition(pair, name) for name in pair.conditions]
     answers = _answers_of_both(pair, conditions)
     return Comparison(

@@ -29,14 +29,15 @@ ENDS = ("low", "high")
 class Gate:
     """Hold one test of --fail-if: a comparison fails if B - A satisfies it in some condition.
 
-    A gate is such as `6g:success_rate < -0.01`. `condition` is the operating point that it is
-    about, None for all. `end` chooses the difference itself (`value`) or an end of its interval
-    (`low`, `high`), which is compared with `number`, in the metric's unit, by `op`.
+    A gate is such as `6g:success_rate < -0.01`. `condition` is the condition (named set of settings
+    of the runs) that it is about, None for all. `end` chooses the difference itself (`value`) or an
+    end of its interval (`low`, `high`), which is compared with `number`, in the metric's unit, by
+    `op`.
     """
 
     text: str  # as it was typed
-    condition: str | None  # the only one it looks at; None for all
-    metric: str  # its name
+    condition: str | None  # name of the only condition it looks at; None for all
+    metric: str  # the metric's name
     end: str  # `low` or `high` end of the interval; `value` for the difference itself
     op: str  # one of `OPERATORS`
     number: float  # in the metric's own unit, shares from 0 to 1
@@ -47,7 +48,7 @@ class Verdict:
     """Hold the result of a gate, a test that a comparison may fail.
 
     `gate` is its text, and `failed` has each condition in which it failed with the value that did
-    it; empty if it passed.
+    it; empty if it passed. A condition is a named set of settings of channel, asking and fusion.
     """
 
     gate: str  # its text, as it was typed
@@ -100,7 +101,9 @@ def gate(
 
 
 def judge(gate: Gate, comparison: Comparison) -> Verdict:
-    """Return in which conditions of a comparison a gate fails.
+    """Return in which conditions of a comparison a gate, a test of a difference, fails.
+
+    A condition is a named set of settings of channel, asking and fusion.
 
     Raises:
         UserError: the gate's condition is not compared, or the difference is unknown there.

@@ -29,7 +29,7 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
     """Return the HTML page of a comparison with its gates' verdicts.
 
     A gate is a test that the comparison may fail. `most` is how many episodes and requests a list
-    shows; `place` returns the link to a run's page, or None.
+    shows; `place` takes a run and returns the link to its page, or None.
     """
     pair = comparison.pair
     sides = {"A": pair.a, "B": pair.b}

@@ -58,8 +58,9 @@ def where(run: Run) -> str:
 class Side:
     """Hold one of the two compared runs with its settings and its metrics as arrays.
 
-    `settings` has the text of each setting by its dotted name. `values` has each metric for C
-    conditions, S channel seeds and E episodes of the run, (C, S, E); NaN where unknown.
+    `settings` has the text of each setting by its dotted name, such as `model.name`. `values` has
+    each metric by name for C conditions, S channel seeds and E episodes of the run, (C, S, E); NaN
+    where unknown.
     """
 
     run: Run  # as it was read
@@ -69,12 +70,19 @@ class Side:
 
     @cached_property
     def ends(self) -> Mapping[tuple[str, int, int], Episode]:
-        """Return the record of each episode, by its condition's name, channel seed and number."""
+        """Return the record of each episode, by its condition's name, channel seed and number.
+
+        A condition is a named set of settings of channel, asking and fusion.
+        """
         return {(e.condition, e.seed, e.episode): e for e in self.run.episodes}
 
     @property
     def prompts(self) -> list[dict[str, Any]]:
-        """Return what the manifest records of the prompts of the ego and of the first helper."""
+        """Return what the manifest records of the prompts of the ego and of the first helper.
+
+        A record has the keys `version`, `sha256` and `released`; if the ego's model answers for
+        helpers, its prompt comes twice.
+        """
         return [self.run.manifest.agent(place)["prompt"] for place in (0, 1)]
 
 
@@ -82,8 +90,9 @@ class Side:
 class Pair:
     """Hold two runs that can be compared, and the conditions, seeds and episodes they share.
 
-    `a` is the run that is compared with, `b` the one that is judged. `conditions` are names of
-    operating points, `seeds` channel seeds, and `episodes` episodes' numbers, ascending.
+    `a` is the run that is compared with, `b` the one that is judged. `conditions` are names of sets
+    of settings of channel, asking and fusion, `seeds` channel seeds, and `episodes` episodes'
+    numbers, ascending.
     """
 
     a: Side  # the one that is the base
@@ -95,7 +104,8 @@ class Pair:
     def values(self, side: Side, metric: str, condition: str) -> Floats:
         """Return a metric of a run in the E shared episodes and S shared seeds, (E, S).
 
-        NaN where unknown. `side` is the run, A or B.
+        NaN where unknown. `side` is the run, A or B; `metric` and `condition` are names. A
+        condition is a named set of settings of channel, asking and fusion.
         """
         grid = side.run.grid
         seeds = [grid.seeds.index(seed) for seed in self.seeds]
@@ -121,8 +131,10 @@ class Pair:
     def judged(self, side: Side, condition: str) -> Judged:
         """Return the shared decisions with exactly one optimal action, for calibration metrics.
 
-        They are those of the run `side` under one condition. `Judged.episode` holds each decision's
-        index in `self.episodes`.
+        An action is optimal if success is still possible after it, where it is possible at all. The
+        decisions are those of the run `side` under one condition. `Judged.episode` holds each one's
+        index in `self.episodes`. A condition is a named set of settings of channel, asking and
+        fusion.
         """
         rows, place = self._rows(side, condition)
         policy = side.run.decisions.of_actions("fused")[rows]
@@ -130,9 +142,10 @@ class Pair:
         return Judged.of(policy, safe == 1.0, place)
 
     def latencies(self, side: Side, condition: str) -> list[Decided]:
-        """Return the latencies of the shared decisions for each seed, as a pair of arrays (n,).
+        """Return the latencies of the n shared decisions of each seed, as a pair of arrays (n,).
 
-        The arrays are a decision's index in `episodes` and its latency, ms.
+        The arrays are a decision's index in `episodes` and its latency, ms. `side` is the run, and
+        `condition` the name of a set of settings of channel, asking and fusion.
         """
         rows, place = self._rows(side, condition)
         seed = side.run.decisions["seed"][rows]
@@ -152,7 +165,9 @@ class Pair:
 
 @uncollected()
 def pair(a: Path, b: Path) -> Pair:
-    """Read two run folders and pair them.
+    """Read two run folders, `a` and `b`, and pair the runs for a comparison.
+
+    A condition is a named set of settings of channel, asking and fusion.
 
     Raises:
         UserError: a folder is no finished run or contradicts itself, or the two runs differ in

@@ -115,9 +115,12 @@ def _row(d: Difference) -> str:
 def markdown(
     comparison: Comparison, verdicts: Sequence[Verdict], most: int, whole: bool = False
 ) -> str:
-    """Return a comparison in GitHub's Markdown; its arguments are those of `terminal`.
+    """Return a comparison and its gates' verdicts in GitHub's Markdown.
 
-    Every text of a run is formatted as code, so that it cannot become a link, picture or mention.
+    A gate is a test that a comparison may fail. `most` is how many episodes and requests a list
+    shows; `whole` also shows all exploratory metrics, those that are not corrected for multiple
+    testing. Every text of a run is formatted as code, so that it cannot become a link, picture or
+    mention.
     """
     pair = comparison.pair
     failed = sum(bool(verdict.failed) for verdict in verdicts)
@@ -206,7 +209,8 @@ def code(text: str) -> str:
 def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> dict[str, Any]:
     """Return a comparison as plain values for JSON: metrics in their units, unknown numbers null.
 
-    `most` is how many episodes and requests a list shows.
+    The keys are those of the output of `harness compare --json`. `verdicts` are those of its gates,
+    tests that it may fail; `most` is how many episodes and requests a list shows.
     """
     pair, prompts = comparison.pair, comparison.prompts
     return {
@@ -257,9 +261,10 @@ def _gate(verdict: Verdict) -> dict[str, Any]:
 
 
 def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str, Any]]:
-    """Return the answers that differ, up to `most` or all, as dicts with the keys `ANSWERS`.
+    """Return the answers that differ as dicts: request, role, and each run's verdict and text.
 
-    `held` is the comparison of both runs' answers to the same questions.
+    `held` is the comparison of both runs' answers to the same questions; up to `most` are taken, or
+    all. The keys are `ANSWERS`.
     """
     rows = []
     for answer in held.changed[:most]:

@@ -40,19 +40,19 @@ EXCERPT = 140  # characters of an answer in a line
 class Line:
     """Hold one row of a comparison's table as text: a metric in runs A and B.
 
-    `a` and `b` are its means there, `change` is B - A and `interval` that of the change; `p` is its
-    p-value. Shares are in percent. `verdict` is `better` or `worse` if the metric is primary and
-    its corrected p is at most 0.05, `hint` if it is exploratory and its uncorrected p is, else
-    empty.
+    `a` and `b` are its means there, `change` is B - A, `interval` that of the change, and `p` its
+    p-value. Shares are in percent. A metric is primary if comparisons are judged by it, else
+    exploratory. `verdict` is `better` or `worse` if it is primary and its corrected p is at most
+    0.05, `hint` if it is exploratory and its uncorrected p is, else empty.
     """
 
-    verdict: str
-    metric: str
-    a: str
-    b: str
-    change: str
-    interval: str
-    p: str
+    verdict: str  # `better`, `worse`, `hint` or empty
+    metric: str  # the metric's label
+    a: str  # its mean in A
+    b: str  # its mean in B
+    change: str  # B - A
+    interval: str  # 95 % interval of the change; empty without one
+    p: str  # p-value of no difference; empty without one
 
 
 def line(d: Difference) -> Line:
@@ -77,7 +77,12 @@ def line(d: Difference) -> Line:
 
 
 def verdict(d: Difference) -> str:
-    """Return `better`, `worse` or `hint`, as in `Line`; empty if not significant or tiny."""
+    """Return `better` or `worse` for a primary metric, `hint` for another; empty if unclear.
+
+    Primary are the metrics that comparisons are judged by; their p is corrected for multiple
+    testing, and at most 0.05. It is empty, too, if the difference rounds to 0, or no direction is
+    better.
+    """
     better, p = entry(d.metric).better, d.p_corrected if d.primary else d.p_value
     if p is None or p > LEVEL or not _visible(d):
         return ""
@@ -94,11 +99,13 @@ def _visible(d: Difference) -> bool:
 
 
 def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
-    """Return which differences in a condition are shown first: `SHOWN` in all at most.
+    """Return a condition's differences that are shown first, the primary and then others.
 
-    They are all of primary metrics, and the most significant ones of exploratory metrics.
-    Exploratory metrics with a preferred direction come first, percentiles of latency last. If one
-    of them is over decisions with one optimal action alone, the number of these is added.
+    Primary are the metrics that comparisons are judged by, all of which are returned. Of the
+    others, exploratory ones, it is the most significant, so that there are `SHOWN` in all: those
+    with a preferred direction come first, percentiles of latency last. If one of them is over
+    decisions with one optimal action alone, the number of these is added. A condition is a named
+    set of settings of channel, asking and fusion.
     """
 
     def order(d: Difference) -> tuple[bool, float]:
@@ -120,13 +127,20 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
 
 
 def rest(c: InCondition) -> list[Difference]:
-    """Return the differences in a condition that `first` leaves out."""
+    """Return a condition's differences in the metrics that are not shown first (by `first`).
+
+    A condition is a named set of settings of channel, asking and fusion.
+    """
     primary, striking = first(c)
     return [d for d in c.differences if d not in (*primary, *striking)]
 
 
 def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
-    """Return for each condition a sentence on the headline metric's change, and its verdict."""
+    """Return for each condition a sentence on the change of success, and its verdict.
+
+    Success is balanced if both runs have that. The verdict is `better`, `worse` or empty. A
+    condition is a named set of settings of channel, asking and fusion.
+    """
     outcomes = []
     for condition in comparison.conditions:
         differences = {d.metric: d for d in condition.differences}
@@ -165,7 +179,10 @@ def sides(pair: Pair, whole: bool = False) -> list[tuple[str, str]]:
 
 
 def paces(pair: Pair) -> list[str]:
-    """Return sentences on how long prefill and decode take, each after its run's letter, A or B."""
+    """Return sentences on how long prefill (reading) and decode (writing) take, for A and for B.
+
+    Each begins with its run's letter.
+    """
     sentences = []
     for name, side in (("A", pair.a), ("B", pair.b)):
         pace = findings(side.run, Kind.PACE)
@@ -174,7 +191,10 @@ def paces(pair: Pair) -> list[str]:
 
 
 def caveats(pair: Pair) -> list[str]:
-    """Return the warnings about both runs; one of a single run begins with its letter."""
+    """Return the warnings about both runs; one of a single run begins with its letter, A or B.
+
+    If a run might stop early, the differences of success by its rule are added.
+    """
     warnings = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
     return [*(finding.sentence for finding in warnings), *_by_stopping_rule(pair)]
 
@@ -209,13 +229,17 @@ def paired(pair: Pair) -> str:
 
 
 def differing(comparison: Comparison) -> str:
-    """Return a phrase with the kinds of settings in which the runs differ."""
+    """Return a phrase with the kinds of settings in which the runs differ, such as `model`."""
     kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in comparison.settings))
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
 
 def success(c: InCondition, pair: Pair) -> str:
-    """Return a sentence on how many episodes × seeds changed to success, how many to failure."""
+    """Return a sentence on how many episodes × seeds changed to success, how many to failure.
+
+    `c` is what differs in one condition, and `pair` has the runs. A condition is a named set of
+    settings of channel, asking and fusion.
+    """
     gained = sum(len(flip.seeds) for flip in c.gained)
     lost = sum(len(flip.seeds) for flip in c.lost)
     unit = "episodes × seeds" if len(pair.seeds) > 1 else "episodes"
@@ -225,8 +249,9 @@ def success(c: InCondition, pair: Pair) -> str:
 def adjusted(c: InCondition) -> Iterator[str]:
     """Yield how success in a condition changed, adjusted for how hard the layouts are.
 
-    A layout is one drawn start situation, one for each episode. It yields nothing for fewer than
-    `SHOWN_FROM` of them.
+    A layout is one drawn start situation, one for each episode. `c` is what differs in the
+    condition. It yields nothing for fewer than `SHOWN_FROM` layouts. A condition is a named set of
+    settings of channel, asking and fusion.
     """
     changes = {d.metric: d.change for d in c.differences}
     for metric, name in IN_WORDS.items():
@@ -240,7 +265,10 @@ def adjusted(c: InCondition) -> Iterator[str]:
 
 
 def many(comparison: Comparison) -> str:
-    """Return a sentence on multiple testing: how many differences were tested, how corrected."""
+    """Return a sentence on multiple testing: how many differences were tested, how corrected.
+
+    The more are tested, the more seem significant by chance.
+    """
     tested = [d for c in comparison.conditions for d in c.differences if d.p_value is not None]
     if not tested:
         return "no difference has a p: too few episodes, or none of them changed"
@@ -263,7 +291,8 @@ def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
     """Return (`lost`, text) and (`gained`, text) of one condition of a comparison of B with A.
 
     Lost are the episodes that succeed in A alone, gained those that succeed in B alone. Each text
-    has up to `most` of them and how they failed; one without episodes is left out.
+    has up to `most` of them and how they failed; one without episodes is left out. A condition is a
+    named set of settings of channel, asking and fusion.
     """
     ways = (("lost", c.lost), ("gained", c.gained))
     return [(way, _flips(some, pair, most)) for way, some in ways if some]
@@ -279,7 +308,11 @@ def _flips(some: Sequence[Flip], pair: Pair, most: int) -> str:
 
 
 def decisions(c: InCondition, pair: Pair) -> str:
-    """Return a sentence on how many decisions differ, and how many made success impossible."""
+    """Return a sentence on how many decisions differ, and how many made success impossible.
+
+    `c` is what differs in one condition, and `pair` has the runs. A condition is a named set of
+    settings of channel, asking and fusion.
+    """
     count = dict.fromkeys(LOST_BY, 0)
     for flip in c.flips:
         count[flip.lost_by] += len(flip.seeds)
@@ -292,7 +325,8 @@ def decisions(c: InCondition, pair: Pair) -> str:
 def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
     """Return the differing decisions that made success impossible in one run alone.
 
-    An item is a phrase that names the run and a text with up to `most` decisions.
+    `c` is what differs in one condition. An item is a phrase that names the run and a text with up
+    to `most` decisions. A condition is a named set of settings of channel, asking and fusion.
     """
     rows = []
     for run in ("B", "A"):
@@ -357,7 +391,11 @@ def _where_all_are(pair: Pair) -> str:
 
 
 def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
-    """Return for each change of parse verdict a phrase with its count and a list of requests."""
+    """Return for each change of parse verdict a phrase with its count and a list of requests.
+
+    A verdict is how an answer could be read: `strict`, `recovered` or `failed`. The list is a text
+    with up to `most` ids.
+    """
     rows = []
     for flipped in comparison.answers:
         n, of = len(flipped.requests), comparison.answers_in_both[flipped.role]
@@ -384,7 +422,10 @@ def answers_held(held: AnswersHeld) -> str:
 
 
 def first_changed(changed: AnswerChanged) -> list[str]:
-    """Return lines on a changed answer: its request, and each run's text from where they differ."""
+    """Return lines on a changed answer: its request, and each run's text from where they differ.
+
+    Texts are cut to `EXCERPT` characters.
+    """
     start = max(_alike(changed.a, changed.b) - BEFORE, 0) if changed.a != changed.b else 0
     lines = [f"first: {changed.request}, {role_word(changed.role)}"]
     answers = zip("AB", changed.verdicts, (changed.a, changed.b), strict=True)
@@ -397,7 +438,8 @@ def first_changed(changed: AnswerChanged) -> list[str]:
 def both_texts(changed: AnswerChanged) -> list[tuple[str, str, str, str, str]]:
     """Return a row for A and for B: letter, verdict, and the answer's text in three parts.
 
-    The parts are the text before, in and after the passage that differs.
+    The verdict is how the answer could be read, such as `strict`; the parts are the text before, in
+    and after the passage that differs.
     """
     a, b = changed.a, changed.b
     start = _alike(a, b)
@@ -421,7 +463,7 @@ def _listed(some: Sequence[str], n: int, most: int) -> str:
 
 
 def settings(comparison: Comparison) -> list[str]:
-    """Return a text for each setting that differs, with its value in A and B."""
+    """Return a text for each setting that differs: its name, and its values in A and in B."""
 
     def in_words(value: str | None) -> str:
         return "none" if value is None else printable(value, 60)

@@ -35,7 +35,7 @@ HIDDEN: dict[str, Any] = {"facecolor": "none", "linestyle": (0, (2, 1.2))}
 
 
 def roads(scenario: Scenario) -> Iterator[Artist]:
-    """Yield the artists of a scenario's roads: surface, lane marks and stop lines."""
+    """Yield matplotlib's artists of a scenario's roads: surface, lane marks and stop lines."""
     surface = ground_of(scenario)
     yield PathPatch(
         _closed(surface.outlines), facecolor=LIGHT["road"], edgecolor=LIGHT["kerb"], linewidth=0.8
@@ -45,21 +45,27 @@ def roads(scenario: Scenario) -> Iterator[Artist]:
 
 
 def shade(state: WorldState, eye: VehicleState) -> Artist:
-    """Return the artist of the area that walls and other vehicles hide from the vehicle `eye`."""
+    """Return matplotlib's artist of the area that walls and vehicles hide from the vehicle `eye`.
+
+    `state` has where everything is.
+    """
     return PathPatch(
         _closed(shadows(state, eye, FAR_M)), facecolor=LIGHT["shade"], edgecolor="none", alpha=0.22
     )
 
 
 def walls(buildings: Iterable[Building]) -> Iterator[Artist]:
-    """Yield the artists of buildings; overlapping ones have one common outline."""
+    """Yield matplotlib's artists of buildings; overlapping ones have one common outline."""
     outlines = _closed([north_up(building.corners()) for building in buildings])
     yield PathPatch(outlines, facecolor="none", edgecolor=LIGHT["wall"], linewidth=1.6)
     yield PathPatch(outlines, facecolor=LIGHT["building"], edgecolor="none")
 
 
 def body(vehicle: VehicleState, look: str, hidden: bool) -> Artist:
-    """Return a vehicle's artist in the style `LOOKS[look]`: red if crashed, dashed if hidden."""
+    """Return the artist of a vehicle, in the style `LOOKS[look]`, that of its role.
+
+    It is red if the vehicle has crashed, and dashed if it is hidden from the viewer (`hidden`).
+    """
     style = dict(LOOKS[look])
     if hidden:
         edge = ROLES["danger"] if look == "danger" else style["edgecolor"]
@@ -72,7 +78,8 @@ def body(vehicle: VehicleState, look: str, hidden: bool) -> Artist:
 def sight(state: WorldState, viewer: str, seen: Collection[str], **look: Any) -> Artist:
     """Return the artist of lines from a viewer to the vehicles whose ids are in `seen`.
 
-    `look` is passed to `LineCollection`; vehicles no longer there are left out.
+    `state` has where vehicles are, and `viewer` is an id. `look` is passed to matplotlib's
+    `LineCollection`; vehicles no longer there are left out.
     """
     at = {v.id: north_up(np.array([v.x_m, v.y_m])) for v in state.vehicles}
     there = [place for name, place in at.items() if name in seen and viewer in at]

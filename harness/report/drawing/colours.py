@@ -52,9 +52,10 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 
 def conditions(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each condition, an operating point by its name.
+    """Return a colour, a hex code, for each condition by its name.
 
-    The paper's operating points keep their own.
+    A condition is a named set of settings of channel, asking and fusion. Those of the paper keep
+    their own colour.
     """
     chosen: dict[str, str] = {}
     for name in dict.fromkeys(names):
@@ -68,7 +69,7 @@ def conditions(names: Iterable[str]) -> dict[str, str]:
 
 
 def actions(names: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each action; the names are in order from slow to fast."""
+    """Return a colour, a hex code, for each action by name; they are in order from slow to fast."""
     every = list(names)
     last = max(len(every) - 1, 1)
     return {name: _SLOW_TO_FAST[round(4 * n / last)] for n, name in enumerate(every)}

@@ -32,9 +32,11 @@ def north_up(points: Floats) -> Floats:
 
 
 def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict], Floats]:
-    """Return the conflicts in a viewer's scene graph and their places (n, 2), m east and north.
+    """Return the n conflicts in a viewer's scene graph and where they are, (n, 2), m.
 
-    Conflicts with vehicles ahead or behind are left out, since these have no fixed place.
+    A conflict is a place where the viewer's path and another vehicle's meet. Positions are to the
+    east and to the north. Conflicts with vehicles ahead or behind are left out, since these have no
+    fixed place. A scene graph is what one vehicle knows of a scene.
     """
     eye = state.vehicle(graph.viewer)
     cos, sin = np.cos(eye.heading_rad), np.sin(eye.heading_rad)
@@ -50,7 +52,7 @@ def ground_of(scenario: Scenario) -> Ground:
 
 
 def shape_of(scenario: Scenario) -> float:
-    """Return height by width of a scenario's picture: 1, or less for a west-east road."""
+    """Return height by width of a scenario's picture: 1, or less for a road from west to east."""
     outlines = scenario.road().ground_within(VIEW_M).outlines
     return LOW_SHAPE if np.ptp(np.concatenate(outlines)[:, 1]) <= LOW_M else 1.0
 
@@ -78,7 +80,8 @@ def shadows(state: WorldState, eye: VehicleState, far_m: float) -> Floats:
 class View:
     """Hold the rectangle of the world that a picture shows, m to the east and to the north.
 
-    `west_m` and `south_m` are its corner, from the origin of the scenario.
+    `west_m` and `south_m` are its corner, from the origin of the scenario, `width_m` and `height_m`
+    its sides.
     """
 
     west_m: float  # its west edge, east of the origin
@@ -98,7 +101,10 @@ class View:
         return self.width_m / (2 * VIEW_M)
 
     def holds(self, points: Floats, margin_m: float = 0.0) -> bool:
-        """Return whether all points (..., 2), m, are in the view, and `margin_m` from its edge."""
+        """Return whether all points (..., 2), m east and north, are in the view.
+
+        They must be `margin_m` from its edge at least.
+        """
         low, high = self.edges
         return bool(np.all((points >= low + margin_m) & (points <= high - margin_m)))
 
@@ -110,14 +116,16 @@ def spots(
     who: Collection[str | None],
     crossed: tuple[list[Conflict], Floats] | None = None,
 ) -> Floats:
-    """Return the points that a picture must show, (n, 2), m east and north.
+    """Return the n points that a picture must show, (n, 2), m east and north.
 
     The first is the ego; points farther than `NEAR_M` from it are left out.
 
     Args:
         state: the vehicles' positions.
-        zone_m: the point where paths cross, in the frame of `harness.world.road`.
-        graph: scene graph of the viewer, whose conflicts are added; None for none.
+        zone_m: the point where paths cross, in the frame of `harness.world.road` (m east and
+            south).
+        graph: scene graph of the viewer, whose conflicts (places where paths meet) are added; None
+            for none.
         who: ids of other vehicles to show: the dangerous one and helpers; None is ignored.
         crossed: the result of `conflict_points` for the graph, if known.
     """
@@ -133,7 +141,7 @@ def spots(
 
 
 def view_of(held: Floats, shape: float = 1.0) -> View:
-    """Return the view around points (n, 2), m, with a margin.
+    """Return the view around points (n, 2), m east and north, with a margin.
 
     It is centred on them as far as the world's edge allows; its height is `shape` times its width.
     """

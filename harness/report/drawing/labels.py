@@ -84,11 +84,17 @@ class Labels:
         self._taken.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def discourage(self, points: Floats) -> None:
-        """Keep labels off the bounding box of points (n, 2), m, if there is free space nearby."""
+        """Keep labels off the bounding box of points (n, 2), m, if there is free space nearby.
+
+        `block` keeps them off altogether.
+        """
         self._unloved.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def free(self, boxes: Sequence[Floats]) -> Floats:
-        """Return the box (2, 2) that covers the least so far, the first of equals, and block it."""
+        """Return the box that covers the least so far, the first of equals, and keep others off it.
+
+        `boxes` are the candidates, each two opposite corners (2, 2), m, and all of one size.
+        """
         half = (boxes[0][1] - boxes[0][0]) / 2
         taken = covered(np.array([box.mean(axis=0) for box in boxes]), half, self._taken)
         self.block(boxes[int(taken.argmin())])
@@ -103,9 +109,10 @@ class Labels:
         colour: str = INK,
         toward: Floats = NOWHERE,
     ) -> None:
-        """Add a label for an object at `at` (2,) with radius `radius_m`, both m.
+        """Add a label, `text`, for an object at `at` (2,) with radius `radius_m`, both m.
 
-        `toward` (2,) is the preferred direction from the object to the label; zero for none.
+        `place` draws it. `toward` (2,) is the preferred direction from the object to the label;
+        zero for none. `colour` and `bold` are of the text.
         """
         self._waiting.append((at, radius_m, text, bold, colour, toward))
 

@@ -81,7 +81,8 @@ def save(figure: Figure, out: Path | BinaryIO, format: Format, dpi: int = 150) -
 def lay_out(figure: Figure) -> None:
     """Run a figure's layout engine once and switch it off, since it takes half of the drawing time.
 
-    A figure grows if something, such as a long legend entry, sticks out of it.
+    The engine gives axes and labels their places. A figure grows if something, such as a long
+    legend entry, sticks out of it.
     """
     layout = figure.get_layout_engine()
     if layout is None:
