@@ -60,7 +60,8 @@ LEAST_AUDITED = 100  # fewest layouts that are audited; an audit of fewer says l
 class Audit(Protocol):
     """Examine the layouts of a dataset that is being built, for a paragraph of its card.
 
-    An audit looks for tells: what gives a hidden danger away. Extensions add audits.
+    A layout is the start situation of an episode, the card the page that describes the dataset. An
+    audit looks for tells: what gives a hidden danger away. Extensions add audits.
     """
 
     def ready(self) -> None:
@@ -75,9 +76,10 @@ class Audit(Protocol):
         progress: Callable[[int], None],
         workers: Workers,
     ) -> str:
-        """Return the paragraph about the layout seeds `seed` to `seed + layouts - 1`.
+        """Return the paragraph about the layouts drawn by the seeds `seed` to `seed + layouts - 1`.
 
-        `progress` is called with the number of layouts just examined.
+        A layout is a start situation of the scenario. `progress` is called with the number of
+        layouts just examined, and `workers` are processes or a cluster.
         """
         ...
 
@@ -98,10 +100,20 @@ def build(
 ) -> dict[str, Any]:
     """Build a dataset in `out`, or freeze a shard of one, which `harness run merge` combines.
 
-    Episode e has layout seed `seed + e`, and the folder's name is the dataset's. `audits` says
-    whether the layouts are examined for what gives a danger away (`Audit`), if there are at least
-    `LEAST_AUDITED`; `more` is called with their number before that, `progress` with the number of
-    layouts just finished or audited.
+    To freeze is to simulate every course that actions can take from a layout, a start situation.
+    Episode e has layout seed `seed + e`, and the folder's name is the dataset's.
+
+    Args:
+        scenario: the scenario of the layouts.
+        out: the folder of the dataset or of the shard.
+        episodes: number of layouts, each with one episode.
+        seed: layout seed of episode 0.
+        workers: processes or a cluster.
+        progress: called with the number of layouts just finished or audited.
+        audits: whether the layouts are examined for what gives a danger away (`Audit`), if there
+            are at least `LEAST_AUDITED`.
+        more: called with the number of layouts to be audited, before that.
+        shard: the part of the dataset to make; None for all of it.
 
     Returns the manifest as a dict; for a shard, the settings that it begins with. Raises UserError
     if the folder holds a finished dataset, one begun with other settings, or something else; the
@@ -174,9 +186,20 @@ def merge(
 ) -> dict[str, Any]:
     """Combine the shards of a dataset, a folder each, into the one that `build` makes without.
 
-    The bytes are the same. `workers`, `progress`, `audits` and `more` are those of `build`, and the
-    manifest is returned as a dict. Raises UserError as `build`, or if the folders are not all the
-    shards of one build, a shard is unfinished, or two hold different bytes for the same layout.
+    The bytes are the same. Returns the manifest as a dict. A layout is one start situation of a
+    scenario.
+
+    Args:
+        folders: the shards' folders, all of one build.
+        out: the folder of the dataset.
+        workers: processes or a cluster.
+        progress: called with the number of layouts just finished or audited.
+        audits: whether the layouts are examined for what gives a danger away.
+        more: called with the number of layouts to be audited, before that.
+
+    Raises UserError if the folders are not all the shards of one build, a shard is unfinished, or
+    two hold different bytes for the same layout; if `out` holds something else; or if the audit
+    needs a package that is missing.
     """
     starts = shards.read(folders, work.WorkStart)
     config = starts[0].settings
@@ -339,12 +362,15 @@ def _entry(name: str) -> ZipInfo:
 
 
 def part_of(episode: int) -> str:
-    """Return the file name of a layout in a working folder: `00042.zip` for episode 42."""
+    """Return the file name of a layout in a working folder: `00042.zip` for episode 42.
+
+    A layout is the start situation of an episode, whose number it has.
+    """
     return f"{episode:05d}.zip"
 
 
 def named(episode: int) -> str:
-    """Return how messages name a layout: `layout 42` for episode 42."""
+    """Return how messages name a layout, the start of an episode: `layout 42` for episode 42."""
     return f"layout {episode}"
 
 

@@ -39,7 +39,13 @@ KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool
 
 @dataclass(frozen=True)
 class Table:
-    """Describe a Parquet table of a published dataset: its source, size and reference results."""
+    """Describe a Parquet table of a published dataset: its source, size and reference results.
+
+    `sha256` and `bytes` are of its file, `dataset_sha256` is the digest of the manifest of the
+    dataset that it was made of. `rows` is the number of its decision points, `lag_s` the time from
+    a decision to its action. `references` has by name the success of policies that need no model,
+    and `prompt` is the version of the prompt whose chats it has.
+    """
 
     manifest: Manifest  # manifest of the dataset that it was made of
     dataset_sha256: str  # digest of that manifest
@@ -71,14 +77,15 @@ class Table:
 
 
 def path_of(name: str) -> str:
-    """Return the path of a dataset's Parquet file within the published folder."""
+    """Return the path of the Parquet file of the dataset `name` within the published folder."""
     return f"data/{name}.parquet"
 
 
 def readme(name: str, tables: Sequence[Table]) -> str:
-    """Return the card (YAML and Markdown) of published tables.
+    """Return the card, a page in YAML and Markdown, of the published tables of datasets.
 
-    Texts from a manifest are quoted, so that none of them adds a key or a heading.
+    `name` is what they have together. Texts from a manifest are quoted, so that none of them adds a
+    key or a heading.
     """
     released = all(t.released for t in tables)
     head = _front_matter(name, tables)
@@ -131,7 +138,7 @@ def _cells(t: Table) -> Sequence[object]:
 
 
 def limits(tables: Sequence[Table]) -> Iterator[str]:
-    """Yield sentences, for a card, that say what the tables must not be used for."""
+    """Yield sentences, for a dataset's card (page), on what the tables must not be used for."""
     splits = {t.split for t in tables}
     if SPLITS["report"] in splits:
         yield (
@@ -170,9 +177,10 @@ def limits(tables: Sequence[Table]) -> Iterator[str]:
 
 
 def croissant(name: str, tables: Sequence[Table]) -> str:
-    """Return the Croissant 1.0 description (JSON-LD) of published tables.
+    """Return the Croissant 1.0 description (JSON-LD) of published tables, for programs.
 
-    It has each Parquet file with its digest, and each column with its meaning.
+    `name` is what they have together. It has each Parquet file with its digest, and each column
+    with its meaning.
     """
     document = {
         "@context": _CONTEXT,

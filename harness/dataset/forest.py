@@ -36,8 +36,11 @@ class Forest:
 
     A decision tree has every decision point that decisions can lead to from a layout, the start
     situation of an episode. There are E trees with N decision points in all and A actions. Decision
-    points are numbered from 0 tree by tree, and within a tree by step. An edge is what one or
-    several equivalent actions do at a decision point: it leads to another one or ends the episode.
+    points are numbered from 0 tree by tree, and within a tree by step, the number of the decision
+    in its episode. `root` (E,), `tree`, `step` (N,) and `child` (N, A) say how they hang together:
+    `child` is the decision point after each action, -1 where the episode ends. `edge` (N, A) is an
+    index in `edges`: an edge is what one or several equivalent actions do at a decision point,
+    which leads to another one or ends the episode. Times are in s.
     """
 
     actions: tuple[str, ...]  # names of the A meta-actions
@@ -63,7 +66,11 @@ class Forest:
     def of(
         cls, trees: Sequence[Tree], actions: tuple[str, ...], parameters: Parameters
     ) -> "Forest":
-        """Return the arrays of trees of one scenario, which has these actions and parameters."""
+        """Return the arrays of the decision trees `trees`, all of one scenario.
+
+        `actions` are the names of its actions, in order, and `parameters` its settings, such as the
+        time that an episode may last.
+        """
         action_index = {action: n for n, action in enumerate(actions)}
         points: list[Branching] = []
         roots, tree_of_point, step_of_point = list[int](), list[int](), list[int]()
@@ -108,14 +115,15 @@ class Forest:
 
     @cached_property
     def place(self) -> Mapping[str, int]:
-        """Return the number of each decision point by its scene id."""
+        """Return the number of each decision point, from 0, by the id of its scene."""
         return {name: n for n, name in enumerate(self.ids)}
 
     @cached_property
     def cleared_s(self) -> Floats:
-        """Return the time (s) at which each edge reaches the goal, (edges,).
+        """Return the time (s) at which each of the edges reaches the goal, (edges,).
 
-        inf if it ends otherwise or leads to another decision point.
+        An edge is what an action does, up to the next decision or the end. inf if it ends otherwise
+        or leads to another decision point.
         """
         times_s = np.full(len(self.edges), np.inf)
         for n, edge in enumerate(self.edges):
@@ -125,15 +133,20 @@ class Forest:
 
     @cached_property
     def harms(self) -> Bools:
-        """Return whether each edge ends in a collision or off the road, (edges,)."""
+        """Return whether each of the edges ends in a collision or off the road, (edges,).
+
+        An edge is what an action does, up to the next decision or the end.
+        """
         ends = [edge.end for edge in self.edges]
         return np.array([end is not None and RATINGS[end.result] == "unsafe" for end in ends])
 
     @cached_property
     def conflicts(self) -> Mapping[str, Floats]:
-        """Return the least time to collision and post-encroachment time (s) of edges, (edges,).
+        """Return how near others come on each of the edges, by name of the measure, in s, (edges,).
 
-        The names are those of `conflict_measures.columns`.
+        The measures are the least time to collision and the least post-encroachment time: from when
+        one vehicle leaves a place to when another arrives. An edge is what an action does, up to
+        the next decision. The names are those of `conflict_measures.columns`.
         """
 
         def number(measure_s: float | UnsetType | None) -> float:
@@ -147,7 +160,11 @@ class Forest:
 
     @cached_property
     def earliest_s(self) -> Floats:
-        """Return the earliest time (s) at the goal after each action, (N, A); inf if never."""
+        """Return the earliest time (s) at which the goal can be reached after each action, (N, A).
+
+        There are N decision points and A actions. It counts from the start of the episode; inf if
+        it cannot be reached.
+        """
         earliest_s = self.cleared_s[self.edge]
         for rows in self._levels_backwards():
             has_child = self.child[rows] >= 0
@@ -159,7 +176,7 @@ class Forest:
     def avoids_harm(self) -> Bools:
         """Return whether harm can still be avoided after each action, (N, A).
 
-        Harm is a collision, or leaving the road.
+        There are N decision points and A actions. Harm is a collision, or leaving the road.
         """
         avoids = ~self.harms[self.edge]
         for rows in self._levels_backwards():
@@ -171,7 +188,7 @@ class Forest:
     def miss(self) -> Bools:
         """Return whether each action makes harm inevitable, (N, A), that could be avoided before.
 
-        Harm is a collision, or leaving the road.
+        There are N decision points and A actions. Harm is a collision, or leaving the road.
         """
         return np.asarray(self.avoids_harm.any(axis=-1, keepdims=True) & ~self.avoids_harm)
 
@@ -179,7 +196,8 @@ class Forest:
     def false_alarm(self) -> Bools:
         """Return whether each action makes success impossible by time alone, (N, A).
 
-        Success was possible before it, and a collision can still be avoided after it.
+        There are N decision points and A actions. Success was possible before it, and harm (a
+        collision, or leaving the road) can still be avoided after it.
         """
         return np.asarray(self.value[:, None] & ~self.safe & self.avoids_harm)
 
@@ -187,7 +205,8 @@ class Forest:
     def then_full_view(self) -> Ints:
         """Return the last edge if the full-view driver goes on after each action, (N, A).
 
-        It is an index in `edges`. That driver is the reference that sees everything.
+        There are N decision points and A actions. It is an index in `edges`, of what is done from
+        the last decision to the end. That driver is the reference rule that sees everything.
         """
         last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
         for rows in self._levels_backwards():
@@ -202,28 +221,33 @@ class Forest:
 
     @cached_property
     def reference_s(self) -> Floats:
-        """Return when the full-view driver reaches the goal in each tree, s, (E,); inf if never.
+        """Return when the full-view driver reaches the goal in each of E trees, s, (E,).
 
-        That is the reference driver that sees everything.
+        That is the reference rule that sees everything; a tree is of one episode. inf if never.
         """
         return self.cleared_s[self.last_edge(self.drivers[PRIVILEGED])]
 
     @cached_property
     def limit_s(self) -> Floats:
-        """Return the latest time (s) of an arrival that is a success, (E,).
+        """Return the latest time (s) of an arrival that is a success, in each of E episodes, (E,).
 
-        It is the full-view driver's time plus the allowance, but at most the time limit.
+        It is the time of the full-view driver, the reference rule that sees everything, plus the
+        allowance, but at most the time limit.
         """
         return np.minimum(self.reference_s + self.allowance_s, self.time_limit_s) + ROUNDING_S
 
     @cached_property
     def safe(self) -> Bools:
-        """Return whether the episode can still succeed after each action, (N, A)."""
+        """Return whether the episode can still succeed after each action, a mask (N, A).
+
+        There are N decision points and A actions. Success is reaching the goal no later than
+        `limit_s`.
+        """
         return self._in_time(self.earliest_s, self.limit_s[self.tree][:, None])
 
     @cached_property
     def value(self) -> Bools:
-        """Return whether the episode can still succeed at each decision point, (N,).
+        """Return whether the episode can still succeed at each of N decision points, (N,).
 
         So it is the success of the best policy from there on.
         """
@@ -231,18 +255,20 @@ class Forest:
 
     @cached_property
     def delay_s(self) -> Floats:
-        """Return by how much (s) each action puts off the earliest arrival, (N, A).
+        """Return by how much (s) each action puts off the earliest arrival at the goal, (N, A).
 
-        NaN if the action is not safe.
+        There are N decision points and A actions. NaN if the action is not safe: no success is
+        possible after it.
         """
         soonest_s = self.earliest_s.min(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             return np.where(self.safe, self.earliest_s - soonest_s, np.nan)
 
     def last_edge(self, chosen: Ints) -> Ints:
-        """Return the edge at which each episode ends, (E,), if a fixed policy decides.
+        """Return the index in `edges` at which each of E episodes ends, (E,), by a fixed policy.
 
-        `chosen` has the index of the action taken at each decision point, (N,).
+        `chosen` has the index of the action taken at each of N decision points, (N,). An edge is
+        what an action does, up to the next decision or the end.
         """
         at, last = self.root.copy(), np.full(len(self.root), -1)
         while (undecided := at >= 0).any():
@@ -254,7 +280,7 @@ class Forest:
     def visited(self, chosen: Ints) -> Ints:
         """Return the indices of the decision points that a fixed policy visits, ascending.
 
-        `chosen` has the index of the action taken at each decision point, (N,).
+        `chosen` has the index of the action taken at each of N decision points, (N,).
         """
         visited, at = [], self.root
         while len(at):
@@ -266,7 +292,8 @@ class Forest:
     def succeeds(self, edge: Ints, tree: Ints) -> Bools:
         """Return whether episodes that end at some edges succeed, (...).
 
-        `edge`, (...), are indices in `edges`, and `tree`, (...), those of the episodes' trees.
+        `edge`, (...), are indices in `edges`, and `tree`, (...), those of the episodes' trees. An
+        edge is what an action does, up to the next decision or the end.
         """
         return self._in_time(self.cleared_s[edge], self.limit_s[tree])
 
@@ -275,30 +302,37 @@ class Forest:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
-        """Return how the episode ends at an edge, an index in `edges` of one that ends it."""
+        """Return how the episode ends at an edge, an index in `edges` of one that ends it.
+
+        An edge is what an action does, up to the next decision or the end.
+        """
         end = self.edges[edge].end
         assert end is not None
         return end
 
     def driver_success(self, driver: str) -> Bools:
-        """Return whether a reference driver succeeds in each episode, (E,)."""
+        """Return whether a reference driver succeeds in each of E episodes, a mask (E,).
+
+        `driver` is its name; such a driver is a rule that decides without a model.
+        """
         return self._success(self.drivers[driver])
 
     def constant_success(self, action: str) -> Bools:
-        """Return whether an ego that always takes one action succeeds in each episode, (E,)."""
+        """Return whether an ego that always takes one action succeeds in E episodes, (E,)."""
         return self._success(np.full(len(self.tree), self.actions.index(action)))
 
     def sequence_success(self, actions: Sequence[str]) -> Bools:
-        """Return whether an ego that takes these actions in turn succeeds in each episode, (E,).
+        """Return whether an ego that takes these actions in turn succeeds in E episodes, (E,).
 
         After the last one it takes this again.
         """
         return self._success(self.sequence(actions))
 
     def sequence(self, actions: Sequence[str]) -> Ints:
-        """Return the action index at each decision point if actions are taken in turn, (N,).
+        """Return the action index at each of N decision points if actions are taken in turn, (N,).
 
-        The nth action is for step n; after the last one it is taken again.
+        `actions` are names; the nth is for the nth decision of the episode, and after the last one
+        it is taken again.
         """
         indices = np.array([self.actions.index(action) for action in actions])
         return np.asarray(indices[np.minimum(self.step, len(indices) - 1)])
@@ -307,21 +341,24 @@ class Forest:
         return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))
 
     def uniform_success(self) -> Floats:
-        """Return the probability of success of each episode under uniform random actions, (E,)."""
+        """Return the probability of success in each of E episodes, (E,), if actions are drawn.
+
+        They are drawn uniformly.
+        """
         return np.asarray(self.worth[self.root].mean(axis=-1))
 
     @cached_property
     def worth(self) -> Floats:
         """Return the probability of success after each action, (N, A), if later ones are drawn.
 
-        They are drawn uniformly.
+        There are N decision points and A actions, and all are drawn with the same probability.
         """
         return self.chance(np.ones(self.child.shape))
 
     def chance(self, policy: Floats) -> Floats:
         """Return the exact probability of success after each action under a policy, (N, A).
 
-        `policy` has the weights of the actions at each decision point, (N, A), by which later
+        `policy` has the weights of A actions at each of N decision points, (N, A), by which later
         actions are drawn; they need not sum to 1.
         """
         chance = self.succeeds(self.edge, self.tree[:, None]).astype(float)

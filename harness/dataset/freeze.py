@@ -29,7 +29,9 @@ class Frozen(NamedTuple):
     """Hold a layout's decision tree and the record of each decision point.
 
     A layout is the start situation of an episode, and its tree has every decision point that
-    decisions can lead to. Both lists have a list for each step, one decision after another.
+    decisions can lead to. Both lists have a list for each step, one decision after another:
+    `branchings` what each action does there, and `scenes` the state and what each vehicle knows of
+    it.
     """
 
     branchings: list[list[Branching]]  # what each action does at each decision point of a step
@@ -151,8 +153,9 @@ def record_of(
 ) -> Record:
     """Return a decision point's state with the scene graphs of its viewers, as a dataset has it.
 
-    The ego is the first viewer. Distances to the conflict zone and to the ego are as the ego knows
-    them from beacons.
+    A scene graph is what one vehicle, a viewer, knows of the state; the ego is the first of
+    `viewers`. `world` is the simulation that is in this state, and `episode` the number of the
+    episode. Distances to the conflict zone and to the ego are as the ego knows them from beacons.
     """
     [record] = records_of(world.scenario, [(world, state, episode, viewers)])
     return record
@@ -161,7 +164,11 @@ def record_of(
 def records_of(
     scenario: Scenario, points: Sequence[tuple[World, WorldState, int, Sequence[VehicleState]]]
 ) -> list[Record]:
-    """Return `record_of` for each decision point: its world, state, episode number and viewers."""
+    """Return the record of each decision point, as a dataset has it: state and scene graphs.
+
+    Each of `points` is the simulation, its state, the number of the episode, and the vehicles whose
+    scene graphs (what they know) are made, the ego first.
+    """
     looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
     graphs, zone_m = iter(scene_graphs(scenario, looks)), scenario.road().zone_m
     records = []

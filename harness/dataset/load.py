@@ -49,8 +49,10 @@ TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over al
 class Scene:
     """Hold one decision point of a dataset or of a drive: its state and its scene graphs.
 
-    A scene graph is what one vehicle knows of the state. Who decides is an agent; where that is not
-    the ego of the scenario, the scene is as this agent sees it, with itself as the ego.
+    A scene graph is what one vehicle knows of the state; `record` has both. Who decides is an
+    agent, `agent` its index, 0 the ego; where that is not the ego of the scenario, the scene is as
+    this agent sees it, with itself as the ego, and `seat` is the scenario so. `several` says
+    whether vehicles beside the ego can decide. `notes` keeps results computed from the scene.
     """
 
     record: Record  # state and scene graphs, as a dataset has them
@@ -71,7 +73,10 @@ class Scene:
 
     @cached_property
     def graphs(self) -> Mapping[str, SceneGraph]:
-        """Return what the ego and each helper know, their scene graphs, by id, the ego first."""
+        """Return the scene graph of the ego and of each helper, by the vehicle's id, the ego first.
+
+        A scene graph is what one vehicle knows of the state.
+        """
         graphs = self.record.graphs
         return {v.id: graphs[v.id] for v in self.state.vehicles if v.id in graphs}
 
@@ -89,10 +94,10 @@ class Scene:
         return self.viewers[0] if name is None else name
 
     def place(self, viewer: int) -> int:
-        """Return the index among all vehicles that can be asked of one of this scene's `viewers`.
+        """Return the index of a vehicle among all that can be asked, the scenario's own ego first.
 
-        `viewer` is the index in `viewers`, which begin with the agent that decides here; the
-        vehicles that can be asked begin with the scenario's own ego.
+        `viewer` is its index in this scene's `viewers`, which begin with the agent that decides
+        here.
         """
         if not viewer:
             return self.agent
@@ -104,9 +109,10 @@ class Scene:
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
-    """Return the indices in `scenes` by the scenario with the agent that decides as its ego.
+    """Group scenes by who decides in them: return their indices in `scenes` by scenario.
 
-    That is `scenario` itself where its own ego decides.
+    A key is the scenario as the agent that decides plays it, with itself as the ego: `scenario`
+    itself for that one's own ego. An agent is a vehicle that decides.
     """
     return places_by(scene.seat or scenario for scene in scenes)
 
@@ -131,7 +137,12 @@ class Trees(Sequence[Tree]):
 
 @dataclass(frozen=True)
 class Dataset:
-    """Hold a verified dataset; its trees and scenes are read and verified when they are used."""
+    """Hold a verified dataset; its trees and scenes are read and verified when they are used.
+
+    `trees` are the decision trees of its episodes: all that decisions can lead to from each start.
+    `sha256` is the digest of its manifest, which pins every file, and `trusted` says whether it is
+    a released dataset, whose digests vouch for its scenes.
+    """
 
     path: Path  # the dataset's folder
     manifest: Manifest  # its manifest
@@ -178,7 +189,10 @@ class Dataset:
 
     @property
     def dangerous(self) -> Bools:
-        """Return whether each of the E episodes has a danger, (E,)."""
+        """Return whether each of the E episodes has a danger, a mask (E,).
+
+        A danger is a vehicle that would meet an ego which keeps its speed.
+        """
         return np.array([tree.danger.sector is not None for tree in self.trees])
 
     @property
@@ -194,7 +208,7 @@ class Dataset:
         return int(before_any[first_edges].all(axis=1).sum())
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
-        """Return this dataset restricted to the episodes with these numbers."""
+        """Return this dataset restricted to the episodes with these numbers, in its own order."""
         if len(numbers) == len(self.episodes) and set(numbers) == set(self.episodes):
             return self
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
@@ -208,9 +222,9 @@ class Dataset:
     def reference_success(self) -> dict[str, Floats]:
         """Return the success of each reference policy in each of E episodes, (E,), by name.
 
-        It is 0 or 1, and for `uniform`, which draws actions, a probability. References are the
-        drivers, `uniform`, and where their actions are known `constant` and `open-loop`, which
-        always take the same ones.
+        It is 0 or 1, and for `uniform`, which draws actions, a probability. References need no
+        model: they are the drivers, which are rules, `uniform`, and where their actions are known
+        `constant` and `open-loop`, which always take the same ones.
         """
         parts: dict[str, list[Floats]] = {}
         action, actions = constant(self.scenario), open_loop(self.scenario)
@@ -227,9 +241,10 @@ class Dataset:
         return {name: np.concatenate(of_trees) for name, of_trees in parts.items()}
 
     def scenes(self, ids: Sequence[str]) -> list[Scene]:
-        """Return the scenes with these ids, read from the folder where needed.
+        """Return the scenes with these ids, in their order, read from the folder where needed.
 
-        Raises UserError for a damaged one and KeyError for an unknown id.
+        A scene is one decision point. Raises UserError for a damaged one and KeyError for an
+        unknown id.
         """
         missing: dict[tuple[int, int], list[int]] = {}  # indices within each level of each tree
         for name in ids:
@@ -287,7 +302,7 @@ class Dataset:
     def scene(self, scene_id: str) -> Scene:
         """Return the scene with this id, or with the only id that begins like this.
 
-        Raises UserError if there is none, or several.
+        A scene is one decision point. Raises UserError if there is none, or several.
         """
         ids = self.forest.ids
         matches = [name for name in ids if name.startswith(scene_id)] if scene_id else []
@@ -298,7 +313,10 @@ class Dataset:
         return self.scenes(matches)[0]
 
     def courses(self) -> tuple[str, ...]:
-        """Return the ids of all decision points that some reference driver visits."""
+        """Return the ids of all decision points that some reference driver visits, in order.
+
+        Such a driver is a rule that decides without a model.
+        """
         forest = self.forest
         visited = [forest.visited(chosen) for chosen in forest.drivers.values()]
         return tuple(forest.ids[n] for n in np.unique(np.concatenate(visited)).tolist())
@@ -350,11 +368,11 @@ def released() -> dict[str, str]:
 
 @uncollected()
 def load(path: Path, limit: int | None = None) -> Dataset:
-    """Read a dataset; with `limit`, only its first episodes.
+    """Read the dataset in the folder `path`; with `limit`, only its first episodes.
 
-    Every file and every tree must have the digest in the manifest, and a tree pins its scenes. For
-    a released dataset, whose manifest is pinned, this is enough; the content of any other dataset
-    is checked as well. Raises UserError if a file is missing, changed or broken.
+    Every file and every decision tree must have the digest in the manifest, and a tree pins its
+    scenes. For a released dataset, whose manifest is pinned, this is enough; the content of any
+    other dataset is checked as well. Raises UserError if a file is missing, changed or broken.
     """
     manifest, digest = read_manifest(path)
     for problem in file_problems(path, manifest):

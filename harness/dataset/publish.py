@@ -38,14 +38,16 @@ def publish(
 ) -> Sequence[Table]:
     """Write datasets as Parquet tables, with a card and a Croissant file, to a new folder.
 
-    Equal datasets and prompts give equal bytes, with one version of the harness and of Arrow.
+    A card is a page that describes them for people, Croissant for programs. Returns a description
+    of each table. Equal datasets and prompts give equal bytes, with one version of the harness and
+    of Arrow.
 
     Args:
         folders: of the datasets; one is in memory at a time.
         out: the folder, which exists only once it is complete.
         ask: returns, for a scenario, the name of the prompt version and a function from a scene
-            graph to the chat messages that ask its viewer.
-        progress: counts layouts.
+            graph (what one vehicle knows) to the chat messages that ask that vehicle.
+        progress: counts layouts, the start situations of episodes.
         suite: the name of all datasets together; that of the first one if None.
 
     Raises UserError if the folder exists, a name is not allowed, two datasets have one name, or one

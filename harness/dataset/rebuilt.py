@@ -65,8 +65,9 @@ def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
 def differences(dataset: Dataset) -> Iterator[str]:
     """Yield a line if layouts of a dataset are not those of the seeds that it states.
 
-    The first scene of up to `BEGUN` layouts is rebuilt, then up to `REBUILT` whole trees. Nothing
-    is yielded if the simulator is not installed.
+    A layout is the start situation of an episode, drawn by its seed. The first scene of up to
+    `BEGUN` layouts is rebuilt, then up to `REBUILT` whole decision trees (all that decisions lead
+    to). Nothing is yielded if the simulator is not installed.
     """
     if find_spec("highway_env") is None:
         return

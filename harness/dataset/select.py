@@ -22,7 +22,11 @@ NONE = "none"  # the `danger` of layouts without one
 
 @dataclass(frozen=True)
 class Choice:
-    """State which episodes a run uses, where something chooses them."""
+    """State which episodes a run uses, where something chooses them.
+
+    `numbers` are those of the episodes that are used, `pool` of those that they were chosen from,
+    both ascending, and `given` has the settings that chose them, by name, as a run states them.
+    """
 
     numbers: tuple[int, ...]  # numbers of the episodes that are used, ascending
     pool: tuple[int, ...]  # numbers of those that they were chosen from, ascending
@@ -32,7 +36,7 @@ class Choice:
 class Selection(ABC):
     """Choose which episodes a run uses, such as a random sample, by an extension's settings.
 
-    It is a base class; objects do not change.
+    `chosen_by` names these settings. It is a base class; objects do not change.
     """
 
     chosen_by: ClassVar[tuple[str, ...]]  # names of the settings of its extension that choose it
@@ -48,8 +52,8 @@ class Selection(ABC):
     def choice(self, numbers: Sequence[int], dataset: Dataset | None) -> Choice:
         """Return which of the episodes with these numbers are used, ascending as they are.
 
-        They are those of `dataset`, or layouts (start situations) to drive where that is None.
-        Raises UserError if there are none, or too few.
+        They are those of `dataset`, or where that is None layouts (start situations) to drive in
+        the simulator. Raises UserError if there are none, or too few.
         """
 
 
@@ -59,7 +63,8 @@ SELECTIONS = ShippedChoices[Selection]("swarmdrive.selections", Selection, {})
 def recorded(record: Mapping[str, Any]) -> Selection | None:
     """Return what chose a run's episodes, by the `selection` that it states; None for all.
 
-    Raises UserError if nothing chooses by what it states, or the extension that does is gone.
+    `record` has that, values by name. Raises UserError if nothing chooses by what it states, or the
+    extension that does is gone.
     """
     if owner := lacking(record):
         raise UserError(f"what selected the episodes of a run is {part_of(owner)}")
@@ -73,7 +78,8 @@ def recorded(record: Mapping[str, Any]) -> Selection | None:
 def lacking(record: Mapping[str, Any]) -> str | None:
     """Return the name of the extension that chose a run's episodes if it is not installed.
 
-    `record` is the `selection` that the run states; None if there is none, or it is installed.
+    `record` is the `selection` that the run states, values by name; None if there is none, or the
+    extension is installed.
     """
     owners = [owner_of_plugin("settings", name) for name in record]
     return next((owner for owner in owners if owner and owner not in extensions()), None)
@@ -82,8 +88,8 @@ def lacking(record: Mapping[str, Any]) -> str | None:
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:
     """Draw `sample` of the episode numbers, without replacement, and return them sorted.
 
-    All are below `end`. A larger sample of the same seed contains a smaller one. Raises UserError
-    if there are too few.
+    `seed` keys the draw, and all numbers are below `end`. A larger sample of the same seed contains
+    a smaller one. Raises UserError if there are too few.
     """
     if not 1 <= sample <= len(numbers):
         raise UserError(f"--sample {sample}: give 1 to {len(numbers)} episodes")

@@ -17,7 +17,10 @@ PREFIX = "suite:"  # marks a suite's name where a dataset's name is expected
 
 
 class Suite(Struct, frozen=True, forbid_unknown_fields=True):
-    """Describe a suite: datasets of several scenarios that are evaluated together."""
+    """Describe a suite: datasets of several scenarios that are evaluated together.
+
+    `datasets` has their names, in the order of tables, and `description` is its purpose.
+    """
 
     name: str  # the suite's name
     description: str  # its purpose
@@ -30,7 +33,8 @@ class Suite(Struct, frozen=True, forbid_unknown_fields=True):
 def named(text: str) -> Suite | None:
     """Return the suite that a text `suite:NAME` names, one that ships or the project's; else None.
 
-    Raises UserError if there is no such suite, or two, or its table is wrong.
+    A suite is datasets of several scenarios. Raises UserError if there is no such suite, or two, or
+    its table is wrong.
     """
     if not text.startswith(PREFIX):
         return None
@@ -63,9 +67,9 @@ def named(text: str) -> Suite | None:
 
 
 def datasets(text: str) -> Sequence[str]:
-    """Return the dataset names that `--dataset` gives: those of a suite, or the one.
+    """Return the dataset names that `--dataset` gives: those of a suite `suite:NAME`, or the one.
 
-    Raises what `named` raises.
+    Raises UserError if there is no such suite, or two, or its table is wrong.
     """
     suite = named(text)
     return suite.datasets if suite else (text,)

@@ -41,7 +41,7 @@ LARGEST_ENTRY = 1 << 28  # bytes
 
 
 def read_manifest(path: Path) -> tuple[Manifest, str]:
-    """Read the manifest of a dataset's folder; return it and its digest.
+    """Read `manifest.json` of a dataset's folder; return it and its SHA-256 digest, in hex.
 
     Raises UserError if it is missing or wrong.
     """
@@ -108,14 +108,15 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
 
 
 def scenario_of(manifest: Manifest) -> Scenario:
-    """Return the scenario of a manifest, with the manifest's parameters."""
+    """Return the scenario that a dataset's manifest names, with the parameters that it states."""
     return scenarios.of_manifest(manifest.scenario, manifest.parameters)
 
 
 def check(path: Path) -> list[str]:
     """Return all problems of the dataset in a folder, one line each; empty if it is sound.
 
-    Raises UserError if the manifest is missing or wrong.
+    Every file, decision tree and scene is read. Raises UserError if the manifest is missing or
+    wrong.
     """
     manifest, _ = read_manifest(path)
     problems, nodes = list(file_problems(path, manifest)), 0
@@ -160,9 +161,9 @@ class Damaged(Exception):
 
 @contextmanager
 def opened(path: Path) -> Iterator[ZipFile]:
-    """Open the archive `layouts.zip` of a dataset's folder; its entries are not yet verified.
+    """Open the archive `layouts.zip` of a dataset's folder, for as long as the context lasts.
 
-    Raises UserError if it cannot be read.
+    Its entries are not yet verified. Raises UserError if it cannot be read.
     """
     file = path / LAYOUTS
     try:
@@ -240,19 +241,23 @@ def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
 
 
 def tree_name(episode: int) -> str:
-    """Return the name of an episode's tree in `layouts.zip`."""
+    """Return the name of an episode's decision tree in `layouts.zip`, by the episode's number."""
     return f"{episode:05d}/tree.json"
 
 
 def level_name(episode: int, step: int) -> str:
-    """Return the name, in `layouts.zip`, of the file with the scenes of one step of an episode."""
+    """Return the name, in `layouts.zip`, of the file with the scenes of one step of an episode.
+
+    `episode` is its number, and `step` the number of the decision in it, from 0.
+    """
     return f"{episode:05d}/{step}.jsonl"
 
 
 def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str]:
-    """Return how a tree contradicts itself or the manifest, one phrase each.
+    """Return how a decision tree contradicts itself or the manifest, one phrase each.
 
-    `number` is the episode's. Types are checked elsewhere.
+    A tree has all that decisions lead to from the start of an episode, whose number is `number`.
+    Types are checked elsewhere.
     """
     actions = Counter(manifest.actions)
     points = [point for level in tree.levels for point in level]
@@ -317,7 +322,10 @@ def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, 
 
 
 def unusable(path: Path, problem: str) -> UserError:
-    """Build the UserError for a dataset that has a problem."""
+    """Return the error for a dataset, by its folder, that has a problem (a phrase).
+
+    It says what to do about it.
+    """
     return UserError(
         f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or "
         "rebuild it"
@@ -325,10 +333,10 @@ def unusable(path: Path, problem: str) -> UserError:
 
 
 def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -> str:
-    """Return in one line where a JSON text does not fit a type.
+    """Return in one line where a JSON text does not fit the type `kind`, for an error.
 
-    `error` is msgspec's, which is used if no better words are found; `text` was decoded as a
-    `kind`, and `what` names it.
+    `text` was decoded as that, and `what` names it; `error` is msgspec's, which is used if no
+    better words are found.
     """
     try:
         if isinstance(table := _JSON.decode(text), dict):
@@ -343,7 +351,7 @@ def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -
 def contradictions(scenario: Scenario, record: Record, manifest: Manifest, name: str) -> list[str]:
     """Return how a scene's record contradicts itself, its scenario or the manifest, in phrases.
 
-    `name` is the scene id that it should have.
+    A scene is one decision point of the dataset, and `name` the scene id that it should have.
     """
     state, graphs = record.state, record.graphs
     ids = [v.id for v in state.vehicles]
