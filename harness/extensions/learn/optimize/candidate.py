@@ -27,7 +27,9 @@ class Candidate:
     """Hold one wording of a prompt that a search tries.
 
     A prompt version is a folder of templates, one for each role: the ego that decides, a helper
-    that is asked, and so on. The search begins with one, the base.
+    that is asked, and so on. The search begins with one, the base. `prompt` is the wording as a
+    version, `what` says in a line how it differs from the base, and `rewritten` has the system
+    texts that a model wrote in place of the templates' own, by role.
     """
 
     prompt: Prompt  # the wording as a prompt version, under the name of the one searched
@@ -127,9 +129,9 @@ def _toml(value: Any) -> str:
 
 
 def write(candidate: Candidate, folder: Path, more: Mapping[str, str]) -> None:
-    """Write a candidate's prompt files to a folder, and `more` files, by name, beside them.
+    """Write a candidate's prompt files to a folder, and more files beside them.
 
-    The further files are not part of the prompt's digest.
+    `more` has the text of each further file by its name; these are not part of the prompt's digest.
     """
     folder.mkdir(parents=True, exist_ok=True)
     ordered: Sequence[str] = [

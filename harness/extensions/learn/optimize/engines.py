@@ -70,9 +70,10 @@ def _better(tuning: Tuning, new: Candidate, old: Candidate) -> bool:
 class Reflecting:
     """Search with GEPA: a model reads what went wrong, and rewrites the system messages.
 
-    Source: Agrawal and others 2025, arXiv:2507.19457, whose package runs the loop. All that it
-    draws is seeded, and what the model wrote is kept, so that a stopped search resumes by
-    repeating.
+    Call it with a `Tuning`, which plays each new wording, keeps all results, and ends the search
+    when the budget of questions is spent; `replies` counts the rewriting model's. Source: Agrawal
+    and others 2025, arXiv:2507.19457, whose package runs the loop. All that it draws is seeded, and
+    what the model wrote is kept, so that a stopped search resumes by repeating.
     """
 
     def __init__(
@@ -125,9 +126,9 @@ class Reflecting:
 
 
 def asked_of(backend: Backend) -> Callable[[str], str]:
-    """Return a function that sends one text to a model and returns its reply.
+    """Return a function that sends a text to a model as one user message and returns its reply.
 
-    The function raises Unanswered if the model gives none.
+    `backend` runs the model. The function raises Unanswered if the model gives no reply.
     """
 
     def reply(prompt: str) -> str:

@@ -14,9 +14,10 @@ from harness.world.scene_graph import Conflict
 def of_course(played: Played) -> tuple[Decision, str]:
     """Return the decision of an episode whose policy lost most, and feedback in words on it.
 
-    A policy is the ego's probabilities of actions. It loses the best action's worth less its own
-    mean worth. The worth of an action is the probability that the episode succeeds after it if all
-    later actions are drawn evenly. The feedback is that of `of_decision`, and whether the episode
+    `played` is a wording's result on one layout (start situation), with the episode's decisions. A
+    policy is the ego's probabilities of actions. It loses the best action's worth less its own mean
+    worth. The worth of an action is the probability that the episode succeeds after it if all later
+    actions are drawn evenly. The feedback is that of `of_decision`, and whether the episode
     succeeded.
     """
     lost = [_lost(decision) for decision in played.course]

@@ -101,10 +101,18 @@ def counted(
 ) -> dict[str, Any]:
     """Return what a search is expected to ask, as the dict that `--dry-run` prints.
 
-    It has the marked choices, requests for one wording and for the certificate on report layouts,
-    and prompt tokens. `sizes` has the alternatives of each choice, `layouts` and `episodes` the
-    layouts of each tune and report dataset; `specs` are evaluations on a few tune layouts, from
-    which it counts.
+    Its keys: `choices`, the alternatives of each marked choice; `wordings`, all their combinations;
+    `wordings_in_a_round`, those that one round over the choices tries; `budget`; numbers of
+    requests for one wording (`questions_a_wording`) and for the comparison on report layouts
+    (`certificate_questions`); and `prompt_tokens` by dataset.
+
+    Args:
+        specs: evaluations on a few tune layouts (start situations), from which it counts.
+        sizes: how many alternatives each choice has, by its name; empty if a model rewrites.
+        budget: most questions that may be asked.
+        layouts: number of layouts of each tune dataset; 0 for as many as `specs` have.
+        episodes: number of layouts of each report dataset.
+        tokenizer: file of a tokenizer that counts tokens; None to count none.
     """
     of_family = [count(spec, spec.source.dataset, tokenizer) for spec in specs]  # type: ignore[attr-defined]
     here = [len(list(spec.source.layout_seeds)) for spec in specs]

@@ -45,7 +45,10 @@ class Search:
 
     Wordings are compared by evaluations on tune layouts, start situations for choosing, within a
     budget of questions to the model; the winner is measured once on report layouts, the test set,
-    and written as a new version.
+    and written as a new version. `base` is the version to begin with; `tune` has its evaluations on
+    tune layouts, one for each scenario, and `report` returns those on report layouts. `version`
+    names the new version, a folder in `prompts`. `engine` names what proposes wordings, and
+    `command` is the command line, both for the study's page.
     """
 
     base: Prompt  # the prompt version whose wording is searched
@@ -74,7 +77,11 @@ def choices(prompt: Prompt) -> dict[str, int]:
 
 
 def render_all(spec: Spec) -> None:
-    """Render each alternative of a prompt once, on one scene. Raises UserError if one fails."""
+    """Render each alternative wording of a prompt once, on one scene, and discard the texts.
+
+    `spec` is the evaluation, which has the prompt and the scenes. Raises UserError, with the
+    alternative's name, if one cannot be rendered.
+    """
     sizes = space(spec.ego.prompt)
     [scene] = spec.source.trial(1, ego_alone=False)
     graphs = {graph.role: graph for graph in scene.graphs.values()}
@@ -101,10 +108,21 @@ def search(
 ) -> Study:
     """Search a better wording, measure the winner on report layouts, and write it as a version.
 
-    Returns a study of what was tried and gained. `place` is the folder of what is kept until the
-    end; the two runs on report layouts stay in `out`. If no candidate beats the base on tune
-    layouts, no report layout is read and no version written. Raises UserError if the budget does
-    not suffice for the base.
+    Layouts are start situations; report layouts are those on which results are measured. Returns a
+    study of what was tried and gained. If no candidate beats the base on tune layouts, no report
+    layout is read and no version written.
+
+    Args:
+        plan: what is searched, on which layouts, and with which budget.
+        engine: is called once with the `Tuning`, and plays candidates on it until it has tried all.
+        out: the folder in which the runs on report layouts stay, of base and winner.
+        place: the folder of the answers so far, from which a stopped search resumes.
+        opens: opens a model's backend.
+        progress: is called with the number of questions just asked.
+        cache_file: file of stored completions; None for no cache.
+
+    Raises:
+        UserError: the budget does not suffice for the base.
     """
     for spec in plan.tune:
         render_all(spec)
@@ -146,10 +164,10 @@ def search(
 
 
 def looks(base: Prompt, where: Path) -> int:
-    """Return how often report layouts (the test set) were read to make a prompt version.
+    """Return how often report layouts were read to make a prompt version.
 
-    It counts the searches from which `base` came, by the history file in its folder under `where`;
-    0 without one.
+    These are start situations on which results are measured. It counts the searches from which
+    `base` came, by the history file in its folder under `where`; 0 without one.
     """
     with suppress(*BROKEN):
         return max(0, int(json.loads(text_of(where / base.version / HISTORY))["looks"]))

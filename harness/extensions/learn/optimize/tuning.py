@@ -42,7 +42,9 @@ class Spent(Exception):
 class Decision(NamedTuple):
     """Hold one decision of an episode: its scene, the messages heard, the policy and the action.
 
-    Fusion makes the ego's policy of its own answer and of the messages that it heard.
+    `scene`, of the dataset `dataset`, is the situation. Fusion makes the ego's policy of its own
+    answer (the text `raw`) and of the messages that it `heard`: `policy` (A,) has the probabilities
+    of the scenario's A actions, and `action` is the index of the one taken.
     """
 
     # the layouts (start situations) that were played, with their trees: every course that actions
@@ -58,7 +60,10 @@ class Decision(NamedTuple):
 class Played(NamedTuple):
     """Hold the result of a candidate wording on one layout, a start situation of a scenario.
 
-    It is one episode under each channel seed, by which messages are lost or delayed.
+    It is one episode under each channel seed, by which messages are lost or delayed. `success` is
+    the share of these that succeed. `worth` is how probable success is under the stated
+    distributions, as a mean over decisions, if later actions are drawn evenly. `course` has the
+    decisions under the first seed.
     """
 
     success: float  # share of successful episodes over the channel seeds
@@ -74,7 +79,12 @@ class Played(NamedTuple):
 
 @dataclass
 class Record:
-    """Hold all results of one candidate wording so far, and the questions that it asked."""
+    """Hold all results of one candidate wording so far, and the questions that it asked.
+
+    `length` is characters of its prompts to the ego, one of each scenario, in sum. `played` has the
+    results by the index of the layout (start situation) in `Tuning.layouts`, and `asked` the keys
+    of its questions so far.
+    """
 
     candidate: Candidate  # the wording
     # characters of the ego's prompt, in the first decision point of each scenario, in sum
@@ -90,7 +100,8 @@ class Tuning:
     Tune layouts are start situations of scenarios on which settings may be chosen.
 
     Attributes:
-        specs: the evaluations of the base on tune layouts, one a scenario; each has one condition.
+        specs: the evaluations of the base on tune layouts, one a scenario; each has one condition
+            (operating point).
         base: the prompt version whose wording is searched.
         budget: most questions that may be asked.
         records: the results of every candidate that was played, by its digest, in order.
@@ -120,7 +131,7 @@ class Tuning:
     def layouts(self) -> list[tuple[int, int]]:
         """Return all tune layouts as pairs: the index in `specs` and the episode's number.
 
-        Other methods number layouts by their index in this list.
+        A layout is a start situation. Other methods number layouts by their index in this list.
         """
         return [(n, e) for n, spec in enumerate(self.specs) for e in _dataset(spec).episodes]
 
@@ -132,7 +143,8 @@ class Tuning:
     def first_half(self) -> Ints:
         """Return indices (n,) of half of the layouts, on which a worse candidate is given up.
 
-        It is every second one of each scenario, of those with a danger and of those without.
+        They index `layouts`, a list of start situations. It is every second one of each scenario,
+        of those with a danger (a vehicle that the ego would meet) and of those without.
         """
         kinds: dict[tuple[int, bool], list[int]] = {}
         for n, (family, _) in enumerate(self.layouts):
@@ -140,9 +152,11 @@ class Tuning:
         return np.array(sorted(n for of_kind in kinds.values() for n in of_kind[::2]))
 
     def weights(self, layouts: Ints) -> Floats:
-        """Return the weights of layouts in a mean score, given their indices (n,); they sum to 1.
+        """Return the weights (n,) of layouts in a mean score, given their indices (n,).
 
-        Scenarios weigh alike, and in each so do layouts with and without a danger.
+        They sum to 1, and indices are those in the list `layouts` of start situations. Scenarios
+        weigh alike, and in each so do layouts with a danger (a vehicle that the ego would meet) and
+        without.
         """
         family = np.array([self.layouts[n][0] for n in layouts])
         weights = np.zeros(len(layouts))
@@ -153,8 +167,9 @@ class Tuning:
         return np.asarray(weights / weights.sum())
 
     def play(self, candidate: Candidate, layouts: Iterable[int]) -> list[Played]:
-        """Return a candidate's results on the layouts of these indices; only new ones are played.
+        """Return a wording's results on the layouts of these indices; only new ones are played.
 
+        A layout is a start situation. The results are in the order of `layouts`, the indices.
         Raises Spent before the budget would be exceeded.
         """
         wanted = list(layouts)
@@ -175,8 +190,9 @@ class Tuning:
     def score(self, candidate: Candidate, layouts: Ints) -> float:
         """Return a candidate's mean score on the layouts of these indices (n,).
 
-        A score is success plus 0.001 times the worth, the mean probability of success if all later
-        actions are drawn evenly. Raises Spent before the budget would be exceeded.
+        A layout is a start situation, numbered as in `Tuning.layouts`. A score is success plus
+        0.001 times the worth, the mean probability of success if all later actions are drawn
+        evenly. Raises Spent before the budget would be exceeded.
         """
         scores = [played.score for played in self.play(candidate, layouts.tolist())]
         return float(self.weights(layouts) @ scores)
@@ -184,7 +200,8 @@ class Tuning:
     def rank(self, candidate: Candidate) -> tuple[float, int]:
         """Return a candidate's sort key, greater for a better one: its score, and minus its length.
 
-        The score is over all layouts. Raises Spent before the budget would be exceeded.
+        The score is over all layouts (start situations), and the length is the characters of its
+        prompts to the ego. Raises Spent before the budget would be exceeded.
         """
         score = self.score(candidate, np.arange(len(self.layouts)))
         return round(score, 9), -self.records[candidate.key].length
@@ -195,7 +212,10 @@ class Tuning:
         return sum(tokens(read_kept(file).values()) for file in self._place.glob("answers-*.jsonl"))
 
     def best(self) -> Candidate:
-        """Return the best candidate of those played on all layouts; of equal ones the first."""
+        """Return the best candidate wording, by `rank`, of those played on all layouts.
+
+        Layouts are start situations. Of equal ones it is the first that was played.
+        """
         whole = [r.candidate for r in self.records.values() if len(r.played) == len(self.layouts)]
         return max(whole, key=self.rank)
 
@@ -248,8 +268,8 @@ class Tuning:
     def take(self, record: Record, questions: Iterable[Hashable]) -> None:
         """Charge those of these questions that the candidate has not asked before to the budget.
 
-        `record` has the candidate's, and a question is a key by which equal ones are one. Raises
-        Spent, and charges none, if the budget has too few left.
+        `record` has the candidate's questions so far. A question is any hashable key; equal keys
+        are the same question. Raises Spent, and charges none, if the budget has too few left.
         """
         new = set(questions) - record.asked
         if self.spent + len(new) > self.budget:
@@ -297,7 +317,10 @@ def tokens(answers: Iterable[Answer]) -> int:
 
 
 def changed(spec: Spec, prompt: Prompt) -> Spec:
-    """Return an evaluation with another prompt for all agents that have the ego's."""
+    """Return an evaluation with another prompt for the ego, and for helpers that have the ego's.
+
+    Helpers with a prompt version of their own keep it.
+    """
     version = spec.ego.prompt.version
     helpers = [
         replace(each, prompt=prompt) if each.prompt.version == version else each

@@ -20,7 +20,8 @@ ANY = "any"  # the viewer is drawn among all
 def read_by(asking: Asking, role: str) -> dict[str, Any]:
     """Return how answers of a role (`ego`, `helper`) are parsed: keyword arguments of `intent`.
 
-    `asking` has the prompt and the answer mode.
+    `asking` has the prompt and the answer mode. The keys are `answer`, `role`, `actions`, `form`,
+    `extension` and `reasons_first`.
     """
     shape = asking.prompt.shape(role, asking.scenario.actions)
     return {
@@ -91,8 +92,17 @@ def intent(
 ) -> tuple[float, ...] | None:
     """Return the distribution over A actions, (A,), that an answer's text states.
 
-    It is None if the text cannot be parsed. `answer` is the answer mode, such as `json`; the other
-    arguments are as `read_by` returns them.
+    It is None if the text cannot be parsed. The arguments but `text` are what `read_by` returns.
+
+    Args:
+        text: the raw answer.
+        answer: the answer mode: `readout` (one letter for an action), `json` or another.
+        role: who answered, `ego` or `helper`.
+        actions: names of the A actions, in the order of the result.
+        form: the form of answer that the prompt asks for; None for any.
+        extension: JSON text of the schemas of further members that the prompt asks for; empty for
+            none.
+        reasons_first: whether reasons may stand before the answer.
     """
     if answer == "readout":
         letter = readout.spelt(text)[:1]
@@ -136,9 +146,10 @@ def earned(
 ) -> float:
     """Return the advantage of an answer: its worth less that of the scenario's constant action.
 
-    `values` (A,) has the worth of each of A actions, `constant` is an action's index, and `worth`
-    says what a distribution is worth. An answer that cannot be parsed has worth 0. `how` are
-    arguments of `intent`.
+    The constant action is one that is always taken; `constant` is its index. `values` (A,) has the
+    probability of success after each of A actions. `worth` takes a distribution over actions and
+    these values, and returns one number, such as `driven`. An answer that cannot be parsed has
+    worth 0. `how` are the further arguments of `intent`, by which the text is parsed.
     """
     p = intent(text, **how)
     return (0.0 if p is None else worth(p, values)) - float(values[constant])
@@ -181,9 +192,10 @@ def expected_advantage(
 ) -> list[float]:
     """Return the advantage of the distribution that each completion states: a reward for TRL.
 
-    It is the mean worth under the distribution, less that of the constant action. It differs
-    between answers with the same likeliest action, so that few samples teach more; but an answer
-    that is unsure and right earns less than one that is sure. Arguments: as of `advantage`.
+    The advantage is the mean probability of success under the distribution, less that of one action
+    that is always taken. It differs between answers with the same likeliest action, so that few
+    samples teach more; but an answer that is unsure and right earns less than one that is sure. The
+    arguments are those of `advantage`: texts, and columns of `rows`.
     """
     return _rewards(expected_success, completions, values, constant, columns)
 

@@ -34,13 +34,15 @@ CHARACTERS = frozenset(["\n", "\t"] + [chr(code) for code in range(0x20, 0x3000)
 class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untyped
     """Let an agent decide for the ego, a decision a step, as a Gymnasium environment.
 
-    Users get one from `harness.environment`. An observation is a chat that asks the viewer
-    (`text`), or the numbers of its scene graph (`arrays`): `numbers`, named by `self.numbers`,
-    which are 0 where `known` is 0. The last observation of an episode repeats the one before.
+    Users get one from `harness.environment`. An observation is a chat that asks the viewer, the
+    vehicle whose sight it shows (`text`), or the numbers of its scene graph (`arrays`): `numbers`,
+    named by `self.numbers`, which are 0 where `known` is 0. The last observation of an episode
+    repeats the one before.
 
-    `info` has what no driver knows: `values` and `optimal` of every action, (A,), `lost` if success
-    is out of reach, `scene`, `layout_seed`, `danger` (its sector, "" without one) and `viewer`;
-    after a step the index `taken`, and at the end `success`.
+    `info` has what no driver knows: `values`, the probability of success after each of A actions,
+    (A,), `optimal`, a mask (A,) of the best ones, `lost` if success is out of reach, `scene` (its
+    id), `layout_seed`, `danger` (the sector it comes from, "" without one) and `viewer`; after a
+    step the index `taken`, and at the end `success`.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 # as gymnasium declares it
@@ -91,11 +93,11 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         return self._trees("values").values
 
     def rows(self, per_level: int = 6) -> list[dict[str, Any]]:
-        """Return questions of all layouts for trainers of text models, a dict each (`asking.rows`).
+        """Return questions of all layouts (start situations) for trainers of text models, as dicts.
 
-        They are of decision points at which the action matters, `per_level` for each step of each
-        layout (see `values.drawn`). Raises UserError if the episodes are driven and so have no
-        trees.
+        The dicts are those of `asking.rows`: the chat, what each action is worth, and how the
+        answer is parsed. They are of decision points at which the action matters, `per_level` for
+        each step of each layout. Raises UserError if the episodes are driven and so have no trees.
         """
         trees = self._trees("rows()")
         at = trees.drawn(per_level)
@@ -109,16 +111,18 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         The keys are drivers, such as `constant`, `uniform` and `full-view`, which sees everything.
         Each has `advantage`, the mean reward over `rows(per_level)` (0 for `constant`), and
         `success`, the share of successful episodes on their layouts, balanced over those with and
-        without a danger. Raises UserError if the episodes are driven, or if no decision of the
-        layouts matters.
+        without a danger, a vehicle that a cruising ego would meet. Raises UserError if the episodes
+        are driven, or if no decision of the layouts matters.
         """
         trees = self._trees("references()")
         return trees.references(trees.drawn(per_level))
 
     def learnt(self) -> dict[str, Any]:
-        """Return what the card of a model trained here should state, as plain values.
+        """Return what the card, the file that describes a model, should state of one trained here.
 
-        It has scenario, seeds, reward and prompt.
+        It is plain values: `scenarios` (name to digest), `layouts` (how many start situations),
+        `first_seed` (of these), `purpose` of the seeds, `then` (who decides after a judged action),
+        `reward`, and `prompts` (version to digest).
         """
         scenario, seeds = self.source.scenario, self.source.seeds
         prompt = self.ask.prompt
@@ -137,8 +141,8 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode on a random layout, or on that of `options={"layout_seed": ...}`.
 
-        Returns the observation and `info`. Raises UserError for a layout that may not be learnt
-        from, or has no tree here.
+        A layout is a start situation. `seed` seeds the draw of layouts. Returns the observation and
+        `info`. Raises UserError for a layout that may not be learnt from, or has no tree here.
         """
         super().reset(seed=seed)
         seeds = self.source.seeds

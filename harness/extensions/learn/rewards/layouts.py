@@ -25,8 +25,9 @@ CODE = ("world/**/*.py", "world/**/*.csv", "dataset/*.py")
 def seeds(which: str | int, layouts: int) -> range:
     """Return the range of `layouts` layout seeds for training.
 
-    `which` is `train` or `tune`, or the first seed. Raises UserError for report seeds, on which
-    results are measured, for seeds of two purposes, or for seeds that do not exist.
+    A layout seed draws a start situation. `which` is `train` or `tune`, or the first seed. Raises
+    UserError for report seeds, on which results are measured, for seeds of two purposes, or for
+    seeds that do not exist.
     """
     if isinstance(which, str) and which not in FIRST:
         raise unknown(
@@ -53,7 +54,10 @@ def whole(what: str, number: Any) -> int:
 
 
 def refuse(kind: Purpose, what: str) -> None:
-    """Raise UserError if layouts are for reporting results; `what` names them in the message."""
+    """Raise UserError if layouts (start situations) are for reporting results, not for learning.
+
+    `kind` is what they are for, such as `train`; `what` names them in the message.
+    """
     if kind == "report":
         raise UserError(
             f"{what}: numbers are reported of layout seeds from {FIRST['report']} on, and nothing "
@@ -66,8 +70,9 @@ def refuse(kind: Purpose, what: str) -> None:
 def stored(dataset: str) -> Dataset:
     """Read a dataset to learn from, by its folder or name.
 
-    Raises UserError if there is none, or if it has report seeds. Some layouts are rebuilt from
-    their seeds, so that a manifest with false seeds is refused.
+    Raises UserError if there is none, or if it has report seeds: layouts (start situations) on
+    which results are measured. Some layouts are rebuilt from their seeds, so that a manifest with
+    false seeds is refused.
     """
     data = load(find(dataset))
     refuse(purpose(data.manifest.seed, data.manifest.episodes), f"dataset {printable(dataset)}")
@@ -80,9 +85,9 @@ def trees(
 ) -> Dataset:
     """Return a scenario's layouts of the seeds `of`, with their decision trees, as a dataset.
 
-    Trees that are not in the user's cache folder are built; a stopped build resumes. `progress` is
-    called with the number of layouts just done. Raises UserError if another process is building
-    them.
+    A layout is a start situation, and its tree has every course that actions can lead to. Trees
+    that are not in the user's cache folder are built; a stopped build resumes. `progress` is called
+    with the number of layouts just done. Raises UserError if another process is building them.
     """
     key = digest([scenario.name, scenario.parameters.stated(), kept.code_sha256(*CODE)])[:12]
     name = re.sub(r"[^A-Za-z0-9]+", "-", scenario.name)[:60]

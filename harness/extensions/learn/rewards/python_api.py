@@ -29,10 +29,11 @@ def environment(
     """Make a Gymnasium environment, whose rewards are exact: docs/learning-environment.md.
 
     Args:
-        scenario: as `harness dataset build` takes it. Default: the usual one.
-        seeds: `train` or `tune`, or the first layout seed; report seeds are refused.
-        layouts: how many; their trees are built once, in seconds each,
-            and kept in the cache folder.
+        scenario: name of the scenario, such as `occluded-intersection`. Default: the usual one.
+        seeds: `train` or `tune`, or the first layout seed, each of which draws a start situation;
+            report seeds, on which results are measured, are refused.
+        layouts: how many; their decision trees, all courses that actions can lead to, are built
+            once, in seconds each, and kept in the cache folder.
         dataset: folder of a dataset of train or tune seeds, whose trees are taken instead.
         driven: whether episodes are driven in the simulator; then no tree is built.
         then: who decides after an action that is judged: a reference driver, and on trees also
@@ -48,8 +49,8 @@ def environment(
         quiet: whether progress is left out.
 
     Raises:
-        UserError: a value is unknown or not allowed,
-            or layouts are those that numbers are reported of.
+        UserError: a value is unknown or not allowed, or layouts are those that numbers are reported
+            of.
     """
     from harness.core import extras
     from harness.core.parallel import workers_of

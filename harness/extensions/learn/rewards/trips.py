@@ -31,11 +31,14 @@ from harness.world.world import World
 
 
 class Trip(Protocol):
-    """Describe an episode that `Source.begin` began: at a decision point, or over."""
+    """Describe one episode in progress, as the environment needs it: where it is, and how to go on.
+
+    It stands at a decision point, a situation in which the ego must act, or is over.
+    """
 
     @property
     def scene(self) -> Scene:
-        """Return the present decision point; the last one once the episode is over."""
+        """Return the present decision point, with what each vehicle sees; at the end the last."""
         ...
 
     @property
@@ -54,18 +57,24 @@ class Trip(Protocol):
 
 
 class Source(Protocol):
-    """Describe where the environment's episodes come from: trees or the simulator."""
+    """Describe where the environment's episodes come from: decision trees or the simulator.
+
+    A decision tree has every course that actions can lead to, and how each ends.
+    """
 
     @property
     def scenario(self) -> Scenario: ...
 
     @property
     def seeds(self) -> Sequence[int]:
-        """Return the layout seeds among which an episode's is drawn."""
+        """Return the layout seeds, each of a start situation, among which an episode's is drawn."""
         ...
 
     def begin(self, seed: int) -> Trip:
-        """Begin an episode on a layout seed. Raises UserError if it has no such layout."""
+        """Begin an episode on the layout (start situation) of this seed, and return it.
+
+        Raises UserError if there is no such layout here.
+        """
         ...
 
 
@@ -74,6 +83,7 @@ class Trees:
     """Take the environment's episodes from the decision trees of a dataset, without a simulator.
 
     A tree has every decision point of a layout that actions can lead to, and how each episode ends.
+    What an action is worth depends on who decides after it, `then`: `best`, `uniform` or a driver.
     """
 
     dataset: Dataset  # the trees, and the scenes of their decision points
@@ -95,7 +105,8 @@ class Trees:
     def constant(self) -> int:
         """Return the index of the action that is always taken, beside which answers are judged.
 
-        It is the scenario's measured best constant, or else the best one of these layouts.
+        It is the scenario's measured best constant action, or else the best one of these layouts
+        (start situations).
         """
         action = constant(self.scenario)
         if action is None:
@@ -103,9 +114,10 @@ class Trees:
         return self.scenario.actions.index(action)
 
     def drawn(self, per_level: int) -> Ints:
-        """Return indices of decision points at which the action matters, (n,).
+        """Return indices, (n,), of decision points at which the action matters.
 
-        There are about `per_level` for each step of each tree; see `values.drawn`.
+        They index the dataset's decision trees. There are about `per_level` for each step of each
+        tree, drawn at random by `values.drawn`.
         """
         data = self.dataset
         return drawn(
@@ -116,8 +128,9 @@ class Trees:
         """Return `advantage` and `success` of drivers that need no model, by the driver's name.
 
         `advantage` is the mean over decision points at indices `at` (n,) of the worth of what the
-        driver does, less that of the constant action; `success` is over all layouts, balanced.
-        Raises UserError if `at` is empty.
+        driver does, less that of the action that is always taken (`constant`). `success` is the
+        share of layouts (start situations) that succeed, where those with a danger, a vehicle that
+        the ego would meet, and without weigh alike. Raises UserError if `at` is empty.
         """
         if not len(at):
             raise UserError("no decision of these layouts matters; give more layouts")
@@ -151,7 +164,12 @@ class Trees:
 
 @dataclass
 class TreeTrip:
-    """Walk through the tree of one layout: an episode that `Trees` began."""
+    """Walk through the tree of one layout: an episode that `Trees` began.
+
+    A layout is a start situation, and its tree has all courses from there. `of` has the tree, and
+    `at` is the index of the present decision point among those of all trees of the dataset.
+    `success` is None until the episode ends.
+    """
 
     of: Trees  # where the layout's tree is
     at: int  # index of the present decision point in the dataset's decision trees
@@ -176,7 +194,11 @@ class TreeTrip:
 
 @dataclass(frozen=True)
 class Roads:
-    """Take the environment's episodes from the simulator, so that no tree is built."""
+    """Take the environment's episodes from the simulator, so that no tree is built.
+
+    Each of the layout `seeds` draws a start situation of `scenario`. `then` names the reference
+    driver that decides after an action whose worth is asked; without one the worth is NaN.
+    """
 
     scenario: Scenario  # what is driven
     seeds: Sequence[int]  # the layout seeds, which draw start situations
@@ -198,7 +220,11 @@ class Roads:
 
 @dataclass
 class RoadTrip:
-    """Drive one layout, a start situation, in the simulator: an episode that `Roads` began."""
+    """Drive one layout, a start situation, in the simulator: an episode that `Roads` began.
+
+    `of` says what is driven, and `world` is the simulated world at the present decision point.
+    `success` is None until the episode ends.
+    """
 
     of: Roads  # what is driven
     world: World  # the simulated world, at the present decision point
@@ -209,9 +235,10 @@ class RoadTrip:
 
     @cached_property
     def reference(self) -> Outcome:
-        """Return how a rule driver that sees everything ends on this layout.
+        """Return how the reference driver that sees everything ends on this layout.
 
-        The time that it takes says from when on the ego is too late.
+        A layout is a start situation, and a reference driver is a rule that needs no model. The
+        time that it takes says from when on the ego is too late.
         """
         return drive(self.of.scenario, PRIVILEGED, self.world.seed)
 

@@ -34,7 +34,12 @@ BEST = "best"
 
 @dataclass(frozen=True)
 class Values:
-    """Hold the worth of A actions at N decision points: the probability of success after each."""
+    """Hold the worth of A actions at N decision points: the probability of success after each.
+
+    `table` (N, A) has it, for the points of `ids` and the names in `actions`, in their order. It is
+    for an episode in which `then` decides after the action: `best`, `uniform` or a reference
+    driver.
+    """
 
     ids: tuple[str, ...]  # ids of the decision points
     actions: tuple[str, ...]  # the meta-actions
@@ -92,9 +97,11 @@ class Values:
 
 
 def balanced(success: Floats | Bools, dangerous: Bools) -> float:
-    """Return the mean success (E,) of E layouts, where those with and without a danger weigh alike.
+    """Return the mean of success (E,), 0 to 1, over E layouts of which both kinds weigh alike.
 
-    `dangerous` (E,) says which have one. If all are of one kind, it is their plain mean.
+    A layout is a start situation. The kinds are those with a danger, a vehicle that the ego would
+    meet, and without: `dangerous` (E,) says which have one. If all are of one kind, it is their
+    plain mean.
     """
     kinds = [success[kind].mean() for kind in (dangerous, ~dangerous) if kind.any()]
     return float(np.mean(kinds))
@@ -103,19 +110,22 @@ def balanced(success: Floats | Bools, dangerous: Bools) -> float:
 def best_constant(forest: Forest, dangerous: Bools) -> int:
     """Return the index of the action that succeeds most if always taken, by balanced success.
 
-    `dangerous` (E,) says which of E layouts have a danger. Of equal actions it is the first.
+    Balanced success is the mean of that in layouts with a danger, a vehicle that the ego would
+    meet, and without; `dangerous` (E,) says which of E layouts (start situations) have one.
+    `forest` has their decision trees. Of equal actions it is the first.
     """
     success = [balanced(forest.constant_success(action), dangerous) for action in forest.actions]
     return int(np.argmax(success))
 
 
 def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario: str) -> Ints:
-    """Draw about `per_level` decision points for each step of each tree: ascending indices, (n,).
+    """Draw about `per_level` decision points of each step of each tree; return their indices, (n,).
 
-    Only points where `of` (N,), a mask of all N points, is true are drawn, keyed by scenario and
-    layout seed; where a step has too few, they repeat. `dangerous` (E,) says which of the E trees'
-    layouts have a danger; of the rarer kind of layout more are drawn, so that both kinds have as
-    many in all.
+    The indices are ascending, among the forest's N points. Only points where the mask `of` (N,) is
+    true are drawn, keyed by scenario and layout seed; where a step has too few, they repeat.
+    `dangerous` (E,) says which of the E trees' layouts (start situations) have a danger, a vehicle
+    that the ego would meet; of the rarer kind of layout more are drawn, so that both kinds have as
+    many in all. `scenario` is the scenario's name.
     """
     alike = np.where(dangerous, dangerous.sum(), (~dangerous).sum())
     kinds = len(np.unique(dangerous))

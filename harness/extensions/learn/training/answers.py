@@ -25,11 +25,12 @@ STEP_M = 7.0  # from one class to the next; the last has no end
 
 
 def evidence(view: SceneGraph, named: bool = True) -> str:
-    """Return one sentence of evidence from a viewer's scene graph, as a helper reports it.
+    """Return one sentence of evidence, as a helper reports it, from what a viewer knows of a scene.
 
-    It says who brakes ahead of the ego, else who comes closest to it in time, else what is hidden.
-    The gap is by how many seconds that vehicle reaches the conflict later than the ego. If `named`
-    is false, the prompt names no vehicle, and the sentence says "one".
+    `view` is that: its scene graph. The sentence says who brakes ahead of the ego, else who comes
+    closest to it in time, else what is hidden. The gap is by how many seconds that vehicle reaches
+    the conflict later than the ego. If `named` is false, the prompt names no vehicle, and the
+    sentence says "one".
     """
 
     def who(conflict: Conflict) -> str:
@@ -51,7 +52,8 @@ def evidence(view: SceneGraph, named: bool = True) -> str:
 def sights(view: SceneGraph) -> str:
     """Return what a viewer's cameras show, as text: up to five vehicles, the nearest first.
 
-    Each has its type, metres ahead and to the left of the viewer, and a brake light or indicator.
+    `view` is the scene graph, what the viewer knows of the scene. Each vehicle has its type, metres
+    ahead and to the left of the viewer, and a brake light or indicator.
     """
     seen = [node for node in view.nodes if "camera" in node.sensors]
     seen.sort(key=lambda node: float(np.hypot(node.forward_m, node.left_m)))
@@ -74,8 +76,9 @@ def message(
     """Return a helper's message that states an intent (A,), with all fields that a prompt may show.
 
     They are `evidence`, `risk`, `intent` (in steps of 1/20), `recommended_maneuver` and
-    `confidence`. `actions` has the names of the A actions, the most careful first. If `named` is
-    false, the prompt names no vehicle, and the evidence says "one".
+    `confidence`. An intent is probabilities of the A actions. `view` is the scene graph, what the
+    helper knows of the scene. `actions` has the names of the A actions, the most careful first. If
+    `named` is false, the prompt names no vehicle, and the evidence says "one".
     """
     parts = rounded(intent.tolist(), PARTS)
     best = int(np.argmax(intent))
@@ -100,8 +103,9 @@ def answer(
 ) -> str:
     """Return the JSON answer that a viewer should give to `prompt` to state an intent (A,).
 
-    `actions` has the names of the A actions. If `bare`, its free text is left empty, as in a
-    constrained answer. If `named` is false, the prompt names no vehicle, and the text says "one".
+    An intent is probabilities of the A actions that `actions` names. `view` is the scene graph,
+    what the viewer knows of the scene. If `bare`, its free text is left empty, as in a constrained
+    answer. If `named` is false, the prompt names no vehicle, and the text says "one".
     """
     sent = message(view, intent, actions, named)
     numbers = ",".join(f'"{a}":{p:.2f}' for a, p in zip(actions, sent["intent"], strict=True))

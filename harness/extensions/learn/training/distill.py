@@ -33,7 +33,9 @@ FACTS = "training.json"  # written last
 class Curriculum:
     """Describe what a model is trained from: scenarios, prompts, layouts, and initial weights.
 
-    A layout is a start situation of a scenario, drawn from a seed.
+    A layout is a start situation of a scenario, drawn from a seed: there are `layouts` of each
+    scenario, with seeds from `seed` on. `prompts` has the versions that are learnt in each, and
+    `base` the model that it begins as; None begins with random weights.
     """
 
     prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
@@ -57,7 +59,11 @@ class Curriculum:
         locate(self.base)  # now, and not after the layouts are drawn
 
     def settings(self) -> dict[str, Any]:
-        """Return as plain values the settings that a resumed training must not change."""
+        """Return as plain values the settings that a resumed training must not change.
+
+        They are digests of scenarios, prompts and the base's weights, and the number and the first
+        seed of layouts (start situations).
+        """
         scenarios = {}
         for scenario in self.prompts:
             parameters = canonical_json(scenario.parameters.stated())
@@ -87,11 +93,21 @@ def distill(
 ) -> dict[str, Any]:
     """Train a model in some scenarios; write checkpoint, tokenizer, GGUF file and card to `out`.
 
-    `out` is a folder to make; its name becomes the model's. A killed call resumes. `drawing` is
-    called with the number of layouts just drawn, `progress` with the stage, the sequences seen in
-    it and the loss. `threads` are PyTorch's CPU threads; None lets PyTorch choose. Returns what the
-    card states: data, plan, loss curves, and how the read-out fits held-out layouts. Raises
-    UserError if `out` holds a finished model or something else.
+    Returns what the card, the file that describes the model, states: data, plan, loss curves, and
+    how its letters for actions fit on held-out layouts (start situations). A killed call resumes.
+
+    Args:
+        curriculum: the scenarios, prompts and layouts, and the initial weights.
+        plan: the length of the training, its rates, seed and objective.
+        out: the folder to make; its name becomes the model's.
+        drawing: called with the number of layouts just drawn.
+        progress: called with the stage, the sequences seen in it and the loss.
+        device: where to train, such as `cpu` or `cuda:0`.
+        threads: PyTorch's CPU threads; None lets PyTorch choose.
+        workers: processes that draw layouts.
+
+    Raises:
+        UserError: `out` holds a finished model or something else.
     """
     if threads:
         torch.set_num_threads(threads)

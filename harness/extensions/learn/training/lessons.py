@@ -50,7 +50,8 @@ PRIOR = {"FASTER": 0.3, "LANE_LEFT": 0.3, "LANE_RIGHT": 0.3}
 class Point(msgspec.Struct, frozen=True):
     """Hold one decision point to learn from: a scene, and what a model should answer there.
 
-    That is a soft label: the probabilities that it should give to the scenario's actions.
+    `record` is the scene, with what every vehicle sees. `label` (A,) is a soft label: the
+    probabilities that the model should give to the scenario's A actions.
     """
 
     record: Record  # the scene: its state, and every viewer's scene graph
@@ -61,7 +62,10 @@ class Point(msgspec.Struct, frozen=True):
 class Lessons:
     """Hold the scenes of one scenario that a model learns from, and what it should answer there.
 
-    Scenes are decision points of layouts, drawn start situations of the scenario.
+    Scenes are decision points of layouts, drawn start situations of the scenario. `labels` has the
+    soft label of each by its id, (A,): the probabilities that the model should give to A actions.
+    `prompts` are the versions that ask. `balanced` says that layouts with a danger (a vehicle that
+    the ego would meet) and those without weigh alike.
     """
 
     scenario: Scenario  # whose actions and words the prompts have
@@ -75,7 +79,7 @@ class Lessons:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """Return the numbers of the layouts that the scenes are of, each once."""
+        """Return the numbers of the layouts (start situations) of these scenes, each once."""
         return tuple(dict.fromkeys(scene.record.episode for scene in self.scenes))
 
     @cached_property
@@ -83,7 +87,8 @@ class Lessons:
         """Return the training weight of each scene, by scene id.
 
         All scenes of one step of one layout (start situation) share a weight of 1. If `balanced`,
-        layouts with a danger and those without have the same total.
+        layouts with a danger (a vehicle that the ego would meet) and those without have the same
+        total.
         """
         levels = [(scene.record.episode, scene.record.step) for scene in self.scenes]
         points = Counter(levels)
@@ -98,7 +103,8 @@ class Lessons:
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
         """Return these lessons without the last layouts, and those of the last layouts.
 
-        `held_out` is the share of layouts that the second part gets, at least one layout.
+        A layout is a start situation. `held_out` is the share of layouts that the second part gets,
+        at least one layout.
         """
         last = self.episodes[-max(1, round(len(self.episodes) * held_out)) :]
         kept = tuple(scene for scene in self.scenes if scene.record.episode not in last)
@@ -148,8 +154,9 @@ def _encoded(scenario: Scenario, seed: int, number: int) -> bytes:
 def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
     """Draw decision points of one layout to learn from, up to six for each step of its tree.
 
-    `seed` is the layout seed, and `number` the episode number that the records get. A point after
-    which no action leads to success is left out.
+    A layout is a start situation, and its tree every course that actions can lead to. `seed` is the
+    layout seed, and `number` the episode number that the records get. A point after which no action
+    leads to success is left out.
     """
     rng = noise.generator("lessons", scenario.name, seed)
     reference, points = drive(scenario, PRIVILEGED, seed), []

@@ -43,10 +43,11 @@ def write(
 ) -> Path:
     """Write a run's chats for fine-tuning to a file as JSON Lines, and return its path.
 
-    Without `margin` they are those of `pairs`, with it those of `preferences`. Raises UserError if
-    the run was driven, its dataset or prompt is not here as it was, or an answer does not match its
-    text; and, unless `report_seeds_too`, if it has report seeds, or layouts that their seeds do not
-    give.
+    Without `margin` they are those of `pairs`, with it those of `preferences`, whose answers are
+    worth less than the best by that or more. `dataset` is the folder of the run's dataset; None
+    finds it. Raises UserError if the run was driven, its dataset or prompt is not here as it was,
+    or an answer does not match its text; and, unless `report_seeds_too`, if it has report seeds, or
+    layouts (start situations) that their seeds do not give.
     """
     option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):
@@ -81,10 +82,10 @@ def _check_seeds(what: str, seeds: Collection[int]) -> None:
 def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     """Yield each question of a run as a chat, with the answer that the decision tree asks for.
 
-    A dict has `prompt` and `completion` (chat messages), and the scene, viewer, seed, actions,
-    their label (`probabilities`) and `values`. Fusion calls are included; a decision point at which
-    no action succeeds is left out. `folder` has the dataset; None finds the one that the run
-    states. Raises UserError if the dataset or the prompt is not here as it was.
+    A dict has `prompt` and `completion` (chat messages), and the scene, viewer (the vehicle asked),
+    seed, actions, their label (`probabilities`) and `values`. Fusion calls are included; a decision
+    point at which no action succeeds is left out. `folder` has the dataset; None finds the one that
+    the run states. Raises UserError if the dataset or the prompt is not here as it was.
     """
     for row, completion, _ in _answered(run, folder):
         yield {"prompt": row.pop("prompt"), "completion": _reply(completion), **row}
@@ -93,10 +94,12 @@ def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
 def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator[dict[str, Any]]:
     """Yield each question of a run whose answer is worth less than the tree's by `margin` or more.
 
-    A dict is as of `pairs`, with `chosen` (the tree's answer), `rejected` (the model's) and
-    `value_rejected`. An answer is worth the probability that it gives to actions after which
+    The tree is the scene's decision tree, which says after which actions success is possible. A
+    dict has what those of `pairs` have, with `chosen` (the tree's answer), `rejected` (the model's)
+    and `value_rejected`. An answer is worth the probability that it gives to actions after which
     success is possible; one that cannot be parsed is worth 0, and of a read-out the likeliest
-    letter counts. A question without an answer is left out.
+    letter counts. A question without an answer is left out. `folder` is that of the dataset; None
+    finds it.
     """
     for row, completion, stored in _answered(run, folder):
         values, p, raw = row["values"], stored.intent, stored.raw

@@ -27,11 +27,11 @@ def examples(
 ) -> Examples:
     """Draw `count` examples for a prompt, 1 or more for each role, each from a layout of its own.
 
-    Layouts have the seeds from `first_seed` on. An example is a decision point of its layout whose
-    best action the role's examples show least so far, and whose viewer sees a conflict where one
-    does. A layout with no safe action is passed over, and so are a few that repeat frequent
-    actions. `progress` is called with 1 for each layout used. Raises UserError if the train seeds
-    end too early.
+    Layouts are start situations, and have the seeds from `first_seed` on. An example is a decision
+    point of its layout whose best action the role's examples show least so far, and whose viewer
+    (the vehicle asked) sees a conflict where one does. A layout with no safe action is passed over,
+    and so are a few that repeat frequent actions. `progress` is called with 1 for each layout used.
+    Raises UserError if the train seeds end too early.
     """
     chosen: dict[str, list[Example]] = {role: [] for role in ROLES}
     times = {role: [0] * len(scenario.actions) for role in ROLES}

@@ -34,7 +34,9 @@ _TELLING = 1e-3  # largest difference of logits that is rounding
 class Adapt:
     """Describe how a published model is fine-tuned: which weights, how fast, and for what.
 
-    The model learns to answer with a letter for an action, followed by a report in words.
+    The model learns to answer with a letter for an action, followed by a report in words. `rank` is
+    that of the LoRA adapter, None to train all weights; `rate` is the learning rate, `dtype` what
+    layers compute in, and `report` the weight of the report's loss beside the letter's.
     """
 
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
@@ -47,7 +49,13 @@ class Adapt:
 
 
 class Published:
-    """Hold a published text model while it is fine-tuned, with its tokenizer and chat template."""
+    """Hold a published text model while it is fine-tuned, with its tokenizer and chat template.
+
+    It is made from the model's card (the file that describes it), and raises UserError if the
+    weights cannot be found or taught. `model` is the transformers model, `card` its card, `sha256`
+    the digest of its weights, `end` the piece of text that ends an answer, and `encode` returns a
+    text's token ids.
+    """
 
     def __init__(self, card: Card, adapt: Adapt, seed: int, device: str) -> None:
         """Open a card's weights on transformers.
@@ -74,10 +82,11 @@ class Published:
             trunk.forward = torch.autocast(torch.device(device).type, torch.bfloat16)(trunk.forward)
 
     def read(self, messages: Sequence[Mapping[str, str]]) -> tuple[NDArray[np.int32], int, str]:
-        """Return a chat's token ids, (tokens,), how many of them it shares, and with which chats.
+        """Return a chat's token ids (tokens,), how many are shared, and the key of that beginning.
 
-        The second says how many of the first tokens, those of all messages but the last, are equal
-        in all chats with the same key, the third; they are computed once.
+        Shared are the first tokens, those of all messages but the last: they are equal in all chats
+        with the same key, so that a trainer computes them once. `messages` are the chat's, each
+        with `role` and `content`.
         """
         ids = self.encode(self.chat.render(messages, thinking=False))
         kind = "\n".join(message["content"] for message in messages[:-1])
@@ -215,7 +224,8 @@ out. The losses are of different sums and compare within a stage only; curves ar
 def references_table(facts: Mapping[str, Any]) -> str:
     """Return a Markdown table of values by scenario: the model's, and those of rule drivers.
 
-    `facts` is what `distill` returns.
+    A value is a mean probability of success, and a rule driver one without a model. `facts` is what
+    `distill` returns.
     """
     names = dict.fromkeys(name for row in facts["held_out"] for name in row["references"])
     lines = [f"| scenario | the model | {' | '.join(f'`{name}`' for name in names)} |"]

@@ -27,7 +27,11 @@ ARRIVES = 0.85  # probability that a helper's message is in the ego's prompt
 class Question:
     """Hold one prompt for one viewer of a scene, and the answer (soft label) that it should get.
 
-    A viewer is the vehicle that is asked: the ego, or a helper.
+    A viewer is the vehicle that is asked: the ego, or a helper. `key` identifies the question (see
+    `key`), `graph` is what the viewer knows, `messages` the chat, and `label` (A,) the
+    probabilities that the answer should give to A actions. `weight` is relative to other
+    questions'. `heard` has helpers' messages that the prompt shows, `image` its picture, and
+    `excerpt` the part of the graph that it shows, if not all.
     """
 
     # scenario, scene, viewer and prompt version, and `+m` where helpers' messages are in it
@@ -65,7 +69,7 @@ class Question:
 def alone(lessons: Lessons) -> Iterator[Question]:
     """Yield a question without helpers' messages for every scene, viewer and prompt version.
 
-    `lessons` has the scenes; viewers are the ego and its helpers.
+    `lessons` has the scenes; viewers are the vehicles that are asked, the ego and its helpers.
     """
     for scene in lessons.scenes:
         for viewer in scene.viewers:
@@ -76,8 +80,9 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
     """Yield shorter copies of questions, in whose scene graph only the conflicts are left.
 
-    A conflict is a vehicle whose path meets the ego's, with both arrival times. Questions with
-    neither conflicts nor a picture are left out.
+    A scene graph is what the asked vehicle knows of the scene. A conflict is a vehicle whose path
+    meets the ego's, with both arrival times. Questions with neither conflicts nor a picture are
+    left out.
     """
     for q in questions:
         if q.graph.conflicts or q.image:
@@ -92,8 +97,8 @@ def with_messages(
     """Yield questions to the ego that show helpers' messages, by scene and prompt version.
 
     `intents` has each helper's intent over A actions, (A,), by the `key` of its question. Each
-    message arrives with probability 0.85, by draws keyed by layout and scene; a scene in which none
-    arrives is left out.
+    message arrives with probability 0.85, by draws keyed by layout (start situation) and scene; a
+    scene in which none arrives is left out.
     """
     for scene in scenes:
         ego, *helpers = scene.viewers
@@ -118,8 +123,8 @@ def question(
 ) -> Question:
     """Return the question to one viewer (a vehicle's id) of a scene, for a prompt version.
 
-    `lessons` has the scene's soft label. `heard` has the helpers' messages that the prompt shows,
-    each as a dict with its `sender`.
+    `lessons` has the scene's soft label, the probabilities of actions that the answer should have.
+    `heard` has the helpers' messages that the prompt shows, each as a dict with its `sender`.
     """
     graph, scenario = scene.graphs[viewer], lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
@@ -130,7 +135,10 @@ def question(
 
 
 def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
-    """Return the key of a question: `scenario/scene/viewer/prompt version`."""
+    """Return the key that tells a question apart: `scenario/scene/viewer/prompt version`.
+
+    The scenario is that of `lessons`, the scene is given by its id, and `viewer` is a vehicle's id.
+    """
     return f"{lessons.scenario.name}/{scene.id}/{viewer}/{prompt.version}"
 
 
@@ -164,7 +172,7 @@ def references(
 def kl_nats(labels: Floats, p: Floats) -> float:
     """Return the mean KL divergence in nats of answers `p` (n, A) from soft labels (n, A).
 
-    They are distributions over A actions, for n questions.
+    Soft labels are what answers should be; both are distributions over A actions, for n questions.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.where(labels > 0, labels * np.log(labels / np.maximum(p, 1e-12)), 0.0)

@@ -60,7 +60,14 @@ T = TypeVar("T")
 
 
 class Student:
-    """Hold a model in training, with its questions and tokenizer, and train it stage by stage."""
+    """Hold a model in training, with its questions and tokenizer, and train it stage by stage.
+
+    The stages are those of `samples`. It is made from the lessons of each scenario, of which the
+    last layouts (start situations) are held out; a plan of the training; `work`, the folder of what
+    a resumed training needs; PyTorch's name of the device; and the model to begin with, None for
+    random weights. Attributes: `model` is the transformers model, `questions` those that it learns,
+    and `letters` the token ids of the letters that stand for actions.
+    """
 
     def __init__(
         self,
@@ -99,10 +106,10 @@ class Student:
     def reading(self, questions: Sequence[Question], seen: bool = False) -> list[Sample]:
         """Return training samples of questions, answered by a letter and a report in words.
 
-        The letter is drawn from the target: the soft label. If a base model with text prompts is
-        there, a picture's target is that model's read-out of the same scene in words, which has
-        less noise. The report tells the nearest conflict; of a picture, if `seen`, the vehicles
-        that it shows.
+        The letter is drawn from the target: the soft label, the probabilities of actions to be
+        learnt. If a base model with text prompts is there, a picture's target is that model's
+        read-out of the same scene in words, which has less noise. The report tells the nearest
+        conflict; of a picture, if `seen`, the vehicles that it shows.
         """
         rng = np.random.default_rng(self.plan.seed)
         samples = []
@@ -134,8 +141,9 @@ class Student:
     def heard(self) -> list[Question]:
         """Return questions to the ego with helpers' messages, whose intents the model states.
 
-        The intents are the model's after the stage `alone`, kept in a file for a resumed training.
-        Raises UserError if no message reaches the ego in the scenes that are taken.
+        The intents, probabilities of actions, are the model's after the stage `alone`, kept in a
+        file for a resumed training. Raises UserError if no message reaches the ego in the scenes
+        that are taken.
         """
         prompts = sum(len(lessons.prompts) for lessons in self.lessons)
         most = self.plan.samples["messages"] // (4 * prompts)  # of each scenario
@@ -168,9 +176,12 @@ class Student:
         return heard
 
     def samples(self, stage: str) -> list[Sample]:
-        """Return the samples of a stage: `excerpts`, `alone`, `messages` or `answers`.
+        """Return the training samples of a stage, by the stage's name.
 
-        The last two stages repeat one-letter samples of the earlier ones.
+        `excerpts` have scene graphs (what a vehicle knows) with conflicts alone, `alone` whole ones
+        without helpers' messages, and `messages` those to an ego that heard some, all answered by a
+        letter; `answers` are answered in JSON. The last two stages repeat some one-letter samples
+        of the earlier ones.
         """
         if stage == "excerpts":
             return self.reading(list(excerpts(self.questions)), seen=True)
@@ -202,7 +213,9 @@ class Student:
     def stage(self, name: str, progress: Progress) -> Curve:
         """Train a stage, or load its weights if it is done, and return its loss curve.
 
-        The curve is empty for a stage of no sequences.
+        `name` is the stage's, as in `samples`. A point of the curve is the sequences seen, the mean
+        loss, and what is watched; the curve is empty for a stage of no sequences. `progress` is
+        called with the name and each point.
         """
         done = self.work / f"{name}.pt"
         if done.is_file():
@@ -258,8 +271,10 @@ class Student:
     def held_out_facts(self) -> list[dict[str, Any]]:
         """Return for each scenario, as a dict, how the read-out fits labels of held-out layouts.
 
-        It has the KL in nats and the `value` (see `questions.value`), balanced over layouts with
-        and without a danger; the same of always answering the mean label; and the values of drivers
+        Held-out layouts are start situations that are not learnt. A read-out is the probabilities
+        of the letters of actions. It has the KL in nats and the `value`, the mean probability of
+        success (`questions.value`), balanced over layouts with and without a danger (a vehicle that
+        the ego would meet); the same of always answering the mean label; and the values of drivers
         that need no model.
         """
         facts = []

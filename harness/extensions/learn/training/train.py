@@ -52,7 +52,10 @@ KEEP_S = 60.0  # a killed run loses at most so much
 class Sample:
     """Hold one training sequence: token ids of a prompt and its answer, and the answer's target.
 
-    The target is what the model should answer: probabilities of the letters of A actions.
+    The target is what the model should answer, probabilities of the letters of A actions, (A,);
+    None where the answer is a text. The first `shared` tokens are equal in all samples of a `kind`,
+    and are computed once. The answer starts at the index `answer_at` of `ids` (tokens,). `weight`
+    is relative to other samples', and `image` the picture whose tokens are among `ids`.
     """
 
     ids: NDArray[np.int32]  # token ids, (tokens,), the shared beginning included
@@ -70,7 +73,13 @@ class Sample:
 
 @dataclass(frozen=True)
 class Plan:
-    """Describe a training: its length, batch size, learning rates, seed and objective."""
+    """Describe a training: its length, batch size, learning rates, seed and objective.
+
+    `samples` is the number of sequences of each stage, by its name, and `batch` those of a step.
+    `muon_lr` is the learning rate of matrices, `adam_lr` that of embeddings and norms; `adapt`, for
+    a published model, replaces both. `objective` is what a letter's probability is fitted to:
+    `imitation` of soft labels, or the `values` of actions.
+    """
 
     samples: dict[str, int]  # sequences per stage, by name
     batch: int = 16  # sequences a step
@@ -81,7 +90,7 @@ class Plan:
     objective: Objective = "imitation"  # what a letter's probability is fitted to
 
     def settings(self) -> dict[str, Any]:
-        """Return as plain values the settings that a resumed training must not change."""
+        """Return as plain values, by name, settings that a resumed training must not change."""
         settings = asdict(self)
         # trainings that were begun before there was another say nothing
         if self.objective == "imitation":
@@ -104,12 +113,22 @@ def run_stage(
     checkpoint: Path,
     watch: Callable[[], Sequence[float]] = tuple,
 ) -> Curve:
-    """Train `model`, a transformers model, on `count` of `samples`, and return the loss curve.
+    """Train a model for one stage, and return the loss curve.
 
-    Samples are drawn by their weights and the seed of `plan`. `letters` and `digits` are the ids of
-    the tokens that state an action and an image token's class. `checkpoint` is the file of this
-    stage, from which a killed call resumes. Every 50 steps the curve gets the sequences seen, the
-    mean loss since then, and what `watch` returns; `progress` is called with them.
+    Every 50 steps the curve gets a tuple: the sequences seen, the mean loss since then, and what
+    `watch` returns.
+
+    Args:
+        model: a transformers model, trained in place.
+        samples: what is drawn from, by their weights and the seed of `plan`.
+        letters: ids of the tokens that stand for actions.
+        digits: ids of the tokens that state how near the vehicle is which an image token shows.
+        count: number of sequences to train on.
+        plan: batch size, learning rates, seed and objective.
+        progress: called with the numbers of each tuple.
+        checkpoint: file of this stage, from which a killed call resumes.
+        watch: returns further numbers for the curve, such as a loss on questions that are not
+            learnt.
     """
     device = next(model.parameters()).device
     opts, rates = _optimizers(model, plan)
@@ -258,8 +277,9 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
     """Return the training loss of a batch of samples of one `kind`, a scalar tensor.
 
     It is the loss of the read-out beside its target (`fitting`), plus mean cross-entropies of
-    prompt text, answer text and image tokens. `letters` and `digits` are tensors of token ids, as
-    in `run_stage`.
+    prompt text, answer text and image tokens. `letters` and `digits` are tensors of token ids: of
+    the letters of actions, and of the classes that image tokens are to state. `plan` has the
+    objective.
     """
     hidden = hidden_states(model, batch)
     weight, device, shared = model.get_output_embeddings().weight, hidden.device, batch[0].shared
@@ -307,9 +327,10 @@ def loss_of(model: Any, batch: Sequence[Sample], letters: Any, digits: Any, plan
 def fitting(logits: Any, labels: Any, objective: Objective) -> Any:
     """Return the mean loss of letter logits (n, A) beside soft labels (n, A).
 
-    There are n answers and A actions, each with a letter. `imitation` is the KL divergence from the
-    label, in nats. `values` is 1 - sum_a p(a) v(a), where p is the softmax of the logits and v(a)
-    is 1 if the episode succeeds after action a: its gradient is the exact policy gradient.
+    Soft labels are the probabilities of actions to be learnt. There are n answers and A actions,
+    each with a letter. `imitation` is the KL divergence from the label, in nats. `values` is 1 -
+    sum_a p(a) v(a), where p is the softmax of the logits and v(a) is 1 if the episode succeeds
+    after action a: its gradient is the exact policy gradient.
     """
     if objective == "imitation":
         return F.kl_div(F.log_softmax(logits, -1), labels, reduction="batchmean")
