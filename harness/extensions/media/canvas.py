@@ -45,7 +45,9 @@ GAPS_PT = (3.5, 13.0, 23.0, 35.0)  # between a vehicle and its name
 class Canvas:
     """Draw the stills of one episode, the pictures of its video, on one figure.
 
-    Parts that do not change are drawn only once.
+    It is made from the replayed episode, the buildings beside the road, and the ids of the agents
+    (vehicles that decide for themselves), the ego first; call `picture` once a still. Parts that do
+    not change are drawn only once.
     """
 
     def __init__(
@@ -88,10 +90,10 @@ class Canvas:
         self.sides: dict[str, int] = {}
 
     def picture(self, still: Still, seen: dict[str, list[str]], view: View) -> Pixels:
-        """Return the pixels of one still, (height, width, 3).
+        """Return the pixels of one still, (height, width, 3): red, green and blue, 0 to 255.
 
         `seen` has, by viewer, the ids of the vehicles that it saw when the decision began; `view`
-        is the part of the world to show from above.
+        is the part of the world to show from above, in metres.
         """
         viewers = _watched(still.state, seen)
         self._words(still, viewers)

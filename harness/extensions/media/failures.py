@@ -14,10 +14,12 @@ class Failures:
         extras.need("--save-video", "matplotlib")
 
     def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
-        """Draw at most `most` failed episodes of the run's last condition; return the files.
+        """Draw at most `most` failed episodes of a run as videos; return the files.
 
-        Each is drawn with the first seed that failed, to the run's folder `videos`, as .mp4 if that
-        can be written here, else as .gif.
+        `run` is the folder of a closed-loop run. Episodes are those that failed under its last
+        condition (operating point), each with the first channel seed with which it did. Files are
+        written to the run's folder `videos`, as .mp4 if that can be written here, else as .gif. If
+        `quiet`, no progress is shown.
         """
         from harness.evaluate.replay import played
         from harness.extensions.media.video import formats, write_video

@@ -28,7 +28,9 @@ STILLS_HZ = 10  # while no decision is open
 class Turn:
     """Hold the latest decision of one agent, at the time of a still (a picture of a video).
 
-    An agent is a vehicle that decides for itself, such as the ego.
+    An agent is a vehicle that decides for itself, such as the ego. The decision began `since_s`
+    seconds before, and is `open` until the agent acts on it; `outcome` is how the agent's journey
+    ended.
     """
 
     decision: Decision  # the decision, open or taken
@@ -39,7 +41,12 @@ class Turn:
 
 @dataclass(frozen=True)
 class Still:
-    """Hold the state of an episode at the time of one picture of its video."""
+    """Hold the state of an episode at the time of one picture of its video.
+
+    `state` is the world now, `seen` as it was when the last decision began. `turns` has the latest
+    decision of each agent (vehicle that decides for itself), by its id. `outcome` is how the
+    episode ended, empty before, and `danger` the id of the vehicle that a cruising ego would meet.
+    """
 
     state: WorldState  # the state of the world
     seen: WorldState  # the state when the last decision began
@@ -55,10 +62,11 @@ class Still:
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> ReplayedEpisode:
-    """Return one episode of a run's folder to replay; by default, last condition and first seed.
+    """Return one episode of a closed-loop run, with all that replaying it needs.
 
-    Raises UserError if the folder holds no closed-loop run, or has no such episode, condition or
-    seed.
+    `path` is the run's folder and `episode` the episode's number. `condition` names the operating
+    point under which it was driven, None for the run's last; `seed` is that of the channel, None
+    for the first. Raises UserError if the folder holds no closed-loop run, or lacks one of these.
     """
     run = read(path)
     if not isinstance(run.manifest.world, ClosedLoop):
@@ -80,9 +88,10 @@ def find(path: Path, episode: int, condition: str | None, seed: int | None) -> R
 def stills(
     played: ReplayedEpisode, progress: Callable[[int], None] = lambda done: None
 ) -> Iterator[Still]:
-    """Yield the stills of an episode: ten a second, and one each frame while a decision is open.
+    """Yield the stills of an episode: ten a second, and every frame while a decision is open.
 
-    `progress` is called with 1 for each.
+    A decision is open from its beginning until the vehicle acts on it. `progress` is called with 1
+    for each still.
     """
     p = played.scenario.parameters
     world = World.start(played.scenario, played.layout_seed)

@@ -39,6 +39,8 @@ def formats() -> list[str]:
 def write_video(played: ReplayedEpisode, out: Path, progress: Callable[[int], None]) -> None:
     """Draw an episode as a video to a `.gif` or `.mp4` file; `progress` is called with 1 a still.
 
+    `played` is the episode with its decisions, as `stills.find` returns it.
+
     Raises:
         UserError: the file's name ends otherwise, or an .mp4 cannot be written here.
     """

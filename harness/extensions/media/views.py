@@ -12,14 +12,14 @@ EASE = 8  # stills before a decision in which a video turns to its view
 
 
 def views(held: Sequence[Floats], parts: Sequence[int], shape: float = 1.0) -> list[View]:
-    """Return the part of the world that each still of a video shows.
+    """Return the part of the world that each still (picture) of a video shows from above.
 
     The view is fixed through each part of the video, such as a decision, and moves to the next
     one's in the part's last stills.
 
     Args:
-        held: for each still, the places that must be in view: their coordinates in metres, (n, 2).
-        parts: for each still, the number of its part, ascending.
+        held: for each still, the points that must be in view: coordinates in metres, (n, 2).
+        parts: for each still, the number of the part that it is in, ascending.
         shape: height of the view by its width.
     """
     starts = [0, *(n for n, (a, b) in enumerate(pairwise(parts), 1) if a != b), len(parts)]
