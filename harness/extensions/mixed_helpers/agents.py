@@ -17,7 +17,9 @@ from harness.runs.settings import Settings
 class Helpers(RoleAgents):
     """Choose who answers for helpers, where that is another agent than the ego's.
 
-    An agent is a model with a prompt version and an answer mode.
+    An agent is a model with a prompt version and an answer mode. The settings in `chosen_by` name
+    it (`helper_model`, a list by commas, and so on); without any of them, the ego's agent answers
+    for all.
     """
 
     chosen_by = ("helper_model", "helper_prompt", "helper_answer", "helper_thinking")
@@ -88,10 +90,10 @@ HELPERS = Helpers()
 
 @contextmanager
 def named(typed: Mapping[str, object]) -> Iterator[None]:
-    """Enter a context in which a UserError about a helper's setting names its own option.
+    """Enter a context in which a UserError about a helper's setting names the helper's option.
 
-    `typed` has the helper's own values by the ego's option, such as `--answer`; None where the
-    ego's holds.
+    So `--answer` in a message becomes `--helper-answer`. `typed` has the values that the user gave
+    for helpers, by the ego's option, such as `--answer`; None where the ego's value holds.
     """
     try:
         yield

@@ -49,7 +49,11 @@ HALVES = ("ego", "helper")
 
 @dataclass(frozen=True)
 class Factor:
-    """Describe one thing that the grid varies: model, prompt or answer mode, of ego or helpers."""
+    """Describe one thing that the grid varies, such as the helpers' prompt version.
+
+    `half` says whose it is, `ego` or `helper`, and `field` what: `model`, `prompt` or `answer` (the
+    answer mode). `levels` are its values in the grid; effects are measured from the first.
+    """
 
     half: str  # whose it is: `ego` or `helper`
     field: str  # `model`, `prompt` or `answer`
@@ -75,15 +79,18 @@ class Cell:
     def level(self, half: str, field: str) -> str:
         """Return the cell's level of a factor, such as the model's name.
 
-        `half` is `ego` or `helper`, and `field` is `model`, `prompt` or `answer`.
+        A cell is one ego agent with one helper agent. A factor is what the grid varies, and a level
+        one of its values. `half` is `ego` or `helper`, and `field` is `model`, `prompt` or
+        `answer`.
         """
         return level(self.ego if half == "ego" else self.helper, field)
 
     @cached_property
     def values(self) -> Mapping[str, Floats]:
-        """Return success, latency (ms) and tokens of a decision, by metric, each (C, S, E).
+        """Return success (0 to 1), latency (ms) and tokens, by metric, each an array (C, S, E).
 
-        The axes are C conditions, S channel seeds and E episodes; unknown values are NaN.
+        The axes are C conditions (operating points), S channel seeds and E episodes. Latency and
+        tokens are means over an episode's decisions; unknown values are NaN.
         """
         run = self.run
         metrics = [METRICS[SUCCESS], METRICS[LATENCY]]
@@ -93,19 +100,22 @@ class Cell:
         return {**values, "tokens": of_episodes.reshape(run.grid.shape)}
 
     def estimate(self, metric: str, condition: str) -> Estimate:
-        """Return a metric's mean under a condition, with its interval over episodes.
+        """Return a metric's mean under a condition, with its 95 % interval over episodes.
 
-        `metric` is its name as in `values`, and `condition` the operating point's.
+        `metric` is its name as in `values`, and `condition` the name of an operating point of the
+        run.
         """
         return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
 
 
 @dataclass(frozen=True)
 class Effect:
-    """Describe how the headline metric changes with a factor, averaged over all other factors.
+    """Describe how success, the headline metric, changes with a factor, averaged over all others.
 
-    `estimate` is the second level less the first, with its interval, and `p` the corrected p-value
-    of no effect, None without an interval.
+    A factor is what the grid varies, such as the ego's prompt; `what` names it and its two levels.
+    `estimate` is success of the second level less the first, with its interval; for an interaction
+    of two factors half the difference of two such differences. `p` is the corrected p-value of no
+    effect, None without an interval, and `condition` the operating point.
     """
 
     condition: str  # the operating point
@@ -126,9 +136,11 @@ class Effect:
 class Halves:
     """Hold which shares of the variance between cells the choices of ego and helpers explain.
 
-    `together` is the share of their interaction, and `apart` is `ego` less `helpers`. The variance
-    is that of the headline metric over the grid's cells. What the random choice of episodes adds is
-    taken off, as estimated by a bootstrap over episodes, which also makes the intervals.
+    A cell is one ego agent with one helper agent, each a model with a prompt version and an answer
+    mode. `ego` and `helpers` are shares from 0 to 1, `together` is that of their interaction, and
+    `apart` is `ego` less `helpers`. The variance is that of success over the grid's cells. What the
+    random choice of episodes adds is taken off, as estimated by a bootstrap over episodes, which
+    also makes the intervals.
     """
 
     condition: str  # the operating point
@@ -139,9 +151,10 @@ class Halves:
 
 
 def level(agent: Agent, field: str) -> str:
-    """Return an agent's model name, prompt version or answer mode: its level of a factor.
+    """Return an agent's level of a factor: its model name, prompt version or answer mode.
 
-    `field` is `model`, `prompt` or `answer`.
+    A factor is what a grid varies, and a level one of its values. `field` is `model`, `prompt` or
+    `answer`.
     """
     return {"model": agent.card.name, "prompt": agent.prompt.version, "answer": agent.answer}[field]
 
@@ -174,11 +187,18 @@ def run_cells(
     progress: Progress,
     cache_file: Path | None,
 ) -> "Grid":
-    """Run every combination of ego and helper agents, each in a folder of its own under `out`.
+    """Run every combination of ego and helper agents, and return the grid of their runs.
 
-    `spec` has their common settings; an agent is a model with a prompt version and an answer mode.
-    Finished runs there are read. All combinations share answers, and completions are kept between
-    calls in the cache file, if there is one.
+    An agent is a model with a prompt version and an answer mode. Finished runs are read, and all
+    combinations share answers.
+
+    Args:
+        spec: the evaluation whose other settings all have.
+        egos: the agents to answer for the ego.
+        helpers: the agents to answer for helpers.
+        out: the study's folder; each run gets a folder below it.
+        progress: is called with the number of items just done in a run.
+        cache_file: file of stored completions; None for no cache.
 
     Raises:
         UserError: the folder holds another grid, or a model is not available.
@@ -211,7 +231,9 @@ class Grid:
     """Hold all runs of a full factorial design: every ego agent with every helper agent.
 
     An agent is a model with a prompt version and an answer mode; there are `rows` ego agents and
-    `columns` helper agents.
+    `columns` helper agents, and `cells` has their runs row by row. `success_rule` says how success
+    is averaged over episodes, such as balanced over those with a danger (a vehicle that the ego
+    would meet) and without.
     """
 
     cells: tuple[Cell, ...]  # row by row
@@ -241,7 +263,11 @@ class Grid:
         return tuple(factors)
 
     def success(self, cell: Cell, condition: str) -> Estimate:
-        """Return a cell's mean success (the headline metric) under a condition."""
+        """Return a cell's mean success, 0 to 1, under a condition, with its interval over episodes.
+
+        A cell is one ego agent with one helper agent. The condition is the name of an operating
+        point.
+        """
         return self.success_rule.estimate(cell.values[SUCCESS][self.conditions.index(condition)])
 
     def name(self, agent: Agent, half: str) -> str:
@@ -254,7 +280,11 @@ class Grid:
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """Return main effects and two-factor interactions on success, under every condition."""
+        """Return main effects and two-factor interactions on success, under every condition.
+
+        A condition is an operating point by its name. Effects are measured from each factor's first
+        level; p-values are corrected together.
+        """
         effects, p_values = list[Effect](), list[float | None]()
         for condition in self.conditions:
             for name, low, high in (*self._main(condition), *self._interactions(condition)):
@@ -295,8 +325,9 @@ class Grid:
     def halves(self, condition: str) -> Halves | None:
         """Return the shares of variance that ego and helpers explain under a condition.
 
-        None if the condition has no channel, if only one of them varies, or if the cells may all be
-        equal.
+        `condition` is the name of an operating point. The result is None if that has no radio
+        channel, if only one of both varies, or if the cells (an ego agent with a helper agent each)
+        may all be equal.
         """
         at = self.conditions.index(condition)
         if (
@@ -343,7 +374,8 @@ MOST_EFFECTS = 8  # that a terminal shows
 def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
     """Return the study (tables, pictures, sentences) of a grid of ego and helper agents.
 
-    The runs lie in folders under `out`, and all share the settings of the evaluation `spec`.
+    An agent is a model with a prompt version and an answer mode. The runs lie in folders under
+    `out`, and all share the settings of the evaluation `spec`.
     """
     data, episodes = tables(grid), grid.cells[0].run.grid.episodes
     factors = "; ".join(f"{factor.name} ({', '.join(factor.levels)})" for factor in grid.factors)
@@ -410,7 +442,11 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
 
 
 def headline(grid: Grid) -> list[str]:
-    """Return a sentence for each condition: whether the choice of ego or helpers matters more."""
+    """Return a sentence for each condition: whether the choice of ego or helpers matters more.
+
+    `grid` has a run of each ego agent with each helper agent. A condition is an operating point by
+    its name.
+    """
     sentences = []
     for condition in grid.conditions:
         halves = grid.halves(condition)
@@ -447,7 +483,8 @@ def _halves(grid: Grid, h: Halves) -> str:
 def front(grid: Grid, condition: str) -> list[Cell]:
     """Return the Pareto front under a condition: cells that no other beats in success and latency.
 
-    They are sorted by latency, the fastest first.
+    A cell is one ego agent with one helper agent, and the condition the name of an operating point.
+    The cells are sorted by latency, the fastest first.
     """
 
     def success(cell: Cell) -> float:
@@ -464,7 +501,11 @@ def front(grid: Grid, condition: str) -> list[Cell]:
 
 
 def pair(grid: Grid, cell: Cell) -> str:
-    """Return a cell's name: its ego's and its helpers' agent, by the factors that vary."""
+    """Return a cell's name, such as `model-a + model-b`: its ego's and its helpers' agent.
+
+    A cell is one ego agent with one helper agent. Both are named by what varies in the grid, or by
+    their model.
+    """
     return f"{grid.name(cell.ego, 'ego')} + {grid.name(cell.helper, 'helper')}"
 
 
@@ -512,7 +553,11 @@ def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
 
 
 def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
-    """Return the tables `cells` and `effects`, with an estimate and its interval in each row."""
+    """Return the data frames `cells` and `effects`, by these names, to write as files.
+
+    `cells` has a row for each condition (operating point), metric, ego's and helpers' model,
+    `effects` one for each effect; each row has an estimate and the ends of its interval.
+    """
     import pandas as pd
 
     def row(cell: Cell, condition: str, metric: str, estimate: Estimate) -> dict[str, Any]:
