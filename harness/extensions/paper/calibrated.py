@@ -51,8 +51,11 @@ TIES = "first"  # no two actions that these intents lead to are alike
 class Parameters:
     """Hold the parameters of the calibrated proxy, which draws intents in place of a model.
 
-    They are shares of episodes, entropies in nats and a time in seconds, computed by `fit.py` from
-    numbers of the paper; none depends on a panel or a grid point.
+    An intent is a vehicle's probabilities of the ego's actions. `..._share` is the share of
+    episodes whose danger the first or second helper sees; `guess_right` and `know_right` are shares
+    of episodes in which an ego that does not see the danger, or does, intends rightly; `..._nats`
+    are entropies of intents, and `inference_s` is the seconds of one inference. All are computed by
+    `fit.py` from numbers of the paper; none depends on what the paper's study varies.
     """
 
     # share of episodes whose danger comes from the approach that the nearest helper watches
@@ -142,8 +145,10 @@ def _below(parts: Sequence[_Drawn]) -> _Drawn:
 class CalibratedWorld:
     """Play drawn episodes as a world: the decision points of one step for all episodes at once.
 
-    An ego that has fused the message of the witness (the helper that sees the danger) knows of the
-    danger from its next decision on. The last decision of an episode decides its success.
+    Episodes of all channel seeds are in one row, the first seed's first, and a decision point is an
+    episode's index in it. An ego that has fused the message of the witness (the helper that sees
+    the danger) knows of the danger from its next decision on. The last decision of an episode
+    decides its success.
     """
 
     def __init__(self, steps: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
@@ -155,7 +160,7 @@ class CalibratedWorld:
         self.success: Bools = self._knows
 
     def observe(self) -> Sequence[int]:
-        """Begin the next step; return the episodes' indices, none after the last step."""
+        """Begin the next step; return the indices of all episodes, none after the last step."""
         self._step += 1
         if self._step == STEPS:
             return ()
@@ -171,13 +176,19 @@ class CalibratedWorld:
         return replace(self._now.intents, own=ego_intents)
 
     def others(self, *_: Any, **__: Any) -> Any:
-        """Raise NotImplementedError: all intents are drawn, so no model can be asked."""
+        """Raise NotImplementedError: all intents are drawn, so no model can be asked.
+
+        An intent is a vehicle's probabilities of actions.
+        """
         raise NotImplementedError
 
     helpers = fusion_call = call_of_agents = others
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return the decisions of this step, one in every episode, with the channel's draws."""
+        """Return the decisions of this step, one in every episode, with the channel's draws.
+
+        The draws are random numbers, the same for every operating point `point`.
+        """
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
     def outlook(self, *_: Any) -> None:
@@ -186,7 +197,11 @@ class CalibratedWorld:
     site = claims = plans = listed = outlook
 
     def step(self, decided: Sequence[Decided[int]]) -> None:
-        """Update which egos know of the danger, and whether each episode's last action is right."""
+        """Update which egos know of the danger, and whether each episode's last action is right.
+
+        The danger is the vehicle that a cruising ego would meet. `decided` has the one batch of
+        this step's decisions, of all episodes.
+        """
         [part] = decided
         self._knows = self._knows | any_of(part.result.on_time & self._now.witness)
         self.success = part.result.action == self._now.right
@@ -195,11 +210,15 @@ class CalibratedWorld:
 class Calibrated:
     """Play operating points with the calibrated proxy, as a source of results for studies.
 
-    The proxy stands for a model: it draws intents by parameters fitted to numbers of the paper.
+    An operating point is everything a decision depends on besides scene and model. The proxy stands
+    for a model: it draws intents (probabilities of actions) by parameters fitted to numbers of the
+    paper.
 
     Attributes:
         name: what reports call it.
         same_episodes: false, since each seed has episodes of its own.
+        episodes: number of episodes of each seed.
+        parameters: what intents are drawn by.
     """
 
     name = "calibrated proxy"
@@ -226,7 +245,11 @@ class Calibrated:
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int]
     ) -> Iterator[Iterable[WalkResult]]:
-        """Yield each setting's results of all seeds, in parts of at most `CHUNK` episodes."""
+        """Yield the results of each grid point with all channel seeds, in parts of some episodes.
+
+        A grid point is an operating point with a number of vehicles; a part has at most `CHUNK`
+        episodes of each seed.
+        """
         most = max((setting.vehicles for setting in settings), default=1) - 1
         for setting in settings:
             yield self._walked(setting, most, seeds)
@@ -301,8 +324,9 @@ class Calibrated:
 def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
     """Return uniform draws in [0, 1), (n,), stratified within each of the `kinds`, (n,).
 
-    `kinds` has the kind of each of n rows. Of the k rows of one kind, each k-th of [0, 1) has one.
-    One such column for each dimension is a Latin hypercube (McKay, Beckman and Conover 1979).
+    `kinds` has the kind of each of n rows, as whole numbers. Of the k rows of one kind, each of the
+    k equal parts of [0, 1) has one. One such column for each dimension is a Latin hypercube (McKay,
+    Beckman and Conover 1979).
     """
     # a kind's rows together, in random order
     order = np.lexsort((generator.random(len(kinds)), kinds))
@@ -316,8 +340,8 @@ def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
 def peaked(nats: Floats, top: Ints) -> Floats:
     """Return intents `(..., A)` of given entropies `nats`, with the most on the action `top`.
 
-    Both are `(...)`, and A is the number of actions. The rest is shared evenly by the other
-    actions.
+    An intent is a vehicle's probabilities of A actions. `nats` and `top`, the index of an action,
+    are `(...)`. The rest is shared evenly by the other actions.
     """
     entropies, shares = _by_entropy()
     most = np.interp(nats, entropies, shares)[..., None]
@@ -336,7 +360,8 @@ def _by_entropy() -> tuple[Floats, Floats]:
 def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
     """Return normal draws with mean `mean` and standard deviation `sd`, by quantiles of `uniforms`.
 
-    The distribution is cut at `CUT` standard deviations on either side.
+    `uniforms` are draws in [0, 1), `(...)`, as is the result. The distribution is cut at `CUT`
+    standard deviations on either side.
     """
     from harness.core.special import ndtr, ndtri
 

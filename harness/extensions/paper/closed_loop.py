@@ -34,9 +34,11 @@ RUN = "run"  # the live run's folder
 
 
 def panels() -> dict[str, list[Setting]]:
-    """Return the grid points of the paper's panels, by panel, for runs in closed loop.
+    """Return the grid points of the paper's panels, by panel, to drive in closed loop.
 
-    Each is a condition named by what it changes; the panel `size` has density-coupled loss.
+    A panel is a set of operating points that are shown together: the paper's, by number of vehicles
+    (`size`), packet loss or tau, the entropy above which the ego asks. Each is named by what it
+    changes; in `size`, loss grows with the density of vehicles.
     """
 
     def setting(panel: str, value: Value, vehicles: int, changes: str) -> Setting:
@@ -60,8 +62,10 @@ def run_closed_loop(
 ) -> Study:
     """Drive all grid points of `panels` as conditions of one run, and return the study.
 
-    A study that was stopped in `out` continues; the run lies in `out/run`. `progress` is called
-    with the number of layouts just driven under all conditions.
+    A grid point is an operating point of a panel of the paper. `spec` has the model and all
+    settings but conditions. A study that was stopped in `out` continues; the run lies in `out/run`.
+    `progress` is called with the number of layouts (start situations) just driven under all
+    conditions. `cache` is the file of stored completions, None for none.
     """
     if (out / RUN / "run.json").is_file():
         stored = finished_run(spec, out / RUN)

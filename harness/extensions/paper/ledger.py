@@ -40,12 +40,14 @@ ASSUMED = {
 def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
     """Compare each number of the paper with ours: a table with a row for each.
 
-    `summary` has our results, as `studies.play` makes it. Columns: `id`, `panel`, `condition`,
-    `variable`, `value`, `metric`, `unit`, `paper_low`, `paper_high`, `ours`, `ci_low`, `ci_high`,
-    `difference` (to the nearest end of the paper's range), `allowed`, `verdict`, `kind` (`fitted`,
-    `predicted` or `cited`) and `assumed`. Where the paper gives a range over grid points, ours is
-    one row a grid point. A verdict is `within` where the difference is allowed, `unclear` where it
-    is not but the interval reaches what is, `misses` where it does not, or `cited`.
+    `summary` has our results, a row for each panel, grid point and metric, as `studies.play` makes
+    it. A panel is a set of operating points that the paper shows together, a condition one by its
+    name. Columns: `id`, `panel`, `condition`, `variable` (what is varied), `value` (of it),
+    `metric`, `unit`, `paper_low`, `paper_high`, `ours`, `ci_low`, `ci_high`, `difference` (to the
+    nearest end of the paper's range), `allowed`, `verdict`, `kind` (`fitted`, `predicted` or
+    `cited`) and `assumed`. Where the paper gives a range over grid points, ours is one row a grid
+    point. A verdict is `within` where the difference is allowed, `unclear` where it is not but the
+    interval reaches what is, `misses` where it does not, or `cited`.
     """
     import pandas as pd
 
@@ -83,9 +85,11 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: float) -> str:
-    """Return `within`, `misses` or `unclear` for a mean of which `least` to `most` is allowed.
+    """Return `within`, `misses` or `unclear` for one of our numbers beside the paper's.
 
-    It is `unclear` if the mean is not allowed, but its interval reaches what is, or is unknown.
+    `mean` is ours, with the ends `ci_low` and `ci_high` of its interval, NaN if unknown; from
+    `least` to `most` is allowed. It is `unclear` if the mean is not allowed, but its interval
+    reaches what is, or is unknown.
     """
     if least <= mean <= most:
         return "within"
@@ -119,8 +123,9 @@ def _our_rows(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> l
 def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
     """Return the paper's values to draw in figures, a row a grid point, by our names.
 
-    Columns: `panel`, `condition`, `value`, `metric`, `low` and `high`, which are in the unit of the
-    ledger and equal where the paper gives one value.
+    `ledger` is the table that the function `ledger` returns. Columns: `panel`, `condition`
+    (operating point), `value` (of what is varied), `metric`, `low` and `high`, which are in the
+    unit of the ledger and equal where the paper gives one value.
     """
     ran = ledger[ledger.kind != "cited"]
     our_metrics = {paper_name: our_name for paper_name, (our_name, *_) in METRICS.items()}
@@ -130,9 +135,10 @@ def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:
-    """Count the numbers of the paper that can be played.
+    """Count the numbers of the paper that can be played, by how they compare with ours.
 
-    The keys are `total`, the verdicts `within`, `unclear` and `misses`, and `predicted`.
+    `ledger` is the table that the function `ledger` returns. The keys are `total`, the verdicts
+    `within`, `unclear` and `misses`, and `predicted`: those on which no parameter was fitted.
     """
     ran = ledger[ledger.kind != "cited"]
     total, misses = set(ran.id), set(ran[ran.verdict == "misses"].id)
@@ -149,8 +155,8 @@ def tally(ledger: "pd.DataFrame") -> dict[str, int]:
 def headline(ledger: "pd.DataFrame") -> list[str]:
     """Return sentences on how many of the paper's numbers lie within the aim, and which do not.
 
-    `ledger` is the table of the function of this name, with a row for each number: its difference
-    to ours, the aim for that, and the verdict.
+    `ledger` is the table that the function `ledger` returns, with a row for each number: its
+    difference to ours, the aim for that, and the verdict.
     """
     counts = tally(ledger)
     sentences = [
@@ -169,7 +175,10 @@ def headline(ledger: "pd.DataFrame") -> list[str]:
 
 
 def tables(ledger: "pd.DataFrame") -> list[Table]:
-    """Return a table of the numbers that the proxy plays, and one of those that are only cited."""
+    """Return two tables to show: the numbers that the proxy plays, and those that are only cited.
+
+    `ledger` is the table that the function `ledger` returns.
+    """
     played, cited = list[Sequence[str]](), list[Sequence[str]]()
     for row in ledger.to_dict("records"):
         low, high = row["paper_low"], row["paper_high"]
