@@ -20,10 +20,12 @@ from harness.core.arrays import Floats
 class Precedence:
     """Decide by precedence: an agent waits for a near one of lower rank that plans to go on.
 
-    It is a consensus rule for agents, vehicles that each decide for themselves. To wait is to take
-    action 0, the most careful one; else the agent acts by its own intent, its probabilities of
-    actions. An agent that itself plans action 0, stands, or has passed the conflict (where paths
-    meet) makes nobody wait. Equal ranks go by the vehicles' numbers in the world.
+    It is a consensus rule, by which messages make a policy, for agents, vehicles that each decide
+    for themselves. To wait is to take action 0, the most careful one; else the agent acts by its
+    own intent, its probabilities of actions. `rank` returns the rank of the agent and of its H
+    helpers, `(..., 1+H)`, from their plans. Two are near if they reach the conflict (where paths
+    meet) less than `apart_s` seconds apart. An agent that itself plans action 0, stands, or has
+    passed the conflict makes nobody wait. Equal ranks go by the vehicles' numbers in the world.
     """
 
     # returns the rank of the agent and of its H helpers, `(..., 1+H)`; the lowest goes first
@@ -35,13 +37,20 @@ class Precedence:
     by_distance: ClassVar[bool] = False
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`."""
+        """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`.
+
+        The rule fuses messages and remembers none. `batch` is the shape of the decisions, and
+        `helpers` and `actions` are numbers of them, not read.
+        """
         return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return each agent's own intent, or certainty of action 0 where it waits; weights are NaN.
+        """Return each agent's policy: its own intent, or certainty of action 0 where it waits.
 
-        Raises ValueError if `messages.plans` is None.
+        An intent is probabilities of A actions. `messages` has those of the agent (a vehicle that
+        decides) and of H helpers, `(..., 1+H, A)`, whom it heard, and their plans. Weights of
+        helpers are NaN; `state`, the rule's memory, is returned as it is. Raises ValueError if
+        `messages.plans` is None.
         """
         if (plans := messages.plans) is None:
             raise ValueError("a rule that reads plans needs them")
