@@ -31,10 +31,10 @@ def begin_per_s(busy: Floats | float, packet_s: float) -> Floats | float:
 def free_share(busy: Floats | float, packet_s: float, aifs_s: float) -> Floats:
     """Return the share of time in which a vehicle that hears this busy ratio may begin to send.
 
-    `busy` is the share of time in which the medium is sensed as busy, and `packet_s` a packet's
-    time on air, s. It is the idle time without the first `aifs_s` seconds of each gap, for which
-    the medium must be idle (AIFS); the lengths of gaps are assumed to be exponential. The shape is
-    that of `busy`.
+    `busy` is the share of time, from 0 to below 1, in which the medium is sensed as busy; the
+    result has its shape. `packet_s` is a packet's time on air, s. It is the idle time without the
+    first `aifs_s` seconds of each gap, for which the medium must be idle (AIFS); the lengths of
+    gaps are assumed to be exponential.
     """
     return (1 - np.asarray(busy)) * np.exp(-aifs_s * begin_per_s(busy, packet_s))
 
@@ -65,9 +65,10 @@ def _idle_s(needed_s: float, per_s: float, cost_s: float) -> float:
 def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Floats, Floats]:
     """Return the distribution of the access delay: n probabilities, (n,), and n delays in s, (n,).
 
-    The access delay is the time from the wish to send until the medium is taken. With each
-    probability it is no longer than the delay at the same index. The arguments are those of
-    `mean_access_s`, its mean.
+    The access delay is the time from the wish to send until the medium is taken; with each
+    probability it is no longer than the delay at the same index. `busy` is the share of time in
+    which the medium is sensed as busy, `packet_s` a packet's time on air, `aifs_s` the time that
+    the medium must be idle first, s, and `window` the longest back-off, in slots.
     """
     packet, aifs, slot = (round(s / TICK_S) for s in (packet_s, aifs_s, SLOT_S))
     starts = -math.expm1(-float(begin_per_s(busy, packet_s)) * TICK_S)  # in a tick of idle time
@@ -92,15 +93,15 @@ def access(busy: float, packet_s: float, aifs_s: float, window: int) -> tuple[Fl
 def same_slot(
     per_slot: float, packet_slots: float, aifs_slots: float, window: int
 ) -> tuple[float, float]:
-    """Return the share of packets that collide in their first slot if all hear all, and busy ratio.
+    """Return the share of packets that begin in one slot with another, and the busy ratio.
 
-    Vehicles that want to send while the medium is busy end their back-off soon after it, so packets
-    collide more often than if they began at random. The model follows the mean number of vehicles
-    with each back-off count, slot by slot from one busy period to the next. Numbers are assumed to
-    be Poisson; the vehicles that a busy period leaves waiting are a fixed point. `per_slot` counts
-    the packets of all vehicles that arrive in a slot. `packet_slots` and `aifs_slots` are the time
-    on air and the idle time before a back-off counts down, in slots; back-off is uniform from 0 to
-    `window` slots.
+    It is for vehicles that all hear each other. Those that want to send while the medium is busy
+    end their back-off soon after it, so packets collide more often than if they began at random.
+    The model follows the mean number of vehicles with each back-off count, slot by slot from one
+    busy period to the next. Numbers are assumed to be Poisson; the vehicles that a busy period
+    leaves waiting are a fixed point. `per_slot` counts the packets of all vehicles that arrive in a
+    slot. `packet_slots` and `aifs_slots` are the time on air and the idle time before a back-off
+    counts down, in slots; back-off is uniform from 0 to `window` slots.
     """
     counts = window + 1
     slot, count = np.arange(counts + 1)[:, None], np.arange(counts)
@@ -124,8 +125,10 @@ def same_slot(
 def crowding(busy: float, packet_s: float, aifs_s: float, window: int) -> float:
     """Return how many times as often packets begin in one slot as if they began at random.
 
-    It is for vehicles which all hear each other and together cause this busy ratio; above
-    `SATURATED` it is constant. The arguments are those of `mean_access_s`.
+    It is for vehicles which all hear each other and together cause the busy ratio `busy`, the share
+    of time in which the medium is sensed as busy; above `SATURATED` it is constant. `packet_s` is a
+    packet's time on air, `aifs_s` the time that the medium must be idle first, s, and `window` the
+    longest back-off, in slots.
     """
     packet_slots = packet_s / SLOT_S
     per_slot = min(busy, SATURATED) / packet_slots

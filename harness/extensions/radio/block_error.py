@@ -27,11 +27,12 @@ BlockError = Callable[[Floats], Floats]
 
 @cache
 def block_error(curve: str) -> BlockError:
-    """Return a published curve by its name, such as `11p-goubet`: a function of the SINR.
+    """Return a published curve by its name, such as `11p-goubet`: the loss of blocks by their SINR.
 
-    It takes signal-to-interference-and-noise ratios in dB and returns the probabilities that a
-    block is lost, of the same shape. Points are interpolated linearly, and the end values hold
-    beyond them. Raises UserError for an unknown name.
+    A block is what is coded and sent as one. The curve takes an array of
+    signal-to-interference-and-noise ratios in dB and returns the probabilities, of the same shape,
+    that a block is lost. Points are interpolated linearly, and the end values hold beyond them.
+    Raises UserError for an unknown name.
     """
     points = [row for row in _rows("block_error_points.csv") if row["curve"] == curve]
     if points:

@@ -26,9 +26,10 @@ def reception(
     Reception is the share of messages received, in line of sight and behind obstacles.
 
     Args:
-        name: the condition's name, the picture's title.
-        channel: the radio.
-        messages: how its messages were received, simulated in line of sight, by distance.
+        name: name of the radio, the picture's title.
+        channel: the radio, whose own curves are drawn.
+        messages: how its messages were received in a simulation in line of sight, one item for each
+            distance.
         against: published curves, each with the radio's reception at the same distances.
     """
     distances_m = np.linspace(1, messages[-1].distance_m, 250)

@@ -61,7 +61,8 @@ class Hazards(NamedTuple):
     """Hold the mean number of others' packets that spoil one, by its distance and received power.
 
     Both tables are (D, P): D distances from sender to receiver in steps of `STEP_M`, and P received
-    powers in steps of `STEP_DB`.
+    powers in steps of `STEP_DB`. `before` counts packets that began no later than the one, and
+    `during` later ones for each second that it is on air.
     """
 
     # packets that began earlier or at the same time and that the receiver is locked to, or that
@@ -74,9 +75,12 @@ class Hazards(NamedTuple):
 class ItsG5(Transceiver):
     """Model 802.11p (ITS-G5) under background traffic of packets of one size and rate.
 
-    Vehicles listen before they send, and wait a random number of slots (the back-off) once the
-    medium is idle. It is the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022); fields are
-    its settings, with those of `Transceiver` and `Propagation`.
+    Background traffic is other vehicles' packets. Vehicles listen before they send, and wait a
+    random number of slots (the back-off, up to `contention_window`) once the medium has been idle
+    for `aifs_slots`. It is the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022). Fields
+    are its settings, with those of `Transceiver` and `Propagation`: `sensing_dbm` is the least
+    power at which a packet is sensed, and `curve` names the loss of frames by their SINR
+    (`block_error`).
     """
 
     # carrier frequency, here the control channel's
@@ -123,9 +127,9 @@ class ItsG5(Transceiver):
         return SIFS_S + self.aifs_slots * SLOT_S
 
     def airtime_s(self, size_bytes: Floats | float) -> Floats:
-        """Return the time on air of frames of `size_bytes`, headers included, s, of its shape.
+        """Return the time on air of frames of `size_bytes`, headers included, s, of the same shape.
 
-        It is by IEEE 802.11-2012, 18.4.3.
+        It follows from the data rate, by IEEE 802.11-2012, 18.4.3.
         """
         bits_per_symbol = self.data_rate_mbps * 1e6 * SYMBOL_S
         symbols = np.ceil((8 * np.asarray(size_bytes) + SERVICE_AND_TAIL_BITS) / bits_per_symbol)
@@ -144,10 +148,11 @@ class ItsG5(Transceiver):
         return self.airtime_s(np.ceil(np.asarray(bits) / 8) + self.header_bytes)
 
     def busy_ratio(self) -> float:
-        """Return the channel busy ratio by a fit to simulations (Sepulcre et al., equation 35).
+        """Return the channel busy ratio, the share of time in which the medium is sensed as busy.
 
-        It is a parabola of the load (34), fitted up to 1.3; beyond its maximum, 0.84 at a load of
-        1.84, it stays constant.
+        It is by a fit to simulations (Sepulcre et al., equation 35), a parabola of the load of
+        background traffic (34), fitted up to 1.3; beyond its maximum, 0.84 at a load of 1.84, it
+        stays constant.
         """
         sensed_m = 2 * float(_sensed(self, np.arange(0.5, SENSED_M)).sum())
         load = min(
@@ -165,9 +170,9 @@ class ItsG5(Transceiver):
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the packet reception ratio, the share of packets received, at n distances, (n,).
 
-        `distance_m` is `(n,)`. It is that of background packets, averaged over shadowing; without
-        `sight` (what stands between, such as `CLEAR`) also over clear and blocked links by the
-        environment's shares.
+        `distance_m` (n,) is in metres, and packets are those of background traffic. It is averaged
+        over shadowing; without `sight` (what stands between, such as `CLEAR`) also over clear and
+        blocked links by the environment's shares.
         """
         shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         distance_m = np.asarray(distance_m, dtype=float)[:, None]

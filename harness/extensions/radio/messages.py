@@ -51,11 +51,12 @@ LENGTHS = {"open": (0, 128), "opaque": (0, 128, 256)}
 
 
 class Counts(NamedTuple):
-    """Hold how much a message lists; numbers or arrays, which broadcast.
+    """Hold how much a message lists: numbers, or arrays that broadcast against each other.
 
-    A message uses those that apply to it. CAM and BSM are beacons, CPM and SDSM lists of objects
-    that a vehicle sees, each by ETSI and by SAE; an intent states probabilities of actions, and a
-    request asks helpers for theirs.
+    A message uses those that apply to it. CAM and BSM are beacons, CPM and SDSM lists of `objects`
+    that a vehicle sees, with `optional` members or without, each by ETSI and by SAE. An intent
+    states the probabilities of so many `actions`, with `text_bytes` of words, and a request asks so
+    many `helpers` for theirs. `points` are those of the path behind, in a beacon.
     """
 
     objects: Count = 0  # listed in a CPM or SDSM
@@ -69,7 +70,12 @@ class Counts(NamedTuple):
 
 
 class Member(NamedTuple):
-    """Hold a row of `messages.csv`: a member (field) of a message by its standard, and its bits."""
+    """Hold a row of `messages.csv`: a member (field) of a message by its standard, and its bits.
+
+    The `member` is one of the message or sequence `type`, may have the `values`, and takes `bits`,
+    None if that follows from its type. There is one for `each` of what this names, such as a field
+    of `Counts`; empty if there is one in all. `source` is where the standard defines it.
+    """
 
     type: str  # the message or sequence that it is a member of
     member: str  # name of the member
@@ -82,7 +88,12 @@ class Member(NamedTuple):
 
 
 class Share(NamedTuple):
-    """Hold the bits of a member (field) in a message, all its occurrences together."""
+    """Hold the bits of a member (field) in a message, all its occurrences together.
+
+    `path` has the names of the member and of those that it is in, the outermost first. `bits` is an
+    array if a number in `Counts`, on which it depends, is one. `source` is where the standard
+    defines it.
+    """
 
     path: tuple[str, ...]  # names of the member and of those that it is in, the outermost first
     bits: Floats  # their sum; an array where a count that it depends on is one
@@ -90,7 +101,12 @@ class Share(NamedTuple):
 
 
 class Size(NamedTuple):
-    """Hold the sizes of a message in bits: arrays where a count that it depends on is one."""
+    """Hold the sizes of a message in bits: arrays where a count that it depends on is one.
+
+    `message` is the message alone, `envelope` its signature and the digest of the sender's
+    certificate, `headers` those of network and transport, and `packet` all three;
+    `with_certificate` is the packet with the whole certificate.
+    """
 
     message: Floats  # the message alone
     envelope: Floats  # its signed envelope, with the digest of the sender's certificate
@@ -101,9 +117,9 @@ class Size(NamedTuple):
 
 @cache
 def table() -> Mapping[str, tuple[Member, ...]]:
-    """Return the rows of `messages.csv`: the members of each message or sequence type, by its name.
+    """Return the rows of `messages.csv`: the members (fields) of each message or sequence type.
 
-    They are in the order of the file.
+    The key is the type's name, such as `CAM`; members are in the order of the file.
     """
     members: dict[str, tuple[Member, ...]] = {}
     for row in csv.DictReader(text_of(Path(__file__).with_name("messages.csv")).splitlines()):
@@ -129,9 +145,9 @@ def message_bits(name: str, content: Counts) -> Floats:
 
 
 def shares(name: str, content: Counts) -> list[Share]:
-    """Return the bits of each member of a message; the last entry is the padding to an octet.
+    """Return the bits of each member (field) of a message; the last entry is the padding.
 
-    `name` is one of `NAMES`, such as CPM, and `content` what it lists.
+    `name` is one of `NAMES`, such as CPM, and `content` says how much it lists, such as objects.
     """
     counts = {**content._asdict(), "path": np.asarray(content.points) > 0}
     members = list(_shares(name, counts, 1.0, ()))
@@ -143,7 +159,12 @@ def packet_bits(
 ) -> Floats:
     """Return the size of a message of so many bits with envelope and headers, bits; 0 stays 0.
 
-    `name` is one of `NAMES`, such as CPM; the other arguments are those of `wraps`.
+    Args:
+        name: a message of `NAMES`, such as CPM.
+        bits: size of the message alone, a number or `(...)`, as is the result.
+        since_certificate_s: seconds since the sender's last message with its whole certificate, by
+            which this one has it or only its digest.
+        headers: whether the headers of network and transport count.
     """
     bits = np.asarray(bits, dtype=float)
     return np.where(bits > 0, bits + _total(wraps(name, bits, since_certificate_s, headers)), 0.0)
@@ -152,11 +173,13 @@ def packet_bits(
 def wraps(
     name: str, bits: Floats | float, since_certificate_s: Floats | float = 0.0, headers: bool = True
 ) -> list[Share]:
-    """Return what a message's signed envelope takes, and the headers of network and transport.
+    """Return the bits of each member of a message's signed envelope, and of its headers.
+
+    The headers are those of network and transport.
 
     Args:
-        name: a message of `NAMES`.
-        bits: its bits.
+        name: a message of `NAMES`, such as CPM.
+        bits: the size of the message alone.
         since_certificate_s: seconds since the sender's last message with its certificate. From
             `CERTIFICATE_EVERY_S` on this one has it, else the certificate's digest.
         headers: whether those of GeoNetworking and BTP-B, or of WSMP, count. Those of the radio
@@ -205,9 +228,10 @@ def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
 
 @dataclass(frozen=True)
 class Standard:
-    """Compute the sizes of a standard's messages; see `harness.coordination.encodings.Encoding`.
+    """Compute the sizes of messages by a standard, ETSI's or SAE's, for radios that send them.
 
-    A condition has it by its setting `encoding`.
+    It is a `harness.coordination.encodings.Encoding`, which an operating point names by its setting
+    `encoding`.
     """
 
     encoding: Encoding  # the standard's name

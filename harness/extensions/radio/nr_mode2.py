@@ -44,9 +44,11 @@ CURVES = {7: "nr-mcs7-100B-urban-nlos", 21: "nr-mcs21-1500B-urban-nlos"}
 class NrMode2(Sidelink):
     """Model NR-V2X Mode 2 in one resource pool, where vehicles choose resources by sensing.
 
-    A resource is one or more sub-channels, each some resource blocks (of frequency) wide, in one
-    slot: what one packet takes. Fields are settings, with those of `Sidelink`, `Transceiver` and
-    `Propagation`.
+    A resource is one or more sub-channels, each `subchannel_blocks` resource blocks (of frequency)
+    wide, in one slot: what one packet takes. Fields are settings, with those of `Sidelink`,
+    `Transceiver` and `Propagation`. A packet may be sent from slot `t1_slots` to `t2_slots` after
+    it is ready; `numerology` 0, 1 or 2 has slots of 1, 0.5 or 0.25 ms, `mcs` is the modulation and
+    coding, and `efficiency` the share of Shannon's bound that codings without a curve reach.
     """
 
     # law of links without a building between; see `Propagation`
@@ -93,7 +95,10 @@ class NrMode2(Sidelink):
 
     @property
     def block_bits(self) -> int:
-        """Return the bits that fit into the sub-channels of a background packet."""
+        """Return the bits that fit into the sub-channels of a background packet.
+
+        A sub-channel is a band of frequency; background packets are those of other vehicles.
+        """
         return int(self._subchannels * self._subchannel_bits)
 
     @property

@@ -28,7 +28,10 @@ class Propagation:
     """Define how strongly signals are received: path loss, blockage, shadowing.
 
     Blockage is the further loss behind a vehicle, and shadowing the slow change of power by what
-    stands around. Fields are settings of a radio.
+    stands around. Fields are settings of a radio: `environment` names the laws of path loss,
+    `antenna_m` is the height of every antenna, `environment_height_m` what is taken off it, and
+    `blocker_m` the height of a blocking vehicle. Round a corner, `street_m` is the width of the
+    receiver's street, `wall_m` the sender's distance from its wall, and `suburban` a further loss.
     """
 
     # law of links without a building between, with its LOS probabilities and decorrelation
@@ -58,13 +61,15 @@ class Propagation:
     ) -> Floats:
         """Return the mean path loss `(...)` of links, dB, blockage by a vehicle included.
 
+        Path loss is how much weaker a signal is received than sent.
+
         Args:
-            distance_m: distance between the ends, `(...)`.
+            distance_m: distance between the ends, m, `(...)`.
             sight: what stands between: `CLEAR`, `VEHICLE` or `BUILDING`, `(...)`.
-            blocker_m: height of a vehicle between; None for the model's own.
-            corner_m: distances of both ends to the crossing's centre, `(..., 2)`; NaN if a building
-                between is not at a corner, for which the NLOS law of TR 37.885 holds.
-            first_m: height of one antenna, if it is not `antenna_m`.
+            blocker_m: height of a vehicle between, m; None for the setting of that name.
+            corner_m: distances of both ends to the crossing's centre, m, `(..., 2)`; NaN if a
+                building between is not at a corner, for which the NLOS law of TR 37.885 holds.
+            first_m: height of one antenna, m, if it is not `antenna_m`.
         """
         distance_m = np.maximum(distance_m, NEAREST_M)
         clear_db = self.clear_db(distance_m, first_m)
@@ -155,9 +160,12 @@ class Propagation:
     ) -> Floats:
         """Return the standard deviation `(...)` of shadowing and blockage together, dB.
 
-        It is 3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4 dB behind
-        a building (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB round a
-        corner (Mangel et al.). The arguments are those of `path_loss_db`.
+        Shadowing is the slow change of received power by what stands around; blockage is a vehicle
+        between. It is 3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4
+        dB behind a building (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB
+        round a corner (Mangel et al.). `sight`, `(...)`, is what stands between, such as `CLEAR`,
+        `blocker_m` the height of a vehicle there, `corner_m`, `(..., 2)`, both distances to a
+        crossing and `first_m` one antenna's height, m, as in `path_loss_db`.
         """
         behind: Floats | float = 4.0
         if corner_m is not None:
@@ -180,7 +188,8 @@ class Propagation:
     def clear_probability(self, distance_m: Floats) -> Floats:
         """Return the share of links of these lengths, m, that no vehicle blocks, without buildings.
 
-        It is that of TR 37.885, table 6.2-1. In `winner-b1` no link is blocked.
+        `distance_m` is `(...)`, as is the result. It is that of TR 37.885, table 6.2-1. In
+        `winner-b1` no link is blocked.
         """
         if self.environment == "winner-b1":
             return np.ones_like(distance_m)
@@ -218,9 +227,9 @@ def winner_b1_db(distance_m: Floats, frequency_ghz: float, effective_m: float) -
 
 
 def nlos_db(distance_m: Floats, frequency_ghz: float) -> Floats:
-    """Return the path loss behind a building at distances `(...)`, dB, `(...)`.
+    """Return the path loss behind a building at distances in m, `(...)`, dB, `(...)`.
 
-    It is that of TR 37.885, table 6.2.1-1.
+    It is that of TR 37.885, table 6.2.1-1, for the carrier frequency `frequency_ghz`.
     """
     return 36.85 + 30 * np.log10(distance_m) + 18.9 * math.log10(frequency_ghz)
 

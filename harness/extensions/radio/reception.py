@@ -36,7 +36,10 @@ COLUMNS = ("distance_m", "reception", "configuration", "source")  # of somebody 
 class Drawn:
     """Hold how messages of a channel, simulated at one distance, were received.
 
-    The ego sends a request, and a helper replies; each is one transmission.
+    The ego sends a request, and a helper replies; each is one transmission. `model` is the share of
+    transmissions that succeed by the channel's own curve and `crossing` the simulated one;
+    `round_trip` is the share of requests that come back answered, after `delay_s` seconds in the
+    mean for helpers that have their answer ready.
     """
 
     distance_m: float  # between ego and helper
@@ -48,9 +51,10 @@ class Drawn:
 
 
 def by_sight(channel: Physical, distances_m: Sequence[float] | Floats) -> dict[str, Floats]:
-    """Return the channel's packet reception ratio at distances `(n,)` for each kind of obstacle.
+    """Return the share of packets received at n distances in m, (n,), for each kind of obstacle.
 
-    The keys are those of `SIGHTS`: `clear`, `vehicle` and `building`.
+    The keys are those of `SIGHTS`, what stands between: `clear` (nothing), `vehicle` and
+    `building`.
     """
     metres = np.asarray(distances_m, dtype=float)
     return {name: channel.reception(metres, sight) for name, sight in SIGHTS.items()}
@@ -75,9 +79,11 @@ def latencies_ms(
 
 
 def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Drawn]:
-    """Simulate `n` requests and replies to one helper at each distance, in line of sight.
+    """Simulate `n` requests and replies to one helper at each distance; return their reception.
 
-    The vehicles are on one road; each message has its own shadowing, drawn by `seed`.
+    The vehicles are on one road in line of sight, and `channel` is their radio; each message has
+    its own shadowing (change of power by what stands around), drawn by `seed`. `distances_m` are in
+    metres.
     """
     result = []
     curve = by_sight(channel, distances_m)["clear"].tolist()
@@ -116,7 +122,9 @@ def drawn(channel: Physical, distances_m: Sequence[float], n: int, seed: int = 0
 class Gap:
     """Hold the inter-packet gap at one distance: the time between two received packets.
 
-    They are packets of one vehicle, received by another on the same trip.
+    They are packets of one vehicle, received by another on the same trip. `mean_s` and `p95_s`, the
+    mean and the 95th percentile, have intervals over trips; `independent_s` would be the mean if
+    each packet were lost by itself.
     """
 
     distance_m: float  # between the two vehicles
@@ -126,11 +134,12 @@ class Gap:
 
 
 def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int = 0) -> list[Gap]:
-    """Simulate inter-packet gaps on `n` trips of two vehicles at each distance.
+    """Simulate the time between received packets on `n` trips of two vehicles at each distance.
 
-    They drive in line of sight at 14 m/s on one road, for `PACKETS` packets. Their shadowing
-    changes as they go; a packet is drawn by its own loss, as runs draw messages. Gaps that a trip's
-    end cuts off are left out, so ones that would be longer than a tenth of a trip are unknown.
+    `channel` is their radio, and `distances_m` are the metres between them. They drive in line of
+    sight at 14 m/s on one road, for `PACKETS` packets. Their shadowing changes as they go; a packet
+    is drawn by its own loss, as in runs, and draws are made from `seed`. Gaps that a trip's end
+    cuts off are left out, so ones that would be longer than a tenth of a trip are unknown.
     """
     moved_m = MPS / channel.rate_hz * np.arange(PACKETS)
     numbers = np.broadcast_to(np.arange(n)[:, None], (n, PACKETS))
@@ -171,7 +180,12 @@ def _p95(values: Floats, trips: Ints) -> Estimate:
 
 @dataclass(frozen=True)
 class Curve:
-    """Hold a published or simulated curve of reception over distance, as n points."""
+    """Hold a published or simulated curve of reception over distance, as n points.
+
+    `reception` (n,) is the share of packets received at `distance_m` (n,). `configuration` has the
+    channel's settings with which it was made, such as `rate_hz=10`; empty for those of the channel
+    that it is compared with. `source` is who published it.
+    """
 
     # the channel settings that it was made with, as a condition states them: `rate_hz=10`; empty
     # for those of the channel that it is compared with
@@ -209,7 +223,10 @@ def curves_of(path: Path) -> list[Curve]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Hold a published curve beside the channel model's reception at the same n distances."""
+    """Hold a published curve beside the channel model's reception at the same n distances.
+
+    `reception` (n,) is the share of packets received by the model.
+    """
 
     curve: Curve  # the curve
     reception: Floats  # share of packets received by the model, `(n,)`
@@ -227,9 +244,10 @@ class Compared:
 
 
 def compared(channel: Channel, curve: Curve, where: str) -> Compared:
-    """Compare a curve with the channel, adapted to the settings that the curve states.
+    """Return a curve beside the channel's reception, with the settings that the curve states.
 
-    `where` names the channel for errors. Raises UserError for a setting it does not have.
+    `channel` is the radio, and `where` names it for errors. Raises UserError for a setting that it
+    does not have.
     """
     adapted = changed(channel, pairs(curve.configuration), where)
     assert isinstance(adapted, Physical)
@@ -238,7 +256,12 @@ def compared(channel: Channel, curve: Curve, where: str) -> Compared:
 
 @dataclass(frozen=True)
 class Check:
-    """Hold a channel's comparison with its own simulated messages and with published curves."""
+    """Hold a channel's comparison with its own simulated messages and with published curves.
+
+    `n` messages were simulated at each distance; `messages` says how they were received, `waits`
+    how long it is from one received packet of a vehicle to the next, and `curves` has the published
+    curves. `busy_ratio` is the share of time in which the medium is sensed as busy.
+    """
 
     n: int  # messages at each distance
     # share of time in which its channel is sensed as busy, under the background load; None if the
@@ -262,8 +285,8 @@ class Check:
 def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check:
     """Simulate `n` messages at each of `DISTANCES_M`, and compare a radio with curves of files.
 
-    `where` names the radio for errors. Raises UserError if a file has no curves, or one states a
-    setting that the radio does not have.
+    `files` are CSV files as `curves_of` reads them. `where` names the radio for errors. Raises
+    UserError if a file has no curves, or one states a setting that the radio does not have.
     """
     curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
     return Check(

@@ -42,7 +42,10 @@ class Sidelink(Transceiver):
 
     Vehicles divide the channel into slots of time and sub-channels of frequency. A resource is what
     one packet takes, a block is what is sent in it, and each vehicle chooses its resources itself.
-    Fields, and those of `Transceiver`, are settings of both.
+    Fields, and those of `Transceiver`, are settings of both: `keep` is the probability that a
+    vehicle keeps its resource, `transmissions` how often it sends each block, and `t1_slots` to
+    `t2_slots` the slots after a message is ready in which it may be sent. `ranks` says that free
+    resources are ranked by received power.
     """
 
     rate_hz: Annotated[float, between(0.1, 1000)] = 10.0  # packets that each vehicle sends a second
@@ -100,9 +103,10 @@ class Sidelink(Transceiver):
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the packet reception ratio, the share of packets received, at n distances, (n,).
 
-        `distance_m` is `(n,)`, and packets are those of background traffic. It is equation 6 of
-        Gonzalez-Martin et al. (2019), averaged over shadowing. `sight` is what stands between, such
-        as `CLEAR`; without it no building does, and vehicles with the environment's probability.
+        `distance_m` (n,) is in metres, and packets are those of background traffic. It is equation
+        6 of Gonzalez-Martin et al. (2019), averaged over shadowing. `sight` is what stands between,
+        such as `CLEAR`; without it no building does, and vehicles with the environment's
+        probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
         success = np.array(
@@ -115,7 +119,10 @@ class Sidelink(Transceiver):
         return (self.t1_slots + np.floor(uniforms * self._window)) * self.slot_s
 
     def message_s(self, bits: Floats | float) -> Floats:
-        """Return the time on air, s: one slot for each block and repetition, one after another."""
+        """Return the time on air of a message of so many bits, s, of the shape of `bits`.
+
+        It is one slot for each block and repetition, one after another.
+        """
         return self._blocks(bits) * (self.transmissions * self.slot_s)
 
     def _turns(

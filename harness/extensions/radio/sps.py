@@ -29,8 +29,11 @@ class Scheduling:
     """Hold what a vehicle's choice of a resource depends on in semi-persistent scheduling.
 
     A resource is what one packet takes of the channel: some frequency in one slot of time. A period
-    is the time from one packet of a vehicle to its next. Numbers in brackets are equations of
-    Gonzalez-Martin et al. (IEEE TVT 68(2), 2019).
+    is the time from one packet of a vehicle to its next: `per_m` packets for each metre of road and
+    `resources` resources are in it. `forgotten` is the share of choices that a vehicle could sense
+    and does not know of. `sensed` takes metres, as an array, and a threshold in dBm, and returns
+    the share of a vehicle's packets received above it at each; `threshold_dbm` is that of a
+    receiver. Equations are those of Gonzalez-Martin et al. (IEEE TVT 68(2), 2019).
     """
 
     per_m: float  # packets that the vehicles on one metre of road send in a period
@@ -50,9 +53,10 @@ class Scheduling:
     def same_by_exclusion(self, apart_m: Floats) -> Floats:
         """Return the probability that a vehicle `apart_m` metres away takes the same resource.
 
-        The shape is that of `apart_m`. It is by Step 2 of a vehicle's choice, in which both exclude
-        the resources that they sense as taken (Gonzalez-Martin et al. 2019, equation 23). The
-        source does not limit them; at most 80 % can be excluded.
+        A resource is what one packet takes of the channel. The shape is that of `apart_m`. It is by
+        Step 2 of a vehicle's choice, in which both exclude the resources that they sense as taken
+        (Gonzalez-Martin et al. 2019, equation 23). The source does not limit them; at most 80 % can
+        be excluded.
         """
         taken = min(self._taken(self.threshold_dbm, 1), (1 - LEAST_SHARE) * self.resources)
         return self._same(apart_m, taken, self.threshold_dbm)
@@ -60,9 +64,10 @@ class Scheduling:
     def same_by_ranking(self, apart_m: Floats) -> Floats:
         """Return the probability that a vehicle `apart_m` metres away takes the same resource.
 
-        The shape is that of `apart_m`. It is by Step 3 of a vehicle's choice, in which both keep
-        the fifth of the resources with the least power (Gonzalez-Martin et al. 2019, equations 31
-        to 33), as if the threshold had been raised until only these were left.
+        A resource is what one packet takes of the channel. The shape is that of `apart_m`. It is by
+        Step 3 of a vehicle's choice, in which both keep the fifth of the resources with the least
+        power (Gonzalez-Martin et al. 2019, equations 31 to 33), as if the threshold had been raised
+        until only these were left.
         """
         threshold_dbm = self.threshold_dbm
         while (taken := self._taken(threshold_dbm, 2)) > (1 - LEAST_SHARE) * self.resources:

@@ -16,10 +16,10 @@ DISTANCE_M, RECEPTION = (1e6, "metres, 0 to 1000000"), (1.0, "a share from 0 to 
 def rows_of(
     path: Path, needed: Collection[str], known_columns: Collection[str]
 ) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
-    """Return the column names of a CSV file, and its rows with their line numbers.
+    """Return the column names of a CSV file, and its rows, each with its line number in the file.
 
-    A row is a dict by column. Raises UserError if it is no table, lacks a column that is `needed`,
-    or has one that is not in `known_columns`.
+    A row is a dict of the cells' texts by column. Raises UserError if it is no table, lacks a
+    column that is `needed`, or has one that is not in `known_columns`.
     """
     file = printable(path)
     try:
@@ -42,10 +42,10 @@ def rows_of(
 def number_of(
     where: str, row: dict[str, str], column: str, most: float, allowed: str, least: float = 0.0
 ) -> float:
-    """Return the number in a column of a row, between `least` and `most`.
+    """Return the number in a column of a row, if it is between `least` and `most`.
 
-    `row` has the cells as texts by column. Raises UserError for any other; `where` says in which
-    file and line, and `allowed` in words what is allowed.
+    `row` has the cells as texts by column. Raises UserError for any other value; `where` says in
+    which file and line it is, and `allowed` in words what is allowed, for the message.
     """
     try:
         value = float(row[column])

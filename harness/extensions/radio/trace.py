@@ -56,7 +56,12 @@ What = Literal["reception", "p50_s", "p95_s"]
 
 
 class Point(NamedTuple):
-    """Hold a row of a user's table of reception: distance, reception, obstacle and latency."""
+    """Hold a row of a user's table of reception: distance, reception, obstacle and latency.
+
+    `reception` is the share of packets received over `distance_m` metres, with `sight` between (one
+    of `SIGHTS`, None in a table without this column). `latency_s` is the time from the wish to send
+    until reception, or its median and 95th percentile; None in a table without.
+    """
 
     distance_m: float  # distance between sender and receiver
     reception: float  # share of packets received
@@ -68,7 +73,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Hold the rows of a table of reception, with the file's path and digest."""
+    """Hold the rows of a table of reception over distance, with its file's path and digest."""
 
     file: str  # path of the file
     sha256: str  # its digest
@@ -81,9 +86,10 @@ class Trace:
 
     The table is averaged over shadowing and for one packet size, so a link's own shadowing and a
     message's bits change nothing, and replies do not wait for each other. A request reaches each
-    helper after the latency of its own distance. Between two percentiles a message's latency is
-    drawn from the lognormal distribution that has them; that it is lognormal, and that messages
-    draw independently, is assumed.
+    helper after the latency of its own distance, or `latency_s` seconds if the table has none.
+    Between two percentiles a message's latency is drawn from the lognormal distribution that has
+    them; that it is lognormal, and that messages draw independently, is assumed. `beyond` says what
+    reception is beyond the last distance: `zero`, or `held`, that of the last row.
     """
 
     receptions: Table  # the table
@@ -105,9 +111,9 @@ class Trace:
         return math.nan
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return a request's times, both NaN: helpers have it after the latency of their own links.
+        """Return a request's times, both NaN: each helper has it after the latency of its own link.
 
-        Its time on air is unknown.
+        `bits` and `draws` are not read. Its time on air is unknown.
         """
         return Broadcast(math.nan, math.nan)
 
@@ -125,10 +131,10 @@ class Trace:
         return any(isinstance(point.latency_s, Spread) for point in self.receptions.points)
 
     def percentiles_s(self, distance_m: Floats, sight: Ints | int) -> tuple[Floats, Floats]:
-        """Return the median and the 95th percentile, s, of messages' latency, `(...)` each.
+        """Return the median and the 95th percentile of messages' latency, s, `(...)` each.
 
-        `distance_m` has the distances of sender and receiver, `(...)`, and `sight` is what stands
-        between, such as `CLEAR`.
+        Latency is the time from the wish to send until reception. `distance_m` has the distances of
+        sender and receiver, m, `(...)`, and `sight` is what stands between, such as `CLEAR`.
         """
         return self._at(distance_m, sight, "p50_s"), self._at(distance_m, sight, "p95_s")
 
@@ -170,8 +176,9 @@ class Trace:
 def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Trace:
     """Return the channel of a profile whose parameter `file` names a table in the same folder.
 
-    `parameters` has the profile's settings by name, `folder` is where its file lies, and `where`
-    names it in messages. Raises UserError if the table is missing, elsewhere or wrong.
+    A profile is a radio by name, one file of `channels/`. `parameters` has its settings by name,
+    `folder` is where its file lies, and `where` names it in messages. Raises UserError if the table
+    is missing, elsewhere or wrong.
     """
     if not isinstance(parameters.get("file"), str):
         raise UserError(f"{where} has no file; add it, a CSV with distance_m and reception")
@@ -188,7 +195,7 @@ def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Tra
 
 
 def read(path: Path) -> tuple[Point, ...]:
-    """Return the rows of a table of reception, sorted by obstacle and distance.
+    """Return the rows of a CSV table of reception over distance, sorted by obstacle and distance.
 
     Raises UserError if the table is wrong.
     """

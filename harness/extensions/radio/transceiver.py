@@ -23,7 +23,9 @@ class Transceiver(Propagation, Physical):
     """Model the radio of all vehicles under background traffic of one packet size and rate.
 
     Background traffic is other vehicles' packets, which compete for the channel with the messages
-    of the ego and its helpers. Fields, and those of `Propagation`, are settings of a radio.
+    of the ego and its helpers: `density_per_km` vehicles send `rate_hz` packets a second each.
+    Fields, and those of `Propagation`, are settings of a radio; `sensing_dbm` is the least power at
+    which a packet is received or sensed.
     """
 
     # background vehicles on one kilometre of road, all lanes and both directions together
@@ -85,17 +87,18 @@ class Transceiver(Propagation, Physical):
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:
         """Return the probability that a message is lost on each of H links, `(..., H)`.
 
-        `site` has the positions, `bits` is the message's size, one number or `(..., H)`, and
-        `shadow` each link's shadowing, `(..., H)`, standard normal. Values for absent helpers mean
+        A link is that of the ego and one helper. `site` has their positions, `bits` is the
+        message's size, one number or `(..., H)`, and `shadow` each link's shadowing (its change of
+        power by what stands around), `(..., H)`, standard normal. Values for absent helpers mean
         nothing.
         """
         return self._lost(self._fate_at(site, shadow), bits)
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when all helpers have a request of so many bits, and its airtime, s.
+        """Return when all helpers have a broadcast request of so many bits, and its time on air, s.
 
         They have it after its wait for the medium, of which `draws` has the random numbers, and its
-        airtime.
+        time on air. `bits` is one number or `(...)`.
         """
         airtime_s = self.message_s(bits)
         return Broadcast(self.wait_s(draws.wait) + airtime_s, airtime_s)
