@@ -40,9 +40,12 @@ PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 class Level:
     """Hold what the ego does, and what it costs, by whom it asks at the decision points of a step.
 
-    A step has N decision points: all that are as many decisions from the start. The other axes are
-    S channel seeds, K sets of helpers that could be asked, and C costs (`COSTS`). Where an axis is
-    S x N, the first seed's N points come first.
+    A step has N decision points: all that are as many decisions from the start; `at` (N,) has their
+    indices in the dataset's decision trees. The other axes are S channel seeds, K sets of helpers
+    that could be asked, and C costs (`COSTS`): `action` (S, N, K) is the index of the ego's action
+    if a set is asked, and `costs` (S, N, K, C) what that costs. Where an axis is S x N, as of
+    `intents` (all vehicles' probabilities of actions) and `draws` (the channel's), the first seed's
+    N points come first.
     """
 
     # indices of the decision points in the forest, the dataset's decision trees, ascending, (N,)
@@ -62,7 +65,9 @@ Choose = Callable[[Level, Floats, Floats], Ints]
 class Choices:
     """Hold what follows at each decision point of a dataset if the ego asks each set of helpers.
 
-    There are K sets of some of H helpers; the empty one, of nobody, is the first.
+    There are K sets of some of H helpers; the empty one, of nobody, is the first. `sets` (K, H)
+    says which helpers are in each, and `levels` has the decision points by step. `forest` has the
+    decision trees: where actions lead, and how each course ends.
     """
 
     # the dataset's decision trees: every decision point that actions can lead to, and how each
@@ -74,10 +79,10 @@ class Choices:
     def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
         """Yield each level, the last first, with what its sets lead to and the chosen sets.
 
-        A level has the decision points of one step. The axes are S channel seeds, N decision
-        points, K sets of helpers and C costs. A tuple has the level, success (S, N, K), 1 or 0,
-        and costs (S, N, K, C) from there to the episode's end, and the indices in `sets` of the
-        chosen sets, (S, N).
+        A set is helpers who are asked together. A level has the decision points of one step. The
+        axes are S channel seeds, N decision points, K sets of helpers and C costs. A tuple has the
+        level, success (S, N, K), 1 or 0, and costs (S, N, K, C) from there to the episode's end,
+        and the indices in `sets` of the chosen sets, (S, N).
 
         Args:
             choose: returns the index of the set asked in each decision, (S, N), given the level,
@@ -105,8 +110,9 @@ class Choices:
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
         """Return success, (S, E), and costs, (S, E, C), of every episode under the rule `choose`.
 
-        The axes are S channel seeds, E episodes and C costs (`COSTS`). Success is 1 or 0. The rule
-        is as in `backwards`: it returns the index of the set to ask in each decision.
+        The axes are S channel seeds, E episodes and C costs (`COSTS`). Success is 1 or 0. `choose`
+        is called for each step, the last first, as in `backwards`, and returns the index of the set
+        of helpers to ask in each decision.
         """
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
@@ -115,8 +121,8 @@ class Choices:
     def oracle(self) -> tuple[Floats, Floats]:
         """Return success, (S, E), and costs, (S, E, C), if the ego always asked the best set.
 
-        That is a bound: only who knows how each course ends could ask so. The axes are S channel
-        seeds, E episodes and C costs (`COSTS`). Of equally good sets, those with the fewest
+        That is a bound: only who knows how each course of actions ends could ask so. The axes are S
+        channel seeds, E episodes and C costs (`COSTS`). Of equally good sets, those with the fewest
         messages are taken.
         """
 
@@ -145,7 +151,7 @@ class Choices:
 
         A schedule says what asking each helper is worth, and the operating point above which worth,
         and how many at most, the ego asks. `worths` is what the method `worths` returned for the
-        point; without it the worth is computed.
+        point; without it the worth is computed. The rule is a function as `backwards` takes it.
         """
         lookup = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
@@ -161,9 +167,10 @@ class Choices:
     def worths(self, point: OperatingPoint) -> list[Floats]:
         """Return what asking each helper is worth to the point's schedule, in the schedule's unit.
 
-        One array for each level of the decision trees (the decision points that are equally many
-        decisions from the start), `(S x N, H)`: S channel seeds by N decision points, and H
-        helpers; `(S x N, 1)` where the worth is the same for all helpers.
+        The schedule of an operating point is its rule for whom to ask. One array for each level of
+        the decision trees (the decision points that are equally many decisions from the start), `(S
+        x N, H)`: S channel seeds by N decision points, and H helpers; `(S x N, 1)` where the worth
+        is the same for all helpers.
         """
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 
@@ -179,9 +186,10 @@ def _values_of(values: Floats, k: Ints) -> Floats:
 def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     """Raise UserError if decisions depend on more than whom the ego hears now.
 
-    Then the oracle is not exact. It is so with a fusion call (the model is asked again with the
-    messages), a consensus rule with memory, another content of messages than intents, or settings
-    by which extensions change messages. `helpers` and `actions` are the numbers of helpers and of
+    Then the oracle, an ego that knows how each episode ends, is not exact. It is so if an operating
+    point has a fusion call (the model is asked again with the messages), a consensus rule with
+    memory, another content of messages than intents (probabilities of actions), or settings by
+    which extensions change messages. `helpers` and `actions` are the numbers of helpers and of
     meta-actions.
     """
     name, consensus = printable(point.name), point.fusion.consensus
@@ -212,7 +220,8 @@ def choices(
 
     Args:
         stored: the run whose answers are used; its model is asked for those that it lacks.
-        point: the operating point; its limit of helpers counts, and its schedule does not.
+        point: the operating point, on which a decision depends besides scene and model; its limit
+            of helpers counts, and its schedule (whom to ask) does not.
         seeds: the channel seeds that draws are made from.
         progress: called with 1 for each step.
 

@@ -14,8 +14,9 @@ from harness.core.arrays import Floats
 def always(inputs: ScheduleInputs) -> Floats:
     """Return an infinite worth of asking, the same for every helper, `(..., 1)`.
 
-    So all helpers are always asked, as far as the operating point's limit allows. `inputs` has what
-    the ego knows before it asks, with leading axes `(...)`.
+    It is a schedule, a rule for whom the ego asks: those whose worth is above a threshold. So all
+    helpers are always asked, as far as the operating point's limit allows. `inputs` has what the
+    ego knows before it asks, with leading axes `(...)`.
     """
     return np.full((*inputs.entropy_nats.shape, 1), np.inf)
 
@@ -25,6 +26,7 @@ def margin(inputs: ScheduleInputs) -> Floats:
 
     It is 1 minus the lead of the likeliest action's probability over the next, `(..., 1)`, the same
     for every helper: 0 for an ego that is certain, 1 for one undecided between two actions.
+    `inputs` has what the ego knows before it asks, with leading axes `(...)`.
     """
     ranked = np.sort(inputs.own, axis=-1)
     difference: Floats = ranked[..., -1] - (ranked[..., -2] if ranked.shape[-1] > 1 else 0.0)
@@ -36,7 +38,8 @@ def risk(inputs: ScheduleInputs) -> Floats:
 
     Doubt is the entropy in nats of the ego's intent, its probabilities of actions; the other factor
     is the unseen share, 0 to 1, of the region that it sees least of. Regions are where a danger may
-    come from: left, right, oncoming. The worth is the same for every helper.
+    come from: left, right, oncoming. The worth is the same for every helper. `inputs` has what the
+    ego knows before it asks, with leading axes `(...)`.
     """
     assert inputs.outlook is not None
     unseen: Floats = np.max(inputs.outlook.unseen, axis=-1, initial=0.0)
@@ -48,7 +51,8 @@ def deadline(inputs: ScheduleInputs) -> Floats:
 
     Doubt is the entropy in nats of the ego's intent, its probabilities of actions. The chance is
     the probability that the request reaches the helper, and its reply the ego, before the ego
-    decides. The worth is NaN for one of the H helpers that may not be asked.
+    decides. The worth is NaN for one of the H helpers that may not be asked. `inputs` has what the
+    ego knows before it asks, with leading axes `(...)`.
     """
     assert inputs.in_time is not None
     return np.where(inputs.may_ask, inputs.entropy_nats[..., None] * inputs.in_time, np.nan)
@@ -59,7 +63,8 @@ def coverage(inputs: ScheduleInputs) -> Floats:
 
     It is a share, 0 to 1, of each region where a danger may come from (left, right, oncoming),
     averaged over regions; NaN for one of the H helpers that may not be asked. This is need times
-    supply at each point of a region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836).
+    supply at each point of a region, as in Where2comm (Hu et al. 2022, arXiv 2209.12836). `inputs`
+    has what the ego knows before it asks, with leading axes `(...)`.
     """
     assert inputs.outlook is not None
     regions = max(inputs.outlook.added.shape[-1], 1)
@@ -69,8 +74,8 @@ def coverage(inputs: ScheduleInputs) -> Floats:
 def random(inputs: ScheduleInputs) -> Floats:
     """Return a uniform draw in [0, 1) as the worth of asking, the same of every helper, `(..., 1)`.
 
-    It is new at each decision. So the ego asks in a share of 1 minus the threshold of its
-    decisions.
+    It is new at each decision, and one of the `inputs`, which have leading axes `(...)`. So the ego
+    asks in a share of 1 minus the threshold of its decisions.
     """
     assert inputs.lot is not None
     return inputs.lot[..., None]

@@ -40,8 +40,9 @@ THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun] = ()) -> str:
     """Return a run's name, its dataset and the seeds of its layouts (start situations), in words.
 
-    Raises UserError unless all seeds are for the purpose `wanted`, such as `train`, the layouts are
-    those that the seeds give, and none of them is in one of the `reported` runs.
+    `stored` is the run. Raises UserError unless all seeds are for the purpose `wanted`, such as
+    `train`, the layouts are those that the seeds give, and none of them is in one of the `reported`
+    runs, on which results are measured.
     """
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
@@ -62,8 +63,9 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
 
     A gain is success if one helper alone is asked, less success if nobody is, -1 to 1, averaged
     over the seeds of the channel. Each of the n rows is a helper that may be asked at a decision
-    point of `tree`, with the F inputs of a learnt schedule (`learnt.INPUTS`). `choose` decides whom
-    the ego asks in the rest of the episode.
+    point of `tree`, with the F inputs of a learnt schedule (`learnt.INPUTS`), under the operating
+    point `point`. `choose` is the rule for whom the ego asks in the rest of the episode, a function
+    as `Choices.backwards` takes it.
     """
     alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
@@ -80,7 +82,8 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
 def fit(x: Floats, y: Floats) -> Network:
     """Fit a network that predicts n gains `y`, (n,), from F inputs `x`, (n, F), by least squares.
 
-    The optimiser is Adam, in each step on all rows, with weight decay.
+    A gain is the success that asking a helper adds, -1 to 1. The optimiser is Adam, in each step on
+    all rows, with weight decay.
     """
     draws = noise.generator("schedule", "weights")
     centre, scale = x.mean(axis=0), np.maximum(x.std(axis=0), LEAST)
@@ -117,9 +120,9 @@ def learn(
     """Learn a network that predicts the gain in success from asking each helper.
 
     `train` are runs on layouts (start situations) that are for learning. `point` is the operating
-    point: its limit of helpers holds, and its schedule decides whom the ego asks in the rest of an
-    episode in the first round, the network in later ones. `progress` is called with 1 for each step
-    and round.
+    point: its limit of helpers holds, and its schedule (its rule for whom to ask) decides in the
+    rest of an episode in the first round, the network in later ones. `progress` is called with 1
+    for each step and round.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rules = None, [tree.scheduled(point) for tree in trees]
@@ -141,7 +144,9 @@ def learn(
 def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
     """Return the rule that asks the helpers whose predicted gain in success is above `threshold`.
 
-    It is for the decision points of `tree`, and asks as many helpers as the operating point allows.
+    It is for the decision points of `tree`, a function as `Choices.backwards` takes it, which
+    returns the index of the asked set in each decision. It asks as many helpers as the operating
+    point allows.
     """
     schedule = Learnt(network, threshold)
     worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in tree.levels]
@@ -156,8 +161,10 @@ def tuned(
 ) -> float:
     """Return the threshold of predicted gain with the most success; of equal ones the highest.
 
-    `tune` are runs on layouts (start situations) that are for choosing settings. Success is by each
-    run's success rule, averaged over runs. `progress` is called with 1 for each step of a run.
+    A helper is asked if the gain in success that `network` predicts is above the threshold, as far
+    as the operating point `point` allows. `tune` are runs on layouts (start situations) that are
+    for choosing settings. Success is by each run's success rule, averaged over runs. `progress` is
+    called with 1 for each step of a run.
     """
     success = np.zeros(len(THRESHOLDS))
     with_outlook = point.changed(schedule="coverage", threshold=None)
@@ -170,7 +177,10 @@ def tuned(
 
 
 def text(schedule: Stated) -> str:
-    """Return the text of a schedule's file: TOML, whose strings and lists are JSON's."""
+    """Return the text of a schedule's file: TOML, whose strings and lists are written as in JSON.
+
+    `schedule` is the file's content: a learnt rule of whom the ego asks.
+    """
     fields = asdict(schedule)
     network = fields.pop("network")
     lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
@@ -189,6 +199,9 @@ def run_learn(
 ) -> Stated:
     """Learn a schedule, choose its threshold, write its file `out`, and return the file's content.
 
+    A schedule is a rule for whom the ego asks: here those whose predicted gain is above the
+    threshold.
+
     Args:
         train: runs on train layouts (start situations), from which the network is learnt.
         tune: runs on tune layouts, on which the threshold is chosen.
@@ -198,8 +211,8 @@ def run_learn(
         progress: called with 1 for each step and round.
 
     Raises:
-        UserError: a run is on layouts for another purpose,
-            or its decisions depend on more than who is heard (see `choices.refuse`).
+        UserError: a run is on layouts for another purpose, or its decisions depend on more than who
+            is heard (see `choices.refuse`).
         Unanswered: too many questions got no answer.
     """
     learnt_from = tuple(layouts(stored, "train") for stored in train)

@@ -40,6 +40,9 @@ class Network:
     """Hold a network with one hidden layer of tanh units: F inputs, J units, one output.
 
     The inputs are `INPUTS`, the output the expected gain in success from asking one helper.
+    `centre` (F,) is taken from the inputs, which are then divided by `scale` (F,). `into` (F, J)
+    and `bias` (J,) make the units of them, `out` (J,) and `base` the output of these. Call it with
+    inputs (..., F).
     """
 
     centre: Floats  # what is subtracted from each input, (F,)
@@ -59,7 +62,8 @@ class Network:
 class Learnt:
     """Decide whom the ego asks by the gain in success that a network expects of each helper alone.
 
-    A helper is asked if its gain is above `threshold`, or above the condition's own threshold.
+    A helper is asked if its gain is above `threshold`, or above the threshold of the condition (the
+    operating point), if that has one. It is a schedule, a rule for whom to ask.
     """
 
     network: Network  # from `inputs` to the gain in success probability
@@ -79,7 +83,9 @@ class Learnt:
 class Weights:
     """Hold the numbers of a `Network` as a schedule's file states them; sizes are not checked yet.
 
-    The network has F inputs and J hidden units.
+    A schedule is a rule for whom the ego asks. The network has F inputs and J hidden units.
+    `centre` and `scale` have F numbers, by which inputs are moved and divided; `into` has F rows of
+    J weights, `bias` and `out` J numbers each; `base` is the bias of the output.
     """
 
     centre: tuple[float, ...]  # what is subtracted from each input, F numbers
@@ -92,7 +98,13 @@ class Weights:
 
 @dataclass(frozen=True)
 class Stated:
-    """Hold the content of a schedule's file in `schedules/`: a learnt rule of whom the ego asks."""
+    """Hold the content of a schedule's file in `schedules/`: a learnt rule of whom the ego asks.
+
+    `command` made the file. `learnt_from` and `tuned_on` name the runs from which it was learnt and
+    on which `threshold` was chosen, with the seeds of their layouts (start situations), and
+    `condition` the operating point of both. A helper is asked if the gain that the network expects
+    of it is above the threshold; `inputs` names the network's inputs.
+    """
 
     description: str  # one sentence
     command: str  # the command that made the file
@@ -104,7 +116,7 @@ class Stated:
     network: Weights  # the network's weights
 
     def schedule(self, where: str) -> Learnt:
-        """Return the schedule; `where` names the file in messages.
+        """Return the schedule, the rule for whom the ego asks; `where` names the file in messages.
 
         Raises UserError if its inputs are not `INPUTS`, or its weights have other sizes.
         """
@@ -177,6 +189,9 @@ def inputs(facts: ScheduleInputs) -> Floats:
 
 @read_once
 def read(path: Path) -> Learnt:
-    """Read a learnt schedule from its file. Raises UserError if the file is wrong."""
+    """Read a learnt schedule, a rule for whom the ego asks, from its TOML file.
+
+    Raises UserError if the file is wrong.
+    """
     where = f"schedule file {printable(path)}"
     return convert(toml(path, where), Stated, where).schedule(where)

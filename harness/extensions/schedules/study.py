@@ -53,8 +53,9 @@ FIRST = (PAPER, NEVER, ALWAYS, "margin", "risk", "deadline", "coverage", RANDOM)
 class Candidate:
     """Describe one setting of a schedule: its threshold and how many helpers it asks at most.
 
-    A schedule says what asking each helper is worth in a decision; those worth more than the
-    threshold are asked.
+    A schedule says what asking each helper is worth in a decision, in its own unit; those worth
+    more than the `threshold` are asked, `most` of them at most. The threshold is None for a
+    schedule without.
     """
 
     schedule: str  # its name
@@ -63,7 +64,10 @@ class Candidate:
     most: int  # most helpers asked in a decision
 
     def at(self, point: OperatingPoint) -> OperatingPoint:
-        """Return a copy of an operating point that asks by this schedule and setting."""
+        """Return a copy of an operating point that asks by this schedule and setting.
+
+        An operating point is everything a decision depends on besides scene and model.
+        """
         if self.schedule == PAPER and self.threshold is not None:
             changed = point.changed(schedule=PAPER, threshold=None, tau_nats=self.threshold)
         else:
@@ -78,7 +82,10 @@ class Candidate:
 class Play:
     """Hold the outcome of one setting of a schedule for S channel seeds and E episodes.
 
-    There are C costs, `COSTS`: messages, air time, latency, energy and so on.
+    A schedule is a rule for whom the ego asks. `success` (S, E) is 1 or 0. `costs` (S, E, C) has
+    what each episode costs, in the order of `COSTS`: messages, air time (ms), latency (ms),
+    decisions and energy (J). `success_rule` says how success is averaged, such as balanced over
+    layouts with a danger (a vehicle that the ego would meet) and without.
     """
 
     candidate: Candidate  # the schedule and its setting
@@ -92,17 +99,25 @@ class Play:
         return self.success_rule.mean(self.success)
 
     def of(self, cost: str) -> Floats:
-        """Return one of `COSTS` by its name, summed over each of E episodes, (S, E), S seeds."""
+        """Return one of the costs of each episode, (S, E), for S channel seeds and E episodes.
+
+        `cost` is its name in `COSTS`, such as `messages`; it is summed over the episode's
+        decisions.
+        """
         return np.asarray(self.costs[..., COSTS.index(cost)])
 
     @property
     def messages(self) -> Floats:
-        """Return the number of messages of E episodes under S channel seeds, (S, E)."""
+        """Return the number of messages in each of E episodes under S channel seeds, (S, E)."""
         return self.of("messages")
 
     @property
     def means(self) -> dict[str, float]:
-        """Return mean costs, by name as in `COSTS`: per episode, but latency (ms) per decision."""
+        """Return mean costs by name, those of `COSTS` but `decisions`.
+
+        They are per episode (messages, air time in ms, energy in J), but latency (ms) is per
+        decision.
+        """
         of_episode = self.costs.sum(axis=(0, 1)) / self.success.size
         means = dict(zip(COSTS, of_episode.tolist(), strict=True))
         decisions = means.pop("decisions")
@@ -114,8 +129,9 @@ def plays(
 ) -> list[Play]:
     """Play settings of one schedule, which differ in threshold or limit; return their outcomes.
 
-    `choices` has what follows from asking each set of helpers, under `point`; `success_rule` says
-    how success is averaged over episodes. What asking is worth is computed once for all settings.
+    A schedule is a rule for whom to ask. `choices` has what follows from asking each set of
+    helpers, under the operating point `point`; `success_rule` says how success is averaged over
+    episodes. What asking is worth is computed once for all settings.
     """
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
@@ -126,8 +142,9 @@ def plays(
 def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[Candidate]:
     """Return the settings of a schedule to try: thresholds, each with every limit of helpers.
 
-    `choices` are those of a dataset under `point`. The thresholds are deciles of what asking is
-    worth there, the schedule's own, and 0.
+    A schedule is a rule for whom to ask, here given by its name; `choices` has what follows from
+    asking under the operating point `point`. The thresholds are deciles of what asking is worth
+    there, the schedule's own, and 0.
     """
     most = range(1, point.ask.max_helpers + 1)
     usual = point.changed(schedule=schedule, threshold=None)
@@ -143,9 +160,14 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
 class Chosen:
     """Compare a schedule, at its chosen setting, with the paper's schedule and the oracle.
 
-    The paper's schedule asks by the entropy of the ego's intent; the oracle is the best that an ego
-    could do which knows how each episode ends. Success is a share of episodes, 0 to 1; every
-    estimate has an interval over episodes. A budget is how much of a cost an episode may take.
+    A schedule is a rule for whom to ask. The paper's asks by the entropy of the ego's intent; the
+    oracle is the best that an ego could do which knows how each episode ends. Success is a share of
+    episodes, 0 to 1: `success` by the success rule, `plain` over all episodes alike, `over_paper`
+    and `over_random` less that of the paper's schedule and of asking at random as often. `closed`
+    is the share of the gap from the paper's to the oracle that it closes, `messages` its messages
+    as a share of the paper's. `area` is success averaged over budgets of messages, `area_j` over
+    budgets of energy; a budget is how much an episode may take. `p` is the corrected p-value of no
+    difference from the paper's. Every estimate has an interval over episodes.
     """
 
     play: Play  # the setting, with success and costs of every episode
@@ -168,7 +190,11 @@ class Chosen:
 class Compared:
     """Hold all schedules that were compared on one run, with the outcome of every setting.
 
-    All played the same episodes with the same draws of the channel.
+    A schedule is a rule for whom to ask. All played the same episodes with the same draws of the
+    channel, at the operating point `point`. `plays` has the outcomes by schedule, and `tune` the
+    same on tune layouts, start situations on which settings are chosen; `oracle` is the outcome of
+    an ego that knows how each episode ends. `budget` is the share of the messages of the paper's
+    schedule that a chosen setting may take.
     """
 
     name: str  # the run's model, prompt and answer mode
@@ -184,7 +210,8 @@ class Compared:
     def paper(self) -> Play:
         """Return the outcome of the paper's schedule at the operating point's own setting.
 
-        The paper's schedule asks where the entropy of the ego's intent is above a threshold.
+        The paper's schedule asks where the entropy of the ego's intent (its probabilities of
+        actions) is above a threshold.
         """
         return _at(self.plays[PAPER], self._untuned(PAPER))
 
@@ -200,7 +227,11 @@ class Compared:
 
     @property
     def success_rule(self) -> Success:
-        """Return how success is averaged over episodes, such as balanced by danger."""
+        """Return how success is averaged over episodes, such as balanced by danger.
+
+        That is the mean over episodes with a danger (a vehicle that the ego would meet) and
+        without.
+        """
         return self.oracle.success_rule
 
     @cached_property
@@ -214,7 +245,8 @@ class Compared:
     def chosen(self, schedule: str) -> Play:
         """Return a schedule's outcome at the setting chosen for it.
 
-        That is the setting with the most success on tune layouts within the budget of messages; of
+        `schedule` is its name, that of a rule for whom to ask. The setting is the one with the most
+        success on tune layouts (start situations for choosing) within the budget of messages; of
         equal ones the cheapest, and the cheapest of all if none is within it. Without tune layouts
         it is the default setting.
         """
@@ -236,8 +268,9 @@ class Compared:
     def front(self, schedule: str, cost: str = "messages") -> list[Play]:
         """Return the outcomes of the settings to use as a cost's budget grows, the cheapest first.
 
-        A setting is in it if no cheaper one succeeds more on tune layouts; without them, on these
-        layouts, which flatters it. `cost` is one of `COSTS`. The first asks nobody.
+        `schedule` is the name of the rule for whom to ask, and `cost` one of `COSTS`. A setting is
+        in it if no cheaper one succeeds more on tune layouts (start situations for choosing);
+        without them, on these layouts, which flatters it. The first asks nobody.
         """
 
         def order(ranked: tuple[Play, float]) -> tuple[float, float]:
@@ -262,7 +295,8 @@ class Compared:
     def oracle_front(self) -> list[Play]:
         """Return the oracle's outcomes where an episode may take 0, 1, 2, ... messages at most.
 
-        An episode that needs more to succeed is played without asking.
+        The oracle is an ego that knows how each episode ends. An episode that needs more messages
+        to succeed is played without asking.
         """
         bound, alone = self.oracle, self.plays[NEVER][0].costs
         cheap = [bound.messages <= cap for cap in range(int(bound.messages.max()) + 1)]
@@ -275,8 +309,9 @@ class Compared:
     def area(self, schedule: str, cost: str = "messages") -> Estimate:
         """Return a schedule's success averaged over budgets of a cost, with a bootstrap interval.
 
-        A budget is how much of the cost an episode may take on average, from the cost of never
-        asking to that of always asking all; `cost` is one of `COSTS`.
+        `schedule` names a rule for whom to ask. A budget is how much of the cost an episode may
+        take on average, from the cost of never asking to that of always asking all; `cost` is one
+        of `COSTS`.
         """
         of_bound = [(play, play.rate) for play in self.oracle_front()]
         ranked = of_bound if schedule == ORACLE else self._ranked(schedule)
@@ -300,12 +335,20 @@ class Compared:
 
     @cached_property
     def regret(self) -> Estimate:
-        """Return the success of the oracle less that of the paper's schedule, paired by episode."""
+        """Return the success of the oracle less that of the paper's schedule, paired by episode.
+
+        The oracle is an ego that knows how each episode ends; the paper's asks by the entropy of
+        its intent.
+        """
         return self.success_rule.difference(self.oracle.success, self.paper.success)
 
     @cached_property
     def rows(self) -> list[Chosen]:
-        """Return the rows to show: the paper's schedule, all compared ones, then the oracle."""
+        """Return the rows to show: the paper's schedule, all compared ones, then the oracle.
+
+        A schedule is a rule for whom the ego asks; the paper's asks by the entropy of its answer.
+        The oracle is an ego that knows how each episode ends.
+        """
         chosen = [self.chosen(name) for name in self.names]
         raw = [self.success_rule.p_value(play.success, self.paper.success) for play in chosen]
         rows = [self._row(self.paper, None)]
@@ -333,7 +376,8 @@ class Compared:
         """Return the success of asking at random with as many messages as `play`, (S, E).
 
         The axes are S channel seeds and E episodes. It is interpolated, 0 to 1, between the two
-        random schedules whose mean numbers of messages are next to that of `play`.
+        `random` schedules (rules for whom to ask) whose mean numbers of messages are next to that
+        of `play`.
         """
         most = self.point.ask.max_helpers
         every = [play for play in self.plays[RANDOM] if play.candidate.most == most]
@@ -358,6 +402,8 @@ def compare(
     progress: Callable[[int], None],
 ) -> Compared:
     """Play every schedule on a run, and on a run on tune layouts if there is one.
+
+    A schedule is a rule for whom the ego asks.
 
     Args:
         stored: the run whose answers are used; schedules are reported on it.
@@ -402,6 +448,9 @@ def run_schedules(
 ) -> list[Compared]:
     """Compare schedules on runs, each with its run on tune layouts, or without any.
 
+    A schedule is a rule for whom the ego asks; tune layouts are start situations for choosing
+    settings.
+
     Args:
         runs: the runs whose answers are used.
         tune: a run on tune layouts for each of `runs`, in their order; or none.
@@ -413,8 +462,8 @@ def run_schedules(
         progress: told how many steps there are, and called with 1 for each.
 
     Raises:
-        UserError: as `compare` does, or the folder `out` has another comparison,
-            or a run is on other layouts.
+        UserError: no schedule changes anything, or the folder `out` has another comparison, or a
+            run is on other layouts.
         Unanswered: too many questions got no answer; the runs keep all others.
     """
     every = [*runs, *tune]
@@ -442,7 +491,10 @@ def run_schedules(
 
 
 def in_order(names: Collection[str]) -> list[str]:
-    """Return names of schedules in the order of tables: those that ship first."""
+    """Return names of schedules in the order of tables: the usual ones first.
+
+    A schedule is a rule for whom the ego asks.
+    """
     first = [name for name in FIRST if name in names]
     return [*first, *(name for name in names if name not in FIRST)]
 
@@ -508,8 +560,9 @@ def schedule_study(
 ) -> Study:
     """Return the study (tables, pictures and sentences) of schedules that were compared.
 
-    `compared` has an item for each model's run, `runs` are all runs that were played, those on tune
-    layouts included, and `seeds` the channel's seeds.
+    A schedule is a rule for whom to ask. `compared` has an item for each model's run, `runs` are
+    all runs that were played, those on tune layouts (start situations for choosing settings)
+    included, and `seeds` the channel's seeds.
     """
     first, data = compared[0], tables(compared)
     words = first.success_rule.words
@@ -559,7 +612,10 @@ def schedule_study(
 
 
 def name_of(row: Chosen) -> str:
-    """Return the label of a row: the schedule, its most helpers, and its threshold."""
+    """Return the label of a row, such as `entropy 1, 0.8`: schedule, most helpers and threshold.
+
+    A schedule is a rule for whom the ego asks: those worth more than the threshold.
+    """
     return f"{row.play.candidate.schedule} {row.play.candidate}"
 
 
@@ -678,7 +734,12 @@ def _table(run: Compared) -> Table:
 
 
 def tables(compared: Sequence[Compared]) -> "dict[str, pd.DataFrame]":
-    """Return the tables `schedules` (each at its chosen setting) and `settings` (all played)."""
+    """Return the data frames `schedules` and `settings`, by these names, to write as files.
+
+    A schedule is a rule for whom to ask. `schedules` has a row for each at its chosen setting, with
+    its comparison; `settings` one for each setting that was played, with its success and mean
+    costs.
+    """
     import pandas as pd
 
     def ends(name: str, e: Estimate) -> dict[str, Any]:
