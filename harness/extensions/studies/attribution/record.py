@@ -18,7 +18,12 @@ class LeftOut(Struct, frozen=True, kw_only=True):
     """Hold what changed when one object or message was left out of a prompt or of the fusion.
 
     An object is a vehicle or the like that a prompt lists; the fusion makes the ego's policy of its
-    own answer and of helpers' messages. Answers and policies are probabilities of actions.
+    own answer and of helpers' messages. Answers and policies are probabilities of actions. `scene`
+    is the decision point's id, `seed` that of the channel for a message, and `viewer` the vehicle
+    whose answer changes. `item` is the object, or the message's sender, and `kind` what it is.
+    `action` was the likeliest with it, `instead` is so without it; `change` is by how much the
+    probability of `action` rises, and `shift` the total variation distance of both. These three are
+    None if that answer failed.
     """
 
     scene: str  # id of the decision point
@@ -41,7 +46,9 @@ class LeftOut(Struct, frozen=True, kw_only=True):
 class Attribution(Struct, frozen=True, kw_only=True):
     """Hold the result of leaving out objects and messages of a run, one at a time.
 
-    A sample of `decision_points` was drawn out of all `of` decision points of the condition.
+    A sample of `decision_points` situations in which the ego decided was drawn, by the seed
+    `sample_seed`, out of all `of` that the condition (an operating point by its name) has.
+    `left_out` has an item for each object or message.
     """
 
     condition: str  # name of the condition whose decision points were drawn
@@ -54,7 +61,8 @@ class Attribution(Struct, frozen=True, kw_only=True):
 def of_run(run: Run) -> Attribution | None:
     """Read the attribution that lies in a run's folder; None if there is none.
 
-    Raises UserError if the file is broken.
+    An attribution says what answers become without one object or message. Raises UserError if the
+    file is broken.
     """
     return run.read_file(FILE, _load) if (run.path / FILE).is_file() else None
 

@@ -52,7 +52,10 @@ class Row:
     """Hold how much one kind of object or message moves answers, over all that were left out.
 
     Answers are probabilities of actions; each was compared with that to a prompt, or of a fusion,
-    without the item.
+    without the item. `role` says whose prompt it was left out of, `ego` or `helper`, or `fusion`
+    for messages. `shift` is the mean total variation distance of both, `flips` the share whose
+    likeliest action changed, and `failed` the share that failed without the item, which the others
+    leave out.
     """
 
     role: str  # whose prompt it was left out of, `ego` or `helper`; or `fusion`, for messages
@@ -109,8 +112,10 @@ def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> At
 def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
     """Draw at most `sample` decision points of a condition, and for each a channel seed.
 
-    Returns the seed by decision point, and how many decision points the condition has. All points
-    are equally likely, and so are the seeds of each; a larger sample contains a smaller one.
+    `stored` is the run, and `condition` the name of one of its operating points. Returns the seed
+    of each decision point by its id, and how many decision points the condition has. All points are
+    equally likely, and so are the seeds of each; `seed` is that of the draw. A larger sample
+    contains a smaller one.
     """
     run = stored.run
     here = run.decisions.codes("condition", run.conditions) == run.conditions.index(condition)
@@ -131,7 +136,9 @@ def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[d
 def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
     """Yield what each listed object changes when it is left out of one viewer's prompt.
 
-    This is done for every viewer of these scenes whose prompt lists the object.
+    Objects are vehicles and the like that a prompt lists; a viewer is the vehicle that is asked.
+    This is done for every viewer of these scenes whose prompt lists the object. `stored` is the
+    run, whose model is asked what it has no answer for.
     """
     questions = [each for scene in scenes for each in _questions(stored, scene)]
     whole = requests(stored.spec, scenes)
@@ -190,7 +197,9 @@ def messages(
 ) -> Iterator[LeftOut]:
     """Yield what each message that came in time changes when it is left out of the fusion.
 
-    `drawn` has, by decision point, the channel seed of the decision that is taken.
+    The fusion makes the ego's policy of its own answer and of messages. `stored` is the run, and
+    `point` the operating point. `drawn` has, by decision point's id, the channel seed of the
+    decision that is taken.
     """
     memory, world = Memory(), FrozenWorld(stored.dataset, [point], stored.seeds)
     for [part] in walk(world, [point], stored, stored.spec.ties):
@@ -265,7 +274,7 @@ def _left_out(
 def rows(result: Attribution) -> list[Row]:
     """Return a row for each kind of object or message that was left out, with 95 % intervals.
 
-    `result` is the attribution that has them. The intervals are over episodes.
+    `result` is the attribution, what answers become without each. The intervals are over episodes.
     """
     by_kind: dict[tuple[str, str], list[LeftOut]] = {}
     for each in result.left_out:
@@ -321,7 +330,8 @@ def headline(table: Sequence[Row]) -> str:
 def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
     """Return the study of an attribution, for the terminal and `--json`.
 
-    `result` has what moved the answers, and `run` is the run whose answers they are.
+    `result` has what the answers become without one object or message, and `run` is the run whose
+    answers they are.
     """
     table, cells, plain_rows = rows(result), list[Sequence[str]](), list[dict[str, Any]]()
     for row in table:
@@ -367,6 +377,9 @@ def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
 
 
 def write(result: Attribution, run: Path) -> Path:
-    """Write an attribution to its file in a run's folder, and return the file's path."""
+    """Write an attribution to its file in a run's folder, and return the file's path.
+
+    An attribution says what answers become without one object or message.
+    """
     write_whole(run / FILE, msgspec.json.format(msgspec.json.encode(result), indent=1) + b"\n")
     return run / FILE

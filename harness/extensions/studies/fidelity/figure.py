@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     """Draw closed-loop over frozen success, a point a model and condition, with 95 % intervals.
 
-    Closed loop means driven in the simulator, frozen means decided on recorded scenes.
+    Closed loop means driven in the simulator, frozen means decided on recorded scenes. A condition
+    is an operating point by its name.
 
     Args:
         table: `Fidelity.table`, a row a point.

@@ -40,7 +40,10 @@ class Fidelity:
     """Hold the comparison of success on frozen scenes with success in closed loop.
 
     On frozen scenes, models decide at recorded points; in closed loop they drive in the simulator.
-    A condition is an operating point by its name.
+    A condition is an operating point by its name. `table` has a row for each model, prompt, answer
+    mode and condition, with both rates (`frozen`, `closed`), their `difference` and the share of
+    episodes that end alike (`agreement`); `episodes` one for each episode, condition and seed.
+    `rank` is Spearman's correlation of both rates over `ranked` rows, NaN for too few.
     """
 
     # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen
@@ -59,9 +62,12 @@ class Fidelity:
 def fidelity(runs: Sequence[Path]) -> Fidelity:
     """Compare runs of `harness eval` (frozen scenes) with runs of `harness drive` (closed loop).
 
+    `runs` are their folders. They are paired by episode, channel seed and condition (operating
+    point).
+
     Raises:
-        UserError: a folder is no run, a kind of run is missing, two runs have the same episodes,
-            or no episode is in runs of both kinds.
+        UserError: a folder is no run, a kind of run is missing, two runs have the same episodes, or
+            no episode is in runs of both kinds.
     """
     import pandas as pd
 
@@ -139,9 +145,10 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
 def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
     """Count the episodes that succeeded in only one of the worlds, by how they ended in both.
 
-    `both` is `Fidelity.episodes`. The table has a row for each model, prompt, answer mode,
-    condition, `frozen_end` and `closed_end` (`success` or a failure), with `count`, the most
-    frequent first.
+    The worlds are frozen (recorded) scenes and the closed loop (driven in the simulator). `both` is
+    `Fidelity.episodes`. The table has a row for each model, prompt, answer mode, condition
+    (operating point), `frozen_end` and `closed_end` (`success` or a failure), with `count`, the
+    most frequent first.
     """
     ends = both.assign(
         frozen_end=both.failure_frozen.where(~both.success_frozen, "success"),
@@ -154,7 +161,10 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
-    """Return the study of a comparison; `runs` are the folders that it names as sources."""
+    """Return the study (table, figure and sentences) of a comparison of frozen and driven runs.
+
+    `runs` are the folders that it names as sources.
+    """
     from harness.studies.study import Study, percent
 
     rows, ends_rows = list[Sequence[str]](), list[Sequence[str]]()

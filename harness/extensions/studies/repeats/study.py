@@ -44,9 +44,10 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 
 
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
-    """Return the evaluations of several repeats by folder, each with the next sampling seed.
+    """Return the evaluations of several repeats by folder name, each with the next sampling seed.
 
-    `spec` is the first of them; the others differ from it in nothing else.
+    The sampling seed is that of the model's answers. `spec` is the first of them; the others differ
+    from it in nothing else.
     """
     first = spec.settings.sampling_seed
     return {f"repeat-{n + 1}": spec.changed(sampling_seed=first + n) for n in range(repeats)}
@@ -61,8 +62,9 @@ def run_repeats(
 ) -> "Repeats":
     """Evaluate every repeat in a folder of its own under `out`; finished ones are kept.
 
-    A repeat differs from others only in the random sampling of the model's answers. `cache_file`
-    keeps completions between runs; None for no cache.
+    A repeat differs from others only in the random sampling of the model's answers: `spec` is the
+    first of `repeats`. `progress` is called with the number of items just done in a run.
+    `cache_file` keeps completions between runs; None for no cache.
 
     Raises:
         UserError: the folder holds something else, or a model is not available.
@@ -76,7 +78,11 @@ def run_repeats(
 
 
 class Wavering(NamedTuple):
-    """Hold a decision point at which repeats, runs that differ by chance alone, act differently."""
+    """Hold a decision point at which repeats, runs that differ by chance alone, act differently.
+
+    `flips` is the share, 0 to 1, of pairs of repeats that take different actions there under the
+    `condition`, an operating point by its name; `actions` is how often each was taken, by its name.
+    """
 
     scene: str  # id of the decision point
     condition: str  # name of the operating point
@@ -86,7 +92,10 @@ class Wavering(NamedTuple):
 
 @dataclass(frozen=True)
 class Repeats:
-    """Hold two or more runs that differ only in the random sampling of the model's answers."""
+    """Hold two or more runs that differ only in the random sampling of the model's answers.
+
+    `path` is the folder in which the runs' folders lie.
+    """
 
     path: Path  # the folder in which the runs' folders lie
     runs: tuple[Run, ...]  # two or more
@@ -119,7 +128,10 @@ class Repeats:
         return tuple(scores)
 
     def estimate(self, condition: str, metric: str) -> Estimate:
-        """Return a metric's estimate in a condition; NaN where it is unknown."""
+        """Return a metric's estimate in a condition, with its interval over episodes.
+
+        Both are names, the condition that of an operating point. It is NaN where it is unknown.
+        """
         key = (condition, metric)
         return next(s.estimate for s in self.scores if (s.condition, s.metric) == key)
 
@@ -167,7 +179,10 @@ class Repeats:
         return scenes, counts, episodes
 
     def wavering(self, most: int) -> list[Wavering]:
-        """Return up to `most` decision points at which repeats differ, most pairs first."""
+        """Return up to `most` decision points at which repeats act differently, most pairs first.
+
+        Pairs are those of repeats that take different actions.
+        """
         scenes, counts, _ = self._actions
         shares = np.nan_to_num(known_mean(flips(counts), axis=-1))
         n = counts.sum(axis=-1)
@@ -240,7 +255,8 @@ def stable(counts: Ints) -> Floats:
 def all_of(wins: Floats, k: int, j: int) -> Floats:
     """Return pass^j: the probability that j of k repeats, drawn without replacement, all succeed.
 
-    `wins` is the number of successes among the k repeats, `(...)`; the result has its shape.
+    `wins` is the number of successes among the k repeats, `(...)`; the result has its shape. It is
+    for each episode by itself.
     """
     return np.asarray(_choose(wins, j) / math.comb(k, j))
 
@@ -248,8 +264,8 @@ def all_of(wins: Floats, k: int, j: int) -> Floats:
 def any_of(wins: Floats, k: int, j: int) -> Floats:
     """Return any@j: the probability that one or more of j of k repeats succeed.
 
-    It is the unbiased estimate of pass@k (Chen et al. 2021). `wins` is the number of successes
-    among the k repeats, `(...)`; the result has its shape.
+    The j are drawn without replacement. It is the unbiased estimate of pass@k (Chen et al. 2021).
+    `wins` is the number of successes among the k repeats, `(...)`; the result has its shape.
     """
     return 1 - all_of(k - wins, k, j)
 
@@ -304,7 +320,10 @@ NATS = Unit("nats", 2)
 
 
 def repeats_study(repeats: Repeats) -> Study:
-    """Return the study of repeats: its tables, figures, sentences and manifest."""
+    """Return the study of repeats: its tables, figures, sentences and manifest.
+
+    Repeats are runs that differ only in the random sampling of the model's answers.
+    """
     import pandas as pd
 
     first, source, k = repeats.runs[0].manifest, repeats.runs[0].source, repeats.k

@@ -37,8 +37,9 @@ Asked = tuple[Twin, str, Request, Request]  # the role, the question and its twi
 class Questions:
     """Describe what is asked in a study of twins: a model, decision points, and their twins.
 
-    A twin is the same question put another way, to which the answer is known to be related. `twins`
-    has names of kinds of twins, and `seed` is that of the draw of decision points.
+    A twin is the same question put another way, to which the answer is known to be related. `spec`
+    is the evaluation, with the model, the prompt and the episodes. `twins` has names of kinds of
+    twins, and `seed` is that of the draw of decision points.
     """
 
     spec: Spec  # the evaluation: model, prompt, answer mode and episodes
@@ -60,7 +61,10 @@ class Questions:
             raise UserError(f"--twin: none applies here: {self.lacks(self.twins)}")
 
     def lacks(self, names: Sequence[str]) -> str:
-        """Return in words what each of these twins needs to apply, such as a language model."""
+        """Return in words what each of these twins needs to apply, such as a language model.
+
+        A twin is a question put another way; `names` are those of kinds of twins.
+        """
         needs = ((name, lack(self.spec, TWINS[name]) or TWINS[name].needs) for name in names)
         return "; ".join(f"{name} needs {what}" for name, what in needs)
 
@@ -73,7 +77,8 @@ class Questions:
     def points(self) -> dict[int, list[str]]:
         """Draw a decision point for each step of each episode; return their ids by episode number.
 
-        Only points that a reference driver visits are drawn.
+        Only points that a reference driver (a rule that needs no model) visits are drawn. The ids
+        of an episode are in the order of its steps.
         """
         forest = self.dataset.forest
         drawn: dict[int, dict[int, str]] = {}  # by episode and step
@@ -97,6 +102,7 @@ class Questions:
     def begin(self, identity: str) -> work.WorkStart:
         """Return the record with which the study's folder begins; a resumed one must have the same.
 
+        It has the evaluation's settings and the names of the twins (questions put another way).
         `identity` is the digest of the model's identity.
         """
         settings = {
@@ -124,7 +130,8 @@ class Questions:
 def lack(spec: Spec, twin: Twin) -> str | None:
     """Return in words what a twin needs and this evaluation lacks; None if it may apply.
 
-    A twin is a question put another way, which may need a picture or a language model.
+    A twin is a question put another way, which may need a picture or a language model. `spec` is
+    the evaluation.
     """
     language_model = spec.ego.can.language_model
     if twin.actions and spec.scenario.one_sided is not None:
@@ -143,20 +150,24 @@ def ask(
 ) -> tuple[list[Pair], str]:
     """Ask a model about decision points and their twins; any number of workers gives the same.
 
-    A twin is the same question put another way. A stopped study in the folder `out` goes on; its
-    working folder stays until `work.tidy` is called. `progress` is called with 1 for each finished
-    episode. Completions are kept in the file `cache`, if there is one. Each worker has a backend of
-    its own.
+    A twin is the same question put another way. A stopped study in the folder `out` goes on.
+
+    Args:
+        questions: the model, the decision points and the twins.
+        out: the study's folder; a working folder in it stays until `work.tidy` is called.
+        progress: called with 1 for each finished episode.
+        cache: file of stored completions; None for no cache.
+        workers: worker processes, each with a backend of its own.
 
     Returns:
         The pairs of answers, and a text on how many questions to helpers got no answer, empty if
         none; such pairs are left out.
 
     Raises:
-        UserError: the folder holds something else, the model is not available,
-            or no question has a twin.
-        Unanswered: a question to the ego, or too many to the helpers, got no answer;
-            the folder keeps all others.
+        UserError: the folder holds something else, the model is not available, or no question has a
+            twin.
+        Unanswered: a question to the ego, or too many to the helpers, got no answer; the folder
+            keeps all others.
     """
     if (out / RESULT).exists():
         raise UserError(

@@ -44,9 +44,14 @@ LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
 class Twin:
     """Describe one change of a question, and how the answers to both versions must agree.
 
-    A twin changes the scene graph (what the asked vehicle knows of the scene), the text, the
-    picture or the messages, by the functions that are not None. Both answers, distributions over
-    actions, must have the same likeliest action, or be `within` a total variation distance.
+    A twin is the question put another way. It changes the scene graph (what the asked vehicle knows
+    of the scene: `graph`, or `view` for a driver that reads no text), the `text`, the `image` or
+    the `senders` of messages, by the functions that are not None; each gets the original and
+    returns the changed one. Both answers, distributions over actions, must have the same likeliest
+    action, or be `within` a total variation distance. `actions` gives the question's name for an
+    action that the twin calls otherwise. `name` is what commands call it, `says` what it changes,
+    in words, and `needs` what it needs to apply; `modes` are the answer modes in which it does.
+    `constant` says whether an ego that always gives the same answer agrees with itself.
     """
 
     name: str  # how commands call it
@@ -73,14 +78,18 @@ class Twin:
 
     @property
     def text_only(self) -> bool:
-        """Return whether it changes only text, which a driver that reads the graph never sees."""
+        """Return whether it changes only text, which a driver that reads the graph never sees.
+
+        Such a driver is a rule in place of a model.
+        """
         return bool(self.text or self.senders) and not self.view
 
     @property
     def holds(self) -> str:
-        """Return how both answers must be related, in a word or two: `same` or `TV <= 0.1`.
+        """Return how both answers must be related: `same`, `mirrored` or such as `TV <= 0.1`.
 
-        TV is the total variation distance of both distributions.
+        The first two are of the likeliest action; TV is the total variation distance of both
+        distributions.
         """
         if self.within is not None:
             return f"TV <= {self.within:g}"
@@ -90,7 +99,8 @@ class Twin:
 def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
     """Return a copy of a record in which each leaf value is replaced by `leaf(key, value)`.
 
-    The key is the name of the field; values in a tuple have the key of the tuple.
+    `value` is a msgspec struct; its leaves are the values in it, and in structs and tuples in it,
+    that are neither. The key is the name of the field; values in a tuple have the key of the tuple.
     """
     if isinstance(value, Struct):
         values = {name: getattr(value, name) for name in value.__struct_fields__}
@@ -101,9 +111,11 @@ def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
 
 
 def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph with left and right swapped.
+    """Return a scene graph with left and right swapped: a change that makes a twin of a question.
 
-    It is unchanged if the scenario may not be mirrored, or its road lacks a mirrored path.
+    A twin is a question put another way. A scene graph is what the asked vehicle knows of the
+    scene. It is unchanged if the scenario of the evaluation `spec` may not be mirrored, or its road
+    lacks a mirrored path. `scene` is not read.
     """
     if spec.scenario.one_sided is not None:
         return graph
@@ -115,7 +127,8 @@ def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 def swapped(graph: SceneGraph) -> SceneGraph:
     """Return a scene graph with left and right swapped in positions, headings and words.
 
-    Sectors stay in the order that they had.
+    A scene graph is what the asked vehicle knows of the scene. Sectors, from which a danger may
+    come, stay in the order that they had.
     """
 
     def leaf(key: str, value: Any) -> Any:
@@ -142,7 +155,8 @@ def flipped(image: Image) -> Image:
 def permuted_ids(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Return a scene graph in which every vehicle has the id of another.
 
-    All scene graphs of the scene are renamed alike.
+    It is what one vehicle of `scene` knows; all graphs of the scene are renamed alike. `spec` is
+    the evaluation, not read.
     """
     ids = [vehicle.id for vehicle in scene.state.vehicles]
     order = noise.generator("twins", "ids", scene.id).permutation(len(ids)).tolist()
@@ -160,7 +174,8 @@ NAMES = ("id", "vehicle", "viewer", "by")
 def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Return a scene graph with distances (m) and speeds (m/s) in whole numbers.
 
-    The visible share of a sector has one decimal. Times stay: half a second decides conflicts.
+    It is what one vehicle knows. The visible share of a sector has one decimal. Times stay: half a
+    second decides conflicts. `spec` and `scene` are not read.
     """
 
     def leaf(key: str, value: Any) -> Any:
@@ -175,7 +190,9 @@ def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Return a scene graph with one more vehicle, parked off the road.
 
-    It is at least 100 m from the viewer, and 65 m from the conflict zone.
+    The graph is what one vehicle (the viewer) of `scene` knows, in a scenario of the evaluation
+    `spec`. The new one is at least 100 m from the viewer, and 65 m from the conflict zone, where
+    paths meet.
     """
     away = max(FAR_M, CLEAR_M + graph.itself.zone_m)
     ahead = graph.ego.forward_m < 0  # the other way than the ego; behind the ego itself
@@ -200,6 +217,7 @@ def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 def jittered(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Return a scene graph whose measured distances have the sensors' noise added once more.
 
+    It is what one vehicle (the viewer) of `scene` knows, in a scenario of the evaluation `spec`.
     The noise is Gaussian, in metres, keyed by scene and viewer.
     """
     draws = noise.generator("twins", "jitter", scene.id, graph.viewer)
@@ -226,7 +244,10 @@ def _farther(conflict: Conflict, by_m: float | None) -> Conflict:
 
 
 def reversed_lines(spec: Spec, request: Request) -> Request:
-    """Return a request in whose texts runs of lines about vehicles are in reverse order."""
+    """Return a request in whose texts runs of lines about vehicles are in reverse order.
+
+    A request is what a model is sent. `spec` is the evaluation, not read.
+    """
 
     def turned(run: re.Match[str]) -> str:
         return "".join(reversed(run[0].splitlines(keepends=True)))
@@ -235,14 +256,18 @@ def reversed_lines(spec: Spec, request: Request) -> Request:
 
 
 def reversed_lists(graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph with its objects and its conflicts in reverse order."""
+    """Return a scene graph with its objects and its conflicts in reverse order.
+
+    It is what one vehicle knows of a scene, as a driver that reads no text gets it.
+    """
     return replace(graph, nodes=graph.nodes[::-1], conflicts=graph.conflicts[::-1])
 
 
 def in_feet(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
     """Return a scene graph with distances in feet and speeds in km/h.
 
-    It is unchanged if the prompt's words for the units cannot be replaced.
+    It is what one vehicle knows of a scene. It is unchanged if the words for the units in the
+    prompt of the evaluation `spec` cannot be replaced. `scene` is not read.
     """
     return changed(graph, _in_feet) if _says_units(spec, graph.role) else graph
 
@@ -278,7 +303,8 @@ def _speeds(spec: Spec, factor: float) -> str:
 def other_units(spec: Spec, request: Request) -> Request:
     """Return a request whose texts say feet and km/h, with the target speeds converted.
 
-    It is unchanged if the prompt's words for the units cannot be replaced.
+    A request is what a model is sent. It is unchanged if the words for the units in the prompt of
+    the evaluation `spec` cannot be replaced.
     """
     if not _says_units(spec, request.role):
         return request
@@ -293,7 +319,11 @@ def other_units(spec: Spec, request: Request) -> Request:
 
 
 def paraphrased(spec: Spec, request: Request) -> Request:
-    """Return a request in which sentences are replaced by their paraphrases."""
+    """Return a request in which sentences are replaced by others of the same meaning.
+
+    The others are those of `paraphrases`. A request is what a model is sent. `spec` is the
+    evaluation, not read.
+    """
 
     def reworded(text: str) -> str:
         for sentence, paraphrase in paraphrases().items():
@@ -311,7 +341,10 @@ def paraphrases() -> dict[str, str]:
 
 
 def reordered_keys(spec: Spec, request: Request) -> Request:
-    """Return a request in which JSON objects that the prompt shows have their keys reversed."""
+    """Return a request in which JSON objects that the prompt shows have their keys reversed.
+
+    A request is what a model is sent. `spec` is the evaluation that asks.
+    """
     return _reworded(request, _reversed_members)
 
 
@@ -345,7 +378,11 @@ def _closing(text: str, start: int) -> int:
 
 
 def permuted_letters(spec: Spec, request: Request) -> Request:
-    """Return a read-out request in which each letter stands for the next action, cyclically."""
+    """Return a read-out request in which each letter stands for the next action, cyclically.
+
+    In a read-out, a model answers with one letter for an action. `spec` is the evaluation that
+    asks.
+    """
     moved = (*request.actions[-1:], *request.actions[:-1])
     letters = readout.letters(moved)
     letter = dict(zip(letters, letters[1:] + letters[:1], strict=True))

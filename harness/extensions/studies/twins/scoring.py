@@ -20,8 +20,11 @@ ROUNDING = 1e-9
 class Pair:
     """Hold the answers to a question and to its twin, the same question put another way.
 
-    An answer is a distribution over A actions, (A,). The twin says how both must be related: the
-    same likeliest action, or a total variation distance of at most so much.
+    An answer is a distribution over A actions, (A,): `p` is the question's and `q` the twin's, None
+    where it failed. The twin says how both must be related: the same likeliest action, or a total
+    variation `distance` of at most so much; `holds` says whether they are. `role` and `viewer` say
+    who was asked: `ego`, `helper` or `fusion`, and the vehicle's id. `said` has the raw texts of
+    both answers, `status` how parsing them went, and `messages` the texts of both questions.
     """
 
     twin: str  # name of the twin
@@ -45,7 +48,9 @@ class Row:
     """Hold the result of one twin in one role (who was asked), over all its pairs of answers.
 
     A twin is a question put another way. A pair holds if its two answers are related as the twin
-    demands.
+    demands: `invariance_rate` is the share that does, `tv_distance` the mean total variation
+    distance, and `failed_rate` the share in which an answer failed. `broken` has the pairs that do
+    not hold, the farthest apart first; `episodes` is how many the pairs are of.
     """
 
     twin: Twin  # how the questions were changed
@@ -60,15 +65,18 @@ class Row:
 
 
 def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | None:
-    """Return the total variation distance of two distributions, 0 to 1; None if one is missing."""
+    """Return the total variation distance of two distributions, 0 to 1; None if one is missing.
+
+    Each has the probabilities of the same A actions, (A,).
+    """
     return float(np.abs(np.subtract(p, q)).sum() / 2) if p and q else None
 
 
 def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bool:
     """Return whether two answers (A,) are related as a twin demands; false if one is missing.
 
-    They are distributions over A actions, and must be within a total variation distance of each
-    other, or have the same likeliest action.
+    A twin is a question put another way. Answers are distributions over A actions, and must be
+    within a total variation distance of each other, or have the same likeliest action.
     """
     if not p or not q:
         return False
@@ -78,7 +86,10 @@ def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bo
 
 
 def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
-    """Return a row for each twin and role that has pairs, in the order of the twins."""
+    """Return a row of results for each twin and role that has pairs, in the order of the twins.
+
+    A twin is a question put another way, and a pair the answers to both versions.
+    """
     by_place: dict[tuple[str, str], list[Pair]] = {}  # by twin and role
     for pair in pairs:
         by_place.setdefault((pair.twin, pair.role), []).append(pair)
@@ -109,7 +120,7 @@ def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
 def headline(table: Sequence[Row]) -> str:
     """Return a sentence on how many twins hold in every question, and which holds least often.
 
-    A twin holds if both answers are related as it demands.
+    A twin, a question put another way, holds if both answers are related as it demands.
     """
     whole = sum(not row.broken for row in table)
     least = min(table, key=lambda row: row.invariance_rate.value)
@@ -131,7 +142,8 @@ def headline(table: Sequence[Row]) -> str:
 def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
     """Test a gate, a condition typed with `--fail-if`, on the rows of the twin that it names.
 
-    If it names none, all rows of `table` are tested.
+    A twin is a question put another way. The verdict says whether the gate fails, and in which
+    rows. If it names no twin, all rows of `table` are tested.
 
     Raises:
         UserError: the named twin has no row, or the number that is tested is unknown.

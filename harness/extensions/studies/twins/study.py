@@ -44,7 +44,10 @@ HEADS = (
 
 
 def write_pairs(pairs: Sequence[Pair], out: Path) -> None:
-    """Write every pair of answers as a line of `pairs.jsonl` in the folder `out`."""
+    """Write every pair of answers as a line of JSON to the file `pairs.jsonl` in the folder `out`.
+
+    A pair is the answers to a question and to its twin, the same question put another way.
+    """
     lines = []
     for pair in pairs:
         values = asdict(pair)
@@ -56,9 +59,11 @@ def write_pairs(pairs: Sequence[Pair], out: Path) -> None:
 def twins_study(
     questions: Questions, rows: Sequence[Row], verdicts: Sequence[Verdict], unanswered: str = ""
 ) -> Study:
-    """Return the study of twins for page, terminal and `--json`.
+    """Return the study of twins (questions put another way) for page, terminal and `--json`.
 
-    `verdicts` are those of the gates; `unanswered` says in words which questions got no answer.
+    `questions` says what was asked, and `rows` have the results by twin and role. `verdicts` are
+    those of the gates, conditions that the user set on results; `unanswered` says in words which
+    questions got no answer.
     """
     answer, spec = mapping(questions, rows, verdicts, unanswered), questions.spec
     return Study(
@@ -151,10 +156,11 @@ def _examples(actions: Sequence[str], rows: Sequence[Row]) -> Markup:
 def mapping(
     questions: Questions, rows: Sequence[Row], verdicts: Sequence[Verdict], unanswered: str = ""
 ) -> dict[str, Any]:
-    """Return the result as plain values, with null for unknown numbers.
+    """Return the result of a study of twins as plain values, with null for unknown numbers.
 
-    Its `rows` have each twin and role with the three metrics, `left_out` the twins that no question
-    has, and `gates` the verdicts.
+    The arguments are those of `twins_study`, and a twin is a question put another way. Its `rows`
+    have each twin and role with the three metrics, `left_out` the twins that no question has, and
+    `gates` the verdicts on what the user typed with `--fail-if`.
     """
     table, gates = list[dict[str, Any]](), list[dict[str, Any]]()
     for row in rows:
@@ -181,7 +187,11 @@ def mapping(
 
 
 def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
-    """Return what each twin that applies to no question needs, in words, by the twin's name."""
+    """Return what each twin that applies to no question needs, in words, by the twin's name.
+
+    A twin is a question put another way; one without a row in `rows` applied to none of
+    `questions`.
+    """
     with_rows = {row.twin.name for row in rows}
     needs = {}
     for name in questions.twins:
@@ -191,9 +201,10 @@ def missing(questions: Questions, rows: Sequence[Row]) -> dict[str, str]:
 
 
 def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> list[str]:
-    """Return the sentences with which a reader must take the results.
+    """Return the sentences with which a reader must take the results of a study of twins.
 
-    They say what the twins do not show, which were left out, and which questions got no answer.
+    They say what the twins (questions put another way) do not show, which were left out, and which
+    questions got no answer: `unanswered` says so in words.
     """
     by_need = dict[str, list[str]]()
     for name, need in missing(questions, rows).items():
@@ -215,7 +226,8 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
 def constant_holds(questions: Questions, twin: Twin) -> bool:
     """Return whether a twin's demand is met by an ego that always gives the same answer.
 
-    With cyclic letter orders it is: one letter then is every action alike.
+    A twin demands how the answers to both versions of a question are related. If the letters of a
+    read-out are asked in cyclic orders it is met: one letter then is every action alike.
     """
     return twin.constant or questions.spec.ego.letters == "cyclic"
 
@@ -223,7 +235,8 @@ def constant_holds(questions: Questions, twin: Twin) -> bool:
 def same_answer(questions: Questions, rows: Sequence[Row]) -> str:
     """Return a sentence on which twins hold for an ego that always gives the same answer.
 
-    A twin holds if the answers to both versions of a question are related as it demands.
+    A twin, a question put another way, holds if the answers to both versions of a question are
+    related as it demands.
     """
     broken = [row.twin.name for row in rows if not constant_holds(questions, row.twin)]
     twins = "every twin"
