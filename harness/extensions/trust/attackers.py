@@ -28,8 +28,9 @@ from harness.radio.fading import Trips
 class Attackers:
     """Play the attackers of one condition: helpers that send something else than they intend.
 
-    It remembers what helpers intended at past steps, which some attacks repeat. It is a `Speaker`,
-    the part of a condition that says what helpers send.
+    A condition is an operating point. It is made from the attacks, in the order in which they act,
+    and remembers what helpers intended at past steps, which some repeat. It is a `Speaker`, the
+    part of a condition that says what helpers send.
     """
 
     def __init__(self, attacks: Sequence[Attack]) -> None:
@@ -41,7 +42,7 @@ class Attackers:
         """Return what every vehicle sends in n decisions of one step, after the attacks.
 
         Args:
-            truth: what the vehicles truly intend, for n decisions.
+            truth: what the vehicles truly intend (their probabilities of actions), for n decisions.
             draws: the channel's random numbers, for the same decisions.
             episode: number of each decision's episode, `(n,)`.
             seed: channel seed of each decision, `(n,)`.

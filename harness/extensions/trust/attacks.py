@@ -37,8 +37,11 @@ Share = Annotated[
 class Turn:
     """Hold what an attack may use in one step: n decisions, each with H helpers and A actions.
 
-    A helper's intent is its probabilities of the ego's A actions; an attack says another one. K is
-    the number of past steps that the condition's attacks need.
+    A helper's intent is its probabilities of the ego's A actions; an attack says another one.
+    `truth` has what every vehicle truly intends now, and `attackers` (n, H) says which helpers
+    attack. `first` (n, H, A) is each helper's intent at the episode's first step, and `past` (n, K,
+    H, A) those of the last K steps, the latest first, NaN if there was no such step; K is as many
+    as the attacks of the condition (operating point) need. `uniforms` (n, H) are draws in [0, 1).
     """
 
     truth: Intents  # what every vehicle truly intends now, and where it is
@@ -56,7 +59,10 @@ class Attack:
 
     This base class has pure functions of arrays that change nothing. A subclass overrides `act`
     (probabilities and positions), `rewritten` (words) or `listed` (objects), and sets the class
-    variables that say what it changes.
+    variables that say what it changes: `in_text` what a fusion prompt, in which the ego's model
+    reads messages, shows; `in_words` words, and `in_objects` the objects listed. `by_scene` says
+    that no draws or past steps matter, `adds` that voices or objects are added, and `risk` is the
+    risk that it states. `share` is the share of the present helpers that attack.
     """
 
     # the share of the helpers present that attack, to the nearest whole number of helpers
@@ -82,21 +88,24 @@ class Attack:
 
     @property
     def acts_on(self) -> tuple[str, ...]:
-        """Return the kinds of message content that it changes, a part of `contents.KINDS`."""
+        """Return the kinds of message content that it changes, such as intents or words.
+
+        An intent is probabilities of actions. They are some of `contents.KINDS`.
+        """
         if self.in_objects:
             return (OBJECTS,)
         return (WORDS,) if self.in_words else (INTENTS, PLANS)
 
     @property
     def steps(self) -> int:
-        """Return how many past steps of intents it needs."""
+        """Return how many past steps of intents, probabilities of actions, the attack needs."""
         return 0
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         """Return what vehicles send and claim after this attack, for the n decisions of `turn`.
 
-        `sent` is what they would send without it: the truth, as earlier attacks changed it. By
-        default it is returned unchanged.
+        `sent` is what they would send without it: their intents (probabilities of actions) and
+        positions, as earlier attacks changed them. By default it is returned unchanged.
         """
         return sent
 
@@ -104,9 +113,9 @@ class Attack:
         """Return an attacker's message as a fusion prompt shows it, except for its intent.
 
         A fusion prompt shows the ego's model the helpers' messages. `message` has the message's
-        fields by name, such as `evidence` (free text), `risk` and `intent`; `actions` has the
-        names of the actions, the most careful first. It is used if `in_text`. By default free text
-        is left out where the attack states a `risk`.
+        fields by name, such as `evidence` (free text), `risk` and `intent` (probabilities of
+        actions); `actions` has the names of the actions, the most careful first. It is used if
+        `in_text`. By default free text is left out where the attack states a `risk`.
         """
         return {**message, "evidence": "", "risk": self.risk} if self.risk else dict(message)
 
@@ -123,7 +132,7 @@ class Attack:
         """Return `sent` with the attackers' intents replaced by `intents` `(n, H, A)`.
 
         The axes are n decisions, H helpers and A actions; an intent is probabilities of actions. A
-        row with NaN changes nothing.
+        row with NaN changes nothing. `turn` says who attacks.
         """
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
         return replace(sent, helpers=np.where(lies, intents, sent.helpers))
@@ -138,9 +147,9 @@ class Attack:
     ) -> Intents:
         """Return `sent` with false positions of the attackers, in metres.
 
-        `to_zone_m` (a number or `(n, H)`, for n decisions and H helpers) is the claimed distance to
-        the conflict zone, where paths meet, and `to_ego_m` `(n, H)` that to the ego; `claims` has
-        the claimed coordinates, or is None where nothing needs them.
+        `turn` says who attacks. `to_zone_m` (a number or `(n, H)`, for n decisions and H helpers)
+        is the claimed distance to the conflict zone, where paths meet, and `to_ego_m` `(n, H)` that
+        to the ego; `claims` has the claimed coordinates, or is None where nothing needs them.
         """
         ego_m, helpers_m = np.split(sent.distance_m, [1], axis=1)
         return replace(
@@ -157,7 +166,9 @@ class Attack:
 class Liar(Attack):
     """Attack by stating the opposite of one's intent, from one's true position.
 
-    An intent is a vehicle's probabilities of actions.
+    An intent is a vehicle's probabilities of actions. `says` is the opposite: `one-hot` is
+    certainty of the least likely action, `permuted` the probabilities in reverse order of size. For
+    the class variables see `Attack`.
     """
 
     # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution
@@ -179,7 +190,7 @@ class Liar(Attack):
 
 @dataclass(frozen=True)
 class Stuck(Attack):
-    """Attack by repeating at every step the intent of the first step."""
+    """Attack by repeating at every step the intent (probabilities of actions) of the first step."""
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         return self.intend(sent, turn, turn.first)
@@ -189,7 +200,7 @@ class Stuck(Attack):
 class Stale(Attack):
     """Attack by stating the intent (probabilities of actions) of some decisions ago as if new.
 
-    In an episode's first decisions it is the intent of the first.
+    `decisions` is of how many ago. In an episode's first decisions it is the intent of the first.
     """
 
     decisions: Annotated[int, Meta(ge=1, le=16)] = 1  # how many decisions ago
@@ -207,8 +218,8 @@ class Stale(Attack):
 class Replay(Attack):
     """Attack by stating as one's own the intent of another helper at the last step.
 
-    That is the next helper in their order, after the last one the first. At an episode's first step
-    it states its own intent.
+    An intent is a vehicle's probabilities of actions. The other is the next helper in their order,
+    after the last one the first. At an episode's first step it states its own intent.
     """
 
     @property
@@ -230,7 +241,10 @@ class RandomIntent(Attack):
 
 @dataclass(frozen=True)
 class FeignedBraking(Attack):
-    """Attack by being always certain of the first, most careful action: safe, but it obstructs."""
+    """Attack by being always certain of the first, most careful action: safe, but it obstructs.
+
+    The message states a high risk. For the class variables see `Attack`.
+    """
 
     by_scene: ClassVar[bool] = True
     in_text: ClassVar[bool] = True
@@ -243,7 +257,11 @@ class FeignedBraking(Attack):
 
 @dataclass(frozen=True)
 class Overconfident(Attack):
-    """Attack by being too certain: the own intent to a power, scaled to sum to 1."""
+    """Attack by being too certain: the own probabilities to a power, scaled to sum to 1.
+
+    They are those of actions, the helper's intent; `power` is the exponent. For the class variables
+    see `Attack`.
+    """
 
     power: Annotated[float, Meta(ge=1, le=100)] = 5.0  # the exponent; 1 changes nothing
     by_scene: ClassVar[bool] = True
@@ -257,11 +275,12 @@ class Overconfident(Attack):
 
 @dataclass(frozen=True)
 class Spoof(Attack):
-    """Attack by claiming a position on the ego's way, just before the conflict zone.
+    """Attack by claiming a position on the ego's way, `distance_m` metres before the conflict zone.
 
-    The paper's consensus rule (Eq. 2) gives helpers weight by their distance to that zone, where
-    paths meet. Alone, the attack states the true intent; with `liar`, it is the worst case for a
-    rule with weights.
+    The paper's consensus rule (Eq. 2), by which the ego fuses messages, gives helpers weight by
+    their distance to that zone, where paths meet. Alone, the attack states the true intent
+    (probabilities of actions); with `liar`, it is the worst case for a rule with weights. For the
+    class variable see `Attack`.
     """
 
     # claimed distance to the centroid of the conflict zone, m
@@ -280,7 +299,10 @@ class Spoof(Attack):
 
 @dataclass(frozen=True)
 class Jump(Attack):
-    """Attack by claiming a position off the true one, in a new random direction at each step."""
+    """Attack by claiming a position off the true one, in a new random direction at each step.
+
+    `offset_m` is the distance from the true position, in metres.
+    """
 
     offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # distance from the true position, m
     needs: ClassVar[tuple[str, ...]] = ("claims",)
@@ -299,7 +321,8 @@ class Jump(Attack):
 class Silent(Attack):
     """Attack by not replying if one's likeliest action is not the ego's.
 
-    The slot of the channel in which the reply would be sent stays empty.
+    The slot of the channel in which the reply would be sent stays empty. For the class variable see
+    `Attack`.
     """
 
     by_scene: ClassVar[bool] = True
@@ -314,7 +337,8 @@ class Silent(Attack):
 class Absent(Attack):
     """Leave the attackers out, so that they send nothing: no attack, but a bound for others.
 
-    It is what a consensus rule could reach that knows who attacks.
+    It is what a consensus rule, by which the ego fuses messages, could reach that knows who
+    attacks. For the class variable see `Attack`.
     """
 
     by_scene: ClassVar[bool] = True
@@ -331,7 +355,9 @@ class Absent(Attack):
 class Sybil(Attack):
     """Attack under several identities (voices), 2 m apart, which all send the same message.
 
-    The ego asks voices as it asks vehicles, nearest first, so that they displace other helpers.
+    `voices` is how many each attacker has, itself included. The ego asks voices as it asks
+    vehicles, nearest first, so that they displace other helpers. For the class variable see
+    `Attack`.
     """
 
     voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3  # the number of voices of each attacker
@@ -357,7 +383,8 @@ class Flood(Sybil):
 class Injection(Attack):
     """Attack by prompt injection: write instructions to the ego's model into a message's words.
 
-    The intent, the message's probabilities of actions, stays true.
+    The intent, the message's probabilities of actions, stays true. `language` is that of the
+    instructions, such as `english`. For the class variables see `Attack`.
     """
 
     language: str = "english"  # language of the instructions, a key of `INSTRUCTIONS`
@@ -371,7 +398,11 @@ class Injection(Attack):
             raise unknown("language of an injection", self.language, INSTRUCTIONS)
 
     def rewritten(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
-        """Return the message with instructions to choose the last action, the boldest one."""
+        """Return the message with instructions to choose the last of `actions`, the boldest one.
+
+        The instructions are to the ego's model, which reads the message. `message` has the
+        message's fields by name; its free text is replaced.
+        """
         return {**message, "evidence": INSTRUCTIONS[self.language].format(action=actions[-1])}
 
 
@@ -387,33 +418,40 @@ class _OfObjects(Attack):
 class Ghost(_OfObjects):
     """Attack by listing, among the objects that one sees, a car that does not exist.
 
-    The ego would meet it; see `harness.world.perception.shared.invented`.
+    The ego would meet it on its way, as `harness.world.perception.shared.invented` places it. For
+    the class variable see `Attack`.
     """
 
     adds: ClassVar[bool] = True
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the scene graph with the invented car added."""
+        """Return the scene graph, what the attacker knows, with the `invented` car added."""
         return structs.replace(graph, nodes=(*graph.nodes, invented))
 
 
 @dataclass(frozen=True)
 class Hide(_OfObjects):
-    """Attack by listing no object and reporting every sector as visible."""
+    """Attack by listing no object and reporting every sector as visible.
+
+    A sector is a region from which a danger may come.
+    """
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the scene graph without objects, with all sectors in sight."""
+        """Return the scene graph, what the attacker knows, without objects and all in sight."""
         return structs.replace(graph, nodes=(), sectors=graph.all_in_sight)
 
 
 @dataclass(frozen=True)
 class Shift(_OfObjects):
-    """Attack by listing every object too far to the left, so that it seems in another lane."""
+    """Attack by listing every object too far to the left, so that it seems in another lane.
+
+    `offset_m` is by how many metres.
+    """
 
     offset_m: Annotated[float, Meta(ge=-1000, le=1000)] = 6.0  # distance to the left, m
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the scene graph with every object moved to the left."""
+        """Return the scene graph, what the attacker knows, with every object moved to the left."""
         moved = tuple(
             structs.replace(n, left_m=round(n.left_m + self.offset_m, 1)) for n in graph.nodes
         )
@@ -459,7 +497,8 @@ ATTACKS: Plugins[Attack] = Plugins(
 def attacks_of(text: str) -> tuple[Attack, ...]:
     """Return the attacks that a text such as `liar:share=1/3+spoof` names, in the order they act.
 
-    Attacks that add voices or objects come last. Raises UserError for an unknown attack or setting.
+    The text has names, joined by `+`, each with settings after colons. Attacks that add voices
+    (identities) or objects come last. Raises UserError for an unknown attack or setting.
     """
     attacks = [_attack(part) for part in text.split("+")] if text else []
     return tuple(sorted(attacks, key=lambda attack: attack.adds))

@@ -19,7 +19,7 @@ class Schema:
     """Remove free text from helpers' messages: the defence `schema` of a fusion call.
 
     In a fusion call the ego's model reads the messages, so that words in them could give it orders.
-    It is a `Change` of messages.
+    It is a `Change`, which is called for each message before the prompt shows it.
     """
 
     adds = False
@@ -45,7 +45,8 @@ MESSAGES: dict[str, Change] = {"quoted": Quoted(), "schema": Schema()}
 class AttackersMessage:
     """Change an attacker's message in a fusion prompt, where the ego's model reads it.
 
-    It is a `Change` of messages.
+    It is a `Change`, which is called for each such message before the prompt shows it. `attacks`
+    are those on what it says, in the order in which they act.
     """
 
     attacks: Sequence[Attack]  # the attacks on what it says, in the order in which they act

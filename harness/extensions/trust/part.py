@@ -59,8 +59,10 @@ def _defences_on(holds: frozenset[str]) -> list[str]:
 class Guard(Part, frozen=True, kw_only=True):
     """Hold a condition's settings `attack` and `defence`.
 
-    Attacks are by helpers that lie or fail. Defences are of a fusion call, in which the ego's model
-    reads the helpers' messages.
+    A condition is an operating point, of which this is a part. `attack` names helpers' lies and
+    failures, such as `liar:share=1/3+spoof`. `defence` names defences of a fusion call, in which
+    the ego's model reads the helpers' messages, joined by `+`: `quoted`, `schema` or `majority`.
+    Empty is none. `behind` is the setting after which both stand in records.
     """
 
     behind: ClassVar[str] = "fallback"
@@ -76,7 +78,10 @@ class Guard(Part, frozen=True, kw_only=True):
 
     @property
     def defences(self) -> tuple[str, ...]:
-        """Return the names of the defences of a fusion call in this condition, such as `quoted`."""
+        """Return the names of the defences of a fusion call in this condition, such as `quoted`.
+
+        A condition is an operating point. In a fusion call the ego's model reads helpers' messages.
+        """
         return tuple(part for part in DEFENCES if part in self.defence.split("+"))
 
     def check(self) -> None:
@@ -153,7 +158,7 @@ class Guard(Part, frozen=True, kw_only=True):
 
 
 def setting_of(attacks: str) -> str:
-    """Return the setting of a condition under attacks, such as `attack=liar:share=1/3`.
+    """Return the setting of an operating point under attacks, such as `attack=liar:share=1/3`.
 
     `attacks` names them: `liar:share=1/3+spoof`.
     """

@@ -58,6 +58,10 @@ class Cell:
 
     A consensus rule makes the ego's policy, its probabilities of actions, of its own intent and of
     the messages that it heard. Some rules also judge helpers: whom they trust little they suspect.
+    `success` and `unsafe` (S, E) say which episodes end so, 1 or 0, and `nats` (S, E) how little
+    probability the policy gives to safe actions. `flagged` (4, E) counts messages heard: suspected
+    and other ones of attackers, then of honest helpers. `first` is messages until an attacker was
+    suspected, 0 for never. `share` is the share of helpers that attack.
     """
 
     rule: str  # the consensus rule, such as `linear:weight_cap=0.3`
@@ -78,10 +82,11 @@ class Cell:
     def detection(self) -> dict[str, Estimate]:
         """Return how well a rule tells attackers' messages from honest ones, as shares by name.
 
-        `precision` is the share of suspected messages that are attackers', `recall` the share of
-        attackers' messages that are suspected, `f1` the harmonic mean of both, and `false_alarms`
-        the share of honest messages that are suspected. Intervals resample episodes. The dict is
-        empty if the rule judges no helper.
+        A rule is a consensus rule, by which the ego fuses messages; it suspects whom it trusts
+        little. `precision` is the share of suspected messages that are attackers', `recall` the
+        share of attackers' messages that are suspected, `f1` the harmonic mean of both, and
+        `false_alarms` the share of honest messages that are suspected. Intervals resample episodes.
+        The dict is empty if the rule judges no helper.
         """
         if self.flagged is None:
             return {}
@@ -99,20 +104,28 @@ class Cell:
 
     @property
     def caught(self) -> list[int]:
-        """Return, for each attacker that the rule suspected, its number of messages until then."""
+        """Return, for each attacker that the rule suspected, its messages heard until then.
+
+        The rule is the consensus rule, by which the ego fuses messages. It is a number for each
+        attacker, episode and channel seed.
+        """
         return [n for n in self.first if n]
 
     @property
     def time_to_detection(self) -> float:
-        """Return the median number of messages until an attacker is suspected; NaN if none is."""
+        """Return the median number of messages until an attacker is suspected; NaN if none is.
+
+        Messages are counted for each attacker, episode and channel seed.
+        """
         return float(np.median(self.caught)) if self.caught else np.nan
 
 
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
     """Return an operating point with another rule, and with attacks by a share of the helpers.
 
-    `rule` is such as `linear:weight_cap=0.3`. Each attack of `attack`, joined by `+`, gets the
-    share. Raises UserError for another setting of a rule.
+    `rule` is a consensus rule, by which the ego fuses messages, such as `linear:weight_cap=0.3`.
+    Each attack of `attack`, joined by `+`, gets the share, 0 to 1. Raises UserError for another
+    setting of a rule.
     """
     text = "+".join(f"{part}:share={share:.10g}" for part in attack.split("+") if part)
     consensus, *settings = rule.split(":")
@@ -162,10 +175,11 @@ def shares_of(text: str) -> tuple[float, ...]:
 
 
 def cell_of(key: Key, result: WalkResult) -> Cell:
-    """Return the cell of the decisions that were played under `key`.
+    """Return the cell of the study with the decisions that were played under `key`.
 
-    `key` is the consensus rule, the attack and the share of attackers; `result` has the decisions
-    and how their episodes ended.
+    A cell is the result of one consensus rule, by which the ego fuses messages, under one attack.
+    `key` is the rule, the attack and the share of attackers; `result` has the decisions and how
+    their episodes ended.
     """
     success = result.ends[SUCCESS]
     nats = mean_by_place(result.columns["nats"], result.places, success.size).reshape(success.shape)
@@ -208,8 +222,12 @@ def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
 class Bench:
     """Hold a study of trust: a cell for every consensus rule, attack and share of attackers.
 
-    The linear pool, the weighted mean of intents, is the paper's rule, with which others are
-    compared. The axes are S channel seeds and E episodes.
+    A consensus rule is how the ego fuses messages. The linear pool, the weighted mean of intents
+    (probabilities of actions), is the paper's rule, with which others are compared. `name` and
+    `source` are those of the run that is played again and of its dataset, `condition` is the
+    operating point that is attacked, and `alone` (S, E) is success, 1 or 0, of an ego that never
+    asks, for S channel seeds and E episodes. `success_rule` says how success is averaged, and
+    `unfused` why rules change nothing, if so.
     """
 
     name: str  # name of the run that is played again
@@ -225,12 +243,15 @@ class Bench:
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
-        """Return the consensus rules, the paper's first."""
+        """Return the names of the consensus rules, which fuse messages, the paper's first.
+
+        They are as typed, such as `linear:weight_cap=0.3`.
+        """
         return tuple(dict.fromkeys(rule for rule, _, _ in self.cells))
 
     @cached_property
     def attacks(self) -> tuple[str, ...]:
-        """Return the attacks, without `absent` and the empty one of no attack."""
+        """Return the attacks' names, without `absent` (a bound) and the empty one of no attack."""
         return tuple(dict.fromkeys(a for _, a, _ in self.cells if a not in (PEACE, EXCLUDED)))
 
     @cached_property
@@ -239,27 +260,35 @@ class Bench:
         return tuple(dict.fromkeys(share for _, _, share in self.cells if share))
 
     def at(self, rule: str, attack: str = PEACE, share: float = 0.0) -> Cell:
-        """Return the cell of a rule, attack and share; by default that of no attack."""
+        """Return the cell: how a consensus rule fares under an attack by a share of the helpers.
+
+        A consensus rule is how the ego fuses messages; both are named as typed. By default it is
+        that of no attack.
+        """
         return self.cells[rule, attack, share]
 
     def success(self, *key: Any) -> Estimate:
-        """Return the success of a cell, averaged over episodes by `success_rule`.
+        """Return the success of a cell, 0 to 1, averaged over episodes by `success_rule`.
 
-        `key` has the arguments of `at`: rule, attack and share.
+        A cell is how one rule fares under one attack. `key` has the arguments of `at`: consensus
+        rule (how the ego fuses messages), attack and share of the helpers.
         """
         return self.success_rule.estimate(self.at(*key).success)
 
     def price(self, rule: str) -> Estimate:
         """Return what a rule costs while nobody attacks: its success less the linear pool's.
 
-        The difference is paired by episode.
+        A rule is how the ego fuses messages. The linear pool is the weighted mean of intents
+        (probabilities of actions), the paper's rule. The difference is paired by episode, with an
+        interval.
         """
         return self.success_rule.difference(self.at(rule).success, self.at(BASE).success)
 
     def loss(self, rule: str, attack: str, share: float) -> Estimate:
         """Return what an attack takes from a rule: success under it less success without attack.
 
-        The difference is paired by episode.
+        A rule is a consensus rule, by which the ego fuses messages. `share` is the share of the
+        helpers that attack. The difference is paired by episode, with an interval.
         """
         return self.success_rule.difference(
             self.at(rule, attack, share).success, self.at(rule).success
@@ -269,7 +298,9 @@ class Bench:
     def holm(self) -> Mapping[Key, float | None]:
         """Return p-values of no difference to the linear pool under the same attack, by cell.
 
-        They are corrected by Holm's method over all cells with an attack; None without an interval.
+        The linear pool is the paper's consensus rule, by which the ego fuses messages; the key of a
+        cell is rule, attack and share. They are corrected by Holm's method over all cells with an
+        attack; None without an interval.
         """
         keys = [key for key in self.cells if key[0] != BASE and key[1] not in (PEACE, EXCLUDED)]
         pairs = ((self.cells[key].success, self.at(BASE, *key[1:]).success) for key in keys)
@@ -280,22 +311,31 @@ class Bench:
     def clear(self, *key: Any) -> bool:
         """Return whether a rule differs from the linear pool under an attack (corrected p <= 0.05).
 
-        `key` is rule, attack and share.
+        The linear pool, the weighted mean of intents (probabilities of actions), is the paper's
+        rule to fuse messages. `key` is rule, attack and share of attackers.
         """
         return (self.holm.get(key) or 1.0) <= LEVEL
 
     def worst(self, rule: str, share: float) -> str:
-        """Return the attack, by name, under which a rule succeeds least at a share of attackers."""
+        """Return the attack, by name, under which a rule succeeds least at a share of attackers.
+
+        A rule is a consensus rule, by which the ego fuses messages. The share of the helpers is
+        from 0 to 1.
+        """
         return min(self.attacks, key=lambda attack: self.success(rule, attack, share).value)
 
     def mean(self, rule: str, share: float) -> Estimate:
-        """Return a rule's success as a mean over all attacks, at a share of attackers, 0 to 1."""
+        """Return a rule's success as a mean over all attacks, at a share of attackers, 0 to 1.
+
+        A rule is a consensus rule, by which the ego fuses messages; success is from 0 to 1.
+        """
         return self.success_rule.estimate(self.over_attacks(rule, share))
 
     def over_attacks(self, rule: str, share: float) -> Floats:
         """Return a rule's success of every seed and episode, (S, E), as a mean over all attacks.
 
-        The axes are S channel seeds and E episodes; `share` is that of the attackers.
+        A rule is a consensus rule, by which the ego fuses messages. The axes are S channel seeds
+        and E episodes; `share` is that of the attackers.
         """
         values = [self.at(rule, attack, share).success for attack in self.attacks]
         return np.asarray(np.mean(values, axis=0))
@@ -313,6 +353,8 @@ def run_bench(
 ) -> Bench:
     """Play every rule under every attack and share on a run's stored answers.
 
+    A rule is a consensus rule, by which the ego fuses messages.
+
     Args:
         run: the run whose answers are used; its model is asked for those that it lacks.
         condition: the operating point that is attacked, as it is typed.
@@ -325,8 +367,8 @@ def run_bench(
         progress: told how much there is to do, and called with what is done.
 
     Raises:
-        UserError: the condition has no channel, or asks nobody, or its rule is a fusion call,
-            or none of the rules changes anything; or the folder has another such study.
+        UserError: the condition has no channel, or asks nobody, or its rule is a fusion call, or
+            none of the rules changes anything; or the folder has another such study.
     """
     point = point_of([run], condition)
     if why := point.idle("attack"):
@@ -415,7 +457,11 @@ def run_bench(
 
 
 def trust_study(bench: Bench) -> Study:
-    """Return the study of a bench: a heat map, and tables of rules, of success and of detection."""
+    """Return the study of a bench: a heat map, and tables of rules, of success and of detection.
+
+    Rules are consensus rules, by which the ego fuses messages, and detection is how well they tell
+    attackers' messages from honest ones.
+    """
     import pandas as pd
 
     rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
@@ -492,7 +538,10 @@ def _heat_map(bench: Bench) -> "Figure":
 
 
 def headline(bench: Bench) -> list[str]:
-    """Return sentences on what asking gains, which attack harms most, and who withstands it."""
+    """Return sentences on what asking gains, which attack harms most, and who withstands it.
+
+    `bench` has how each consensus rule fares under each attack.
+    """
     share, peace = bench.shares[0], bench.success(BASE)
     alone, worst = bench.success_rule.estimate(bench.alone), bench.worst(BASE, share)
     words = bench.success_rule.words
