@@ -19,7 +19,7 @@ TOKEN = "token"
 
 
 def cookie(port: int) -> str:
-    """Return the name of the cookie that holds the token on a port.
+    """Return the name of the cookie that holds the secret token of a server on a port.
 
     Browsers send the cookies of one port to all ports, so the name has the port.
     """
@@ -29,7 +29,8 @@ def cookie(port: int) -> str:
 class Access:
     """Guard the pages, as ASGI middleware: answer 403 to requests without the token.
 
-    Requests that another website causes are refused, too; all others are passed on to the app.
+    It is made from the app that it guards and the secret token, which a request has in its address
+    or in a cookie. Requests that another website causes are refused, too; all others are passed on.
     """
 
     def __init__(self, app: ASGIApp, token: str) -> None:

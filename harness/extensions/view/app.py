@@ -124,9 +124,10 @@ class _Guarded:
 
 
 class View:
-    """Answer the requests of the web application for one folder of runs.
+    """Answer the requests of the web application for one folder of runs, a method for each address.
 
-    Files are read in threads; pages that take seconds are made one at a time.
+    Each takes the request and returns the page or file. Files are read in threads; pages that take
+    seconds are made one at a time.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -140,7 +141,7 @@ class View:
         return HTMLResponse(page, headers=OF_LIST if "<script>" in page else None)
 
     def progress(self, request: Request) -> Response:
-        """Return as JSON what changes in the list while runs go on."""
+        """Return as JSON what changes in the list of runs while runs go on: `pages.now`."""
         every = runs(self.folder)
         return JSONResponse(pages.now(every, pages.extents(self.folder, every)))
 
@@ -172,7 +173,10 @@ class View:
         )
 
     async def notes(self, request: Request) -> Response:
-        """Return the page with the notes on a run, and a form for another."""
+        """Return the page with the notes on a run's decisions, and a form for another.
+
+        The address has the run's name, `path`, and may have the decision point's id, `scene`.
+        """
         [run] = await run_in_threadpool(self._picked, request)
         [path] = self._whole([run])
         scene = request.query_params.get("scene", "")
@@ -181,9 +185,11 @@ class View:
         return HTMLResponse(page, headers={"Referrer-Policy": "same-origin"})
 
     async def note(self, request: Request) -> Response:
-        """Write the note that a form sent, and lead back to the run's notes.
+        """Write the note that a form sent, and lead back to the page of the run's notes.
 
-        A request that names no origin is refused here; `Access` refuses one from another origin.
+        The form has `path` (the run's name), `scene` (the decision point's id), `text` and `before`
+        (the date of the note that is replaced). A request that names no origin is refused here;
+        `Access` refuses one from another origin.
         """
         if "origin" not in request.headers:
             raise HTTPException(
@@ -233,7 +239,10 @@ class View:
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
 
     async def compare(self, request: Request) -> Response:
-        """Return the page that compares two runs; A is the older, or the one in the address."""
+        """Return the page that compares two runs, named by `path` in the address.
+
+        Run A is the one of `a` in the address, else the one that began first.
+        """
         picked = await run_in_threadpool(self._picked, request)
         if len(picked) != 2:
             raise UserError(f"{len(picked)} runs are picked; pick two to compare them")
@@ -250,7 +259,7 @@ class View:
         return await self._drawn(request, partial(pages.report, self._whole(picked), None, scene))
 
     def wrong(self, request: Request, error: Exception) -> Response:
-        """Return an error page of one line, with the error's status, 400 for a UserError."""
+        """Return an error page of one line, with the error's HTTP status, 400 for a UserError."""
         status, reason = (
             (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, error)
         )

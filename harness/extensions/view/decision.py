@@ -13,8 +13,9 @@ from harness.report.runs import Runs
 def with_decision(page: str, runs: Runs, scene: str) -> str:
     """Return the HTML page of some runs with all details of one decision point put in.
 
-    `page` is the HTML, and `scene` the point's id. The details are prompts, answers and pictures,
-    which the page itself has for few points. Raises UserError if no run has the point.
+    A decision point is a situation in which the ego decided. `page` is the HTML of the report on
+    `runs`, and `scene` the point's id. The details are prompts, answers and pictures, which the
+    page itself has for few points. Raises UserError if no run has the point.
     """
     detail = library.packed({scene: everything(runs, scene)})
     return page.replace(
@@ -23,9 +24,10 @@ def with_decision(page: str, runs: Runs, scene: str) -> str:
 
 
 def everything(runs: Runs, name: str) -> dict[str, Any]:
-    """Return all details of one decision point, as a run's page shows them.
+    """Return all details of one decision point as plain values, for the script of a run's page.
 
-    `name` is the point's id. Raises UserError if no run has it.
+    `name` is the point's id. They are its prompts, answers, decisions and picture. Raises UserError
+    if no run has it.
     """
     if not any(name in run.decisions.scenes for run in runs.runs):
         raise UserError(

@@ -23,7 +23,11 @@ from harness.runs.records import Score
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one run in a history: a list of runs on the same scenes, with one metric, by date."""
+    """Hold one run in a history: a list of runs on the same scenes, with one metric, by date.
+
+    `name` is its folder, relative to the folder of all runs, `date` is when it began, and `score`
+    its value of the metric under the list's condition (operating point); None where it has none.
+    """
 
     name: str  # its folder, relative to the folder of all runs
     date: datetime  # when it began, UTC
@@ -37,7 +41,8 @@ class Group:
     """Hold the runs of the same scenes, by date, and the metric and condition of their values.
 
     A condition is an operating point by its name: everything that a decision depends on besides
-    scene and model, such as the radio.
+    scene and model, such as the radio. `of` names the scenes for people, `metric` is such as
+    `success_rate`, and `lines` has the runs, the oldest first.
     """
 
     of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
@@ -60,12 +65,13 @@ def history(
     The group with the newest run comes first.
 
     Args:
-        folder: is searched as `harness run ls` does.
+        folder: is searched for runs, with folders below it.
         metric: a metric of `summary.csv`; None for each group's headline success.
-        condition: of the values; None for the last of those that most of a group's runs have.
+        condition: name of an operating point; None for the last of those that most of a group's
+            runs have.
         dataset: name of the dataset, or of the scenario of driven runs; None for all.
-        wrong: called with the name of a run that is left out since a file of it is broken,
-            and the error.
+        wrong: called with the name of a run that is left out since a file of it is broken, and the
+            error.
 
     Raises:
         UserError: there is no such folder, metric, condition or dataset.

@@ -24,9 +24,9 @@ class Note(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def notes(run: Path) -> list[Note]:
-    """Return the notes in a run's folder, sorted by decision point; empty without the file.
+    """Return the notes in a run's folder, sorted by decision point; empty if nobody wrote one.
 
-    Raises UserError if the file is broken.
+    Raises UserError if the file of notes is broken.
     """
     try:
         return msgspec.json.decode(text_of(run / FILE, "text"), type=list[Note])

@@ -43,7 +43,8 @@ def report(folders: Sequence[Path], written: Path | None = None, scene: str | No
     """Return the HTML report of the runs in these folders: the content of `written`, or a new one.
 
     `written` is a report that lies in the run's folder; None makes a new one. `scene` is the id of
-    a decision point, all details of which are put in; None for none.
+    a decision point, a situation in which the ego decided, all details of which are put in; None
+    for none.
     """
     runs = gather(folders)
     page = render(runs) if written is None else whole_text(written)
@@ -61,7 +62,7 @@ def with_way_back(page: str, links: Sequence[tuple[str, str]] = (), home: str = 
 
 
 def whole_text(page: Path) -> str:
-    """Return the text of an HTML page that lies in a run's folder."""
+    """Return the text of an HTML page that lies in a run's folder, read at once."""
     return bytes_of(page, "rows").decode("utf-8", "replace")
 
 
@@ -99,7 +100,10 @@ def suite_of(folder: Path, name: str) -> SuiteRun:
 
 
 def suite(folder: Path, name: str) -> str:
-    """Return the HTML page of a suite of runs, by its name in the list of `folder`."""
+    """Return the HTML page of a suite of runs, by its name in the list of `folder`.
+
+    A suite is one model's runs on several scenarios.
+    """
     done = suite_of(folder, name)
     return suites.render([(done, suites.lines(done))], partial(_place, folder))
 
@@ -112,8 +116,9 @@ def listed(folder: Path, words: str, order: str) -> str:
     """Return the HTML list of the runs in `folder` that match, sorted by a column.
 
     `words` are separated by spaces; a run matches if its name, kind, state, model, prompt, answer
-    mode, condition and tags contain each of them. `order` is one of `COLUMNS`, with `-` before it
-    for the reverse order. While a run goes on, the page has a script, allowed by its digest.
+    mode, condition (operating point) and tags contain each of them. `order` is one of `COLUMNS`,
+    with `-` before it for the reverse order. While a run goes on, the page has a script, allowed by
+    its digest.
     """
     every = runs(folder)
     how_far = extents(folder, every)
@@ -139,7 +144,10 @@ def listed(folder: Path, words: str, order: str) -> str:
 
 
 def extents(folder: Path, every: Sequence[Listed]) -> dict[str, Extent]:
-    """Return how far each unfinished run is, by its name; `every` are all runs in `folder`."""
+    """Return how far each unfinished run is, by its name, such as its episodes done and due.
+
+    `every` are all runs in `folder`.
+    """
     return {run.name: extent(folder / run.name) for run in every if run.state == "unfinished"}
 
 
@@ -165,7 +173,10 @@ def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any
 
 
 def progress(run: Listed, extent: Extent) -> str:
-    """Return in words how far an unfinished run is."""
+    """Return in words how far an unfinished run is, such as how many episodes of how many.
+
+    `extent` has these numbers, and `run` says how to continue it.
+    """
     due = "" if extent.due is None else f" of {'at most ' * extent.early}{extent.due}"
     text = f"{extent.done}{due} episodes"
     if extent.answers:
@@ -187,7 +198,7 @@ def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
 def study(run: Listed, pictures: Sequence[str]) -> str:
     """Return an HTML page of a study's pictures, for a study without a page of its own.
 
-    `run` is the study in the list, and `pictures` has the file names in its folder.
+    `run` is the study as the list of runs has it, and `pictures` has the file names in its folder.
     """
     return _page("study.html.j2", run=run, pictures=pictures)
 
@@ -240,8 +251,8 @@ def note(path: Path, scene: str, text: str, before: str) -> None:
         before: the date of the note that is replaced, as the form showed it; empty if there was
             none.
 
-    Raises UserError if the run has no such point, if the note there has another date by now, or as
-    `harness.extensions.view.notes.write` does.
+    Raises UserError if the run has no such point, if the note there has another date by now, or if
+    the text is too long or the file of notes cannot be written.
     """
     if scene not in read_run(path).decisions.labels("scene"):
         raise UserError(

@@ -13,10 +13,13 @@ from harness.runs.folder import Run
 
 
 class Remarks:
-    """Show users' notes on the page of their run; see `harness.report.remarks.Remarks`."""
+    """Show users' notes on the page of their run.
+
+    It is an extension's `harness.report.remarks.Remarks`, which the page asks for sentences.
+    """
 
     def sentences(self, runs: Runs) -> Iterator[Markup]:
-        """Yield each note on a decision point of these runs, as HTML."""
+        """Yield each note on a decision point of these runs, as HTML with a link to it."""
         template = environment(Path(__file__).parent).get_template("remark.html.j2")
         for place, run in enumerate(runs.runs):
             if noted := notes(run.path):

@@ -14,8 +14,8 @@ def serve(folder: Path, port: int, listening: Callable[[str], None]) -> None:
 
     Args:
         folder: the folder of runs.
-        port: the port; 0 for a free one.
-        listening: called with the address, which holds the token, once the server listens.
+        port: the TCP port on 127.0.0.1; 0 for a free one.
+        listening: called with the address, which holds the secret token, once the server listens.
 
     Raises:
         UserError: the port is not available.
