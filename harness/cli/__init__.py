@@ -77,7 +77,11 @@ _UsageError: Any = typer.BadParameter.__mro__[1]
 
 
 def main() -> None:
-    """Run the command line: print a UserError as one line on stderr, and exit with `EXIT_CODES`."""
+    """Run the command line that was typed.
+
+    A UserError, which says what the user did wrong, is printed as one line on stderr, and the
+    process exits with the error's `code`, one of `EXIT_CODES`.
+    """
     gc.set_threshold(COLLECT_AFTER, 10, 10)
     # all memory goes as the process ends; its last collections would walk it all
     atexit.register(gc.freeze)

@@ -70,22 +70,26 @@ OLD = {
 
 
 def commands() -> Mapping[str, str]:
-    """Return the function (`module:function`) behind each command, those of extensions included."""
+    """Return where the function of each command is, those of extensions included.
+
+    The key is what is typed, such as `run ls`, and the value the function's place,
+    `module:function`.
+    """
     return joined(COMMANDS, "commands")
 
 
 def groups() -> Mapping[str, str]:
-    """Return the help text of each group of commands, those of extensions included."""
+    """Return the help text of each group of commands by its name, those of extensions included."""
     return joined(GROUPS, "groups")
 
 
 def spellings() -> Mapping[str, str]:
-    """Return what replaces each renamed command, by its old spelling, extensions' included."""
+    """Return what is typed now for each renamed command, by its old spelling."""
     return joined(OLD, "spellings")
 
 
 def short() -> Mapping[str, str]:
-    """Return permanent short forms of commands, by what is typed; only extensions have any."""
+    """Return the command for each permanent short form, by that; only extensions have any."""
     return joined({}, "short")
 
 

@@ -47,8 +47,8 @@ class Videos(Protocol):
     def write(self, run: Path, most: int, quiet: bool) -> list[Path]:
         """Draw up to `most` episodes that failed under the run's last condition; return the files.
 
-        A condition is an operating point by its name. `run` is the run's folder; `quiet` shows no
-        progress.
+        A condition is an operating point by its name. `run` is the folder of a closed-loop run;
+        `quiet` shows no progress.
         """
         ...
 
@@ -157,8 +157,9 @@ def command(
 def deciding(scenario: str, agents: str) -> str:
     """Return the name of a scenario with a setting of which vehicles decide for themselves.
 
-    `agents` is `ego`, `all` or a share of the other vehicles, such as 0.5. Raises UserError for any
-    other text, or a scenario in which only the ego has a goal.
+    `scenario` is its name without, and `agents` is `ego`, `all` or a share of the other vehicles,
+    such as 0.5. Raises UserError for any other text, or a scenario in which only the ego has a
+    goal.
     """
     from harness.world import scenarios
 

@@ -154,7 +154,7 @@ def show_counted(spec: "Spec", counted: dict[str, Any], times: int = 1) -> None:
     """Print what an evaluation would take, as a dry run counted it: requests, tokens and cost.
 
     `spec` is the evaluation, and `counted` what `evaluate.dry_run.count` returned for it. The cost
-    is that of so many `times`, as of repeats.
+    is that of so many `times`, since repeats ask as often.
     """
     repeated = f" × {times} repeats" if times > 1 else ""
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"

@@ -197,9 +197,9 @@ def takes(
     a file of settings, or a run's folder; options typed beside it win.
 
     Args:
-        world: what is evaluated, frozen scenes or a closed loop.
+        world: what is evaluated, frozen (recorded) scenes or a closed loop.
         help: other help texts for some options, by name.
-        without: options to leave out.
+        without: names of options to leave out.
     """
 
     def decorate(command: Any) -> Any:
@@ -242,7 +242,8 @@ def takes(
 def as_command(typed: Any, command: Any, parameters: list[inspect.Parameter]) -> Any:
     """Return the function `typed` with these parameters, and with the name and help of `command`.
 
-    So typer reads it as a command. Options of extensions come last in its help.
+    Both are functions: typer reads the first as a command, which calls the second. Options of
+    extensions come last in its help.
     """
     in_order = sorted(parameters, key=_is_of_extension)
     typed.__signature__ = inspect.Signature(in_order)
@@ -283,7 +284,8 @@ def _parameter(option: stated.Option) -> inspect.Parameter:
 def cards(models: "Sequence[str] | None") -> "list[Card]":
     """Return the model cards (files that describe a model) of the models that a user names.
 
-    None stands for no models. Raises UserError if there is no such model.
+    `models` are names, paths or hub ids; None stands for no models. Raises UserError if there is no
+    such model.
     """
     from harness.backends.cards import resolve
 
@@ -291,7 +293,10 @@ def cards(models: "Sequence[str] | None") -> "list[Card]":
 
 
 def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
-    """Print a line on stderr for each dataset that has fewer episodes than --limit."""
+    """Print a line on stderr for each dataset that has fewer episodes than --limit.
+
+    `limit` is the number that was typed; None for no limit prints nothing.
+    """
     for dataset in datasets:
         if limit is not None and limit > (n := dataset.manifest.episodes):
             echo(
@@ -302,10 +307,10 @@ def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
 
 
 def of_families(command: Any) -> Any:
-    """Give a command the options that name a scenario of a family.
+    """Return a command with further options that name a scenario of a family.
 
-    A family is scenarios that an extension makes by name, such as `env:merge-v0`. The command gets
-    what is typed for them as `of_family`: texts by the option's name.
+    A family is scenarios that an extension makes by name, such as `env:merge-v0`. The command, a
+    function, gets what is typed for them as `of_family`: texts by the option's name.
     """
     from harness.world.families import FAMILIES
 
@@ -320,8 +325,9 @@ def of_families(command: Any) -> Any:
 def of_extensions(followed: bool) -> Callable[[Any], Any]:
     """Return a decorator that gives a command the options of extensions that no run keeps.
 
-    The command gets what is typed for them as `of_command`: values by the option's name. Those that
-    follow whole runs are given if the command's runs are `followed`.
+    The command gets what is typed for them as `of_command`: values by the option's name. An option
+    of what follows whole runs, such as a tracker, is given only if the command's runs are
+    `followed`.
     """
     from harness.evaluate.command_options import OPTIONS
 
@@ -358,9 +364,11 @@ def _gathering(command: Any, name: str, added: Sequence[inspect.Parameter]) -> A
 
 
 def scenario_name(name: str | None, of_family: Mapping[str, str]) -> str:
-    """Return the name of a scenario, or of one of a family by the options that were typed.
+    """Return the scenario's name that was typed, or that of a family by its options.
 
-    Raises UserError unless exactly one of the two is given and can be used.
+    A family is scenarios that an extension makes by name. `name` is None if no name was typed, and
+    `of_family` has the options by name. Raises UserError unless exactly one of the two is given and
+    can be used.
     """
     from harness.world.families import FAMILIES
 
@@ -379,7 +387,7 @@ def scenario_name(name: str | None, of_family: Mapping[str, str]) -> str:
 
 
 def typed_scenario(scenario: str) -> str:
-    """Return a scenario's name, and allow it to open what it needs, such as a module.
+    """Return a scenario's name as it is, and allow it to open what it needs, such as a module.
 
     Only a name that the user typed may do so, not one from a file.
     """
@@ -391,21 +399,31 @@ def typed_scenario(scenario: str) -> str:
 
 
 def workers_of(text: str) -> "parallel.Workers":
-    """Return the workers that a text of --workers names. Raises UserError if it names none."""
+    """Return the workers, a number of processes or a Ray cluster, that a text of --workers names.
+
+    Raises UserError if it names none.
+    """
     from harness.core.parallel import workers_of
 
     return workers_of(text)
 
 
 def shard_of(text: str | None) -> "shards.Shard | None":
-    """Return the shard (part I of N) that a text of --shard names; None for None."""
+    """Return the shard that a text of --shard names, part I of N of a run or dataset.
+
+    The text is such as `2/8`; None for None. Raises UserError if it is no such text.
+    """
     from harness.core.shards import shard_of
 
     return None if text is None else shard_of(text)
 
 
 def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
-    """Print that a shard is done, and the command that merges all of them."""
+    """Print that a shard is done, and the command that merges all of them.
+
+    A shard is one of several parts of a run or dataset that are made apart; `out` is its folder,
+    and `what` says in words what it has.
+    """
     echo(
         f"wrote {printable(out)}: {what}, shard {shard}; merge all {shard.of} shards with "
         "`harness run merge FOLDER... --out FOLDER`"

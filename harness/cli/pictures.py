@@ -27,8 +27,9 @@ COLUMNS = 64  # of a picture in a terminal
 class PictureModel:
     """Hold a model with vision that pictures of a prompt are drawn for, and its picture size.
 
-    `card` is its model card, and `vision` how it takes pictures. `processor_tokens` is the number
-    of tokens of a picture by its own image processor; None if not asked.
+    `card` is its model card, the file that describes it, and `vision` how it takes pictures.
+    `processor_tokens` is the number of tokens of a picture by its own image processor; None if not
+    asked.
     """
 
     card: "Card"  # the model's
@@ -53,7 +54,8 @@ class PictureModel:
     def difference(self) -> str | None:
         """Return a sentence if the image processor's number of tokens is not that on the card.
 
-        None if it is, or the processor was not asked.
+        The card is the file that describes the model. None if the numbers are equal, or the
+        processor was not asked.
         """
         n = self.processor_tokens
         difference = None if n is None else self.vision.difference(n)
@@ -114,7 +116,7 @@ def write(image: "Image", file: Path) -> str:
 
 
 def draw(image: "Image") -> bool:
-    """Draw an image in the terminal, and return whether it was: it must be one with colours."""
+    """Draw an image in the terminal; return whether it was drawn, which takes one with colours."""
     screen = console()
     if not screen.is_terminal or screen.color_system in (None, "standard"):
         return False
@@ -123,7 +125,11 @@ def draw(image: "Image") -> bool:
 
 
 def half_blocks(pixels: "Pixels") -> "Text":
-    """Return pixels (H, W, 3) as text of half-block characters, each with two pixels' colours."""
+    """Return pixels (height, width, 3) as text of half-block characters.
+
+    Pixels are red, green and blue, 0 to 255. Each character has the colours of two, one above the
+    other.
+    """
     from rich.color import Color
     from rich.style import Style
     from rich.text import Text

@@ -56,9 +56,11 @@ class Bar(Progress):
 
 @contextmanager
 def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) -> Iterator[Bar]:
-    """Show a progress bar with count, speed and time left on stderr; nothing if `quiet`.
+    """Show a progress bar with count, speed and time left on stderr, while the context is entered.
 
-    Off a terminal it is a line every `LINE_S` seconds. `grows` is as in `Bar`.
+    The context's value is called with the number of items newly done. Off a terminal it is a line
+    every `LINE_S` seconds; nothing if `quiet`. `total` is the number of items, 0 if unknown;
+    `grows` says that finished items can add more.
     """
     progress = Bar(label, total, grows)
     if quiet:
@@ -123,7 +125,7 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
 
 
 def drawn(console: "Console") -> "Columns":
-    """Return Rich's progress display with a label, a bar, a count and the pace."""
+    """Return Rich's progress display with a label, a bar, a count and the pace, for a console."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,

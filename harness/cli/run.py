@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 class Column:
     """Describe a column of a run's table: its head, and the metric whose scores stand below it.
 
-    `metric` is the metric's name. With `interval`, a score is shown with its interval, else with
-    its unit.
+    `metric` is the metric's name, as in `summary.csv`. With `interval`, a score is shown with its
+    95 % interval, else with its unit.
     """
 
     head: str
@@ -72,7 +72,7 @@ MOST_BESIDE = 3  # conditions of a table of intervals
 
 
 def file_name(model: str) -> str:
-    """Return a model's name with characters that suit a folder's name."""
+    """Return a model's name with characters that suit a folder's name: others become hyphens."""
     return "".join(c if c.isalnum() or c in "._-" else "-" for c in model).strip(".-") or "model"
 
 
@@ -88,18 +88,18 @@ def evaluate(
     then: "Callable[[], object]" = lambda: None,
     follows: "Sequence[Follow]" = (),
 ) -> "tuple[Evaluated, Path]":
-    """Evaluate with a progress bar, write the run and its report, and return both.
+    """Evaluate with a progress bar, and write the run and its report; return the run and the page.
 
     Args:
-        spec: what to evaluate, in frozen scenes or in closed loop.
+        spec: what to evaluate, in frozen (recorded) scenes or in closed loop.
         folder: the run's folder.
-        opens: opens a backend; None for the usual way.
+        opens: opens a model's backend; None for the usual way.
         cache: file of stored completions; None for no cache.
         quiet: whether to show no progress.
         workers: worker processes.
         full: whether the report includes prompts of rules and all pictures.
         then: adds files to the run; if it is interrupted, the run can be resumed.
-        follows: what follows the run.
+        follows: what is told of the run as it goes, such as a tracker.
     """
     from harness.cli.report import write
     from harness.evaluate.frozen_world import FrozenSource
@@ -131,7 +131,7 @@ def evaluate(
 
 
 def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
-    """Return the part of a dataset that a run evaluated, since a run may stop early."""
+    """Return the part of a dataset, the first episodes, that a run evaluated: it may stop early."""
     numbers = dataset.episodes[: run.manifest.world.episodes]
     if len(numbers) == len(dataset.episodes):
         return dataset
@@ -139,17 +139,22 @@ def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
 
 
 def default_out(spec: "Spec") -> Path:
-    """Return the default folder of an evaluation under reports/: a new one, or a stopped one's."""
+    """Return the default folder of an evaluation under reports/.
+
+    It is a new one, named after model, prompt and dataset, or the one in which the same evaluation
+    was stopped.
+    """
     from harness.evaluate.lifecycle import resumable
 
     return free_folder([spec], spec.source.name, lambda folder: resumable(spec, folder))
 
 
 def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], bool]) -> Path:
-    """Return a folder under reports/ named after model, prompts and `scenes`.
+    """Return a folder under reports/ named after the models, the prompts and `scenes`.
 
-    It is the first, with a number if needed, that does not exist or for which `goes_on` is true:
-    the same evaluation was stopped there.
+    `specs` are the evaluations to be written there, with the same models. It is the first, with a
+    number if needed, that does not exist or for which `goes_on` is true: the same evaluation was
+    stopped there.
     """
     ego, *helpers = specs[0].agents
     prompts = "-".join(dict.fromkeys(spec.ego.prompt.version for spec in specs))
@@ -163,7 +168,8 @@ def free_folder(specs: "Sequence[Spec]", scenes: str, goes_on: Callable[[Path], 
 def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
     """Return the first folder among reports/`name`, reports/`name`-2 and so on that is `usable`.
 
-    If it has a number, a line on stderr says so.
+    `usable` takes a folder and says whether it may be taken. If the folder has a number, a line on
+    stderr says so.
     """
     named = Path("reports") / name
     folders = (named if n == 1 else named.with_name(f"{name}-{n}") for n in count(1))
@@ -251,9 +257,14 @@ def show(
 ) -> None:
     """Print a run's table, a row for each condition, with its caveats and notes.
 
-    A condition is an operating point by its name. `done` is the run as it was just evaluated,
-    `scenes` a phrase on its scenes, and `columns` are the table's. `beside` adds rows of references
-    without a model: scores by name and metric. A run with balanced success has a table of it first.
+    A condition is an operating point by its name.
+
+    Args:
+        done: the run as it was just evaluated.
+        scenes: a phrase on its scenes.
+        columns: the table's; a run with balanced success has a table of that first.
+        notes: sentences to print below.
+        beside: rows of references without a model: scores by name and metric; None for none.
     """
     from harness.report.findings import FIRST, LAST, Kind, findings
     from harness.runs.folder import read
@@ -300,8 +311,9 @@ def _scores_table(
 def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:
     """Print success by the number of helpers that see the danger, if the layouts declare it.
 
-    A layout is one drawn start situation; `figures` holds scores by condition and metric,
-    `conditions` the names of the operating points to print.
+    The danger is the vehicle that a cruising ego would meet, and a layout one drawn start
+    situation. `figures` holds scores by condition and metric, `conditions` the names of the
+    operating points to print.
     """
     metrics = {}
     for name, metric in BY_WITNESSES.items():

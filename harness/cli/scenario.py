@@ -92,8 +92,9 @@ class Drives:
     """Describe how reference drivers drive the layouts of a scenario, and what is said of it.
 
     A reference driver is a rule that decides without a model; a layout is one drawn start
-    situation. `check` drives a number of layouts from a seed on and returns the results, `show`
-    prints them.
+    situation. `check` takes the scenario, the number of layouts, the seed of the first, the
+    workers, and what is called with the number just done; it returns the results by name, as JSON
+    has them. `show` takes both numbers and the results, and prints them.
     """
 
     # takes the scenario, how many layouts, the seed of the first, the workers, and what is told how
@@ -119,7 +120,7 @@ DRIVES = Shipped[Drives]("swarmdrive.drives", Drives, {EGO: Drives(_check, _show
 
 
 def drives_of(scenario: "Scenario") -> Drives:
-    """Return how reference drivers drive a scenario.
+    """Return how reference drivers, rules that decide without a model, drive a scenario.
 
     Raises UserError if several agents decide in it, and no extension says so for these.
     """
@@ -136,8 +137,9 @@ def drives_of(scenario: "Scenario") -> Drives:
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
     """Return the scenario of this name, if so many layouts from this seed can be driven together.
 
-    Raises UserError if there is none, or the layouts are too many or serve different purposes.
-    `counted` is the option for their number.
+    A layout is a drawn start situation: `episodes` of them have the seeds from `seed` on. Raises
+    UserError if there is no such scenario, or the layouts are too many or serve different purposes.
+    `counted` is the option for their number, for the message.
     """
     from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios

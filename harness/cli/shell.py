@@ -32,7 +32,8 @@ class Stopped(Exception):
 class Branch(Mapping[str, Any]):
     """Map names to the commands and groups below a group; each is imported when looked up.
 
-    Extensions are searched only if the core has no such name, or all names are listed.
+    It is made from what is typed up to the group, such as `run`; empty for all commands. Extensions
+    are searched only if the core has no such name, or all names are listed.
     """
 
     def __init__(self, path: str) -> None:
@@ -104,7 +105,10 @@ class Command(TyperCommand):
     """Extend typer's command by help that lists options under headings, those without one first."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the arguments, then the options under each heading, to the help."""
+        """Write the arguments, then the options under each heading, to the help.
+
+        `ctx` and `formatter` are click's: the command's context, and what collects the help's text.
+        """
         panels: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         for parameter in self.get_params(ctx):
             if record := parameter.get_help_record(ctx):
@@ -119,7 +123,7 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """Extend typer's group by commands that load on use, and help in one column."""
+    """Extend typer's group of commands: these load on use, and help has one column."""
 
     def __init__(self, path: str = "", **attributes: Any) -> None:
         below: Any = Branch(path)
@@ -130,7 +134,7 @@ class Group(TyperGroup):
         self.path = path
 
     def invoke(self, ctx: Any) -> Any:
-        """Invoke the command that was typed.
+        """Invoke the command that was typed, and return what it returns; `ctx` is click's context.
 
         Raises Stopped if it is interrupted, and UserError if a package tries to end the program.
         """
@@ -144,9 +148,11 @@ class Group(TyperGroup):
             raise
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command that was typed; for an old spelling, print the new one on stderr.
+        """Return the name, the command that was typed, and the arguments behind it.
 
-        An unknown command ends with suggestions of similar ones.
+        For an old spelling of a command, the new one is printed on stderr. An unknown command ends
+        with suggestions of similar ones. `ctx` is click's context, and `args` are the words that
+        were typed.
         """
         old, new = ("", "") if self.path else respelt(args)
         rest = args[len(old.split()) :]
@@ -205,7 +211,10 @@ class Group(TyperGroup):
         return "", ""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write each heading's commands to the help, each with the first sentence of its own."""
+        """Write each heading's commands to the help, each with the first sentence of its own.
+
+        `ctx` and `formatter` are click's: the group's context, and what collects the help's text.
+        """
         here = [*self.commands]
         width = max(map(len, here))
         for panel, names in {"Commands": here}.items() if self.path else panels().items():
@@ -231,7 +240,7 @@ class Group(TyperGroup):
 def respelt(args: list[str]) -> tuple[str, str]:
     """Return the old or short spelling that arguments begin with, and the command it stands for.
 
-    Both are empty if there is none.
+    `args` are the words that were typed. Both are empty if there is none.
     """
     spelt = [" ".join(args[:n]) for n in (2, 1)]
     for typed in spelt:
@@ -255,7 +264,7 @@ def _never(stream: object) -> bool:
 
 
 def hasten(command: Any) -> None:
-    """Have a command convert plain arguments without pydantic, to start faster.
+    """Change a typer command so that it converts plain arguments without pydantic, to start faster.
 
     Typer converts every value with pydantic, a missing one too, and loading that takes a tenth of a
     second. What is not plainly right is left to typer, which words the error.

@@ -18,7 +18,10 @@ CELL = 80
 
 
 def finish(study: "Study", out: Path, as_json: bool = False, quiet: bool = False) -> None:
-    """Write a study to a folder, and print it as JSON or as text, unless `quiet`."""
+    """Write a study to a folder, and print it as JSON or as text.
+
+    `out` is the folder to make. It is JSON if `as_json`, and nothing is printed as text if `quiet`.
+    """
     from harness.studies.study import undrawn, write_study
 
     page = write_study(study, out)
@@ -32,7 +35,7 @@ def finish(study: "Study", out: Path, as_json: bool = False, quiet: bool = False
 
 
 def echo_answer(study: "Study") -> None:
-    """Print a study's result as JSON; a data frame as a list of records."""
+    """Print a study's result, its `answer`, as JSON; a data frame as a list of records."""
 
     def records(frame: Any) -> Any:
         return json.loads(frame.to_json(orient="records"))

@@ -64,9 +64,17 @@ def evaluate(
 ) -> Path:
     """Evaluate on every dataset of a suite with one backend; write and print the means.
 
-    A suite is several datasets, one for each family of scenes. `specs` and `datasets` are the
-    evaluation on each, and the dataset; `evaluated` evaluates one of them. Returns the suite's
-    folder, `out` or a default one for None.
+    A suite is several datasets, one for each family of scenes. Returns the suite's folder.
+
+    Args:
+        suite: the suite.
+        specs: the evaluation on each of its datasets.
+        datasets: these datasets, in the same order.
+        out: the folder to write; None for a default one.
+        evaluated: evaluates one of `specs`, and writes its run; it takes the evaluation, the run's
+            folder, and what opens a backend.
+        quiet: whether to show no progress.
+        as_json: whether to print JSON instead of tables.
     """
     from harness.backends.registry import open_backend
     from harness.evaluate.run import finished_run

@@ -27,14 +27,15 @@ _FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]+?(?:  # (.*))?$", re.
 
 
 def echo_wrong(name: str, error: UserError) -> None:
-    """Print the name of an entry in a list that cannot be used, and the error."""
+    """Print the name of an entry in a list that cannot be used, such as a card, and the error."""
     typer.echo(f"{printable(name)} · wrong\n  {error}")
 
 
 def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
-    """Print a dry run's counts of prompt tokens by role: `least`, `most`, `mean` and `n`.
+    """Print a dry run's counts of prompt tokens by role (`ego`, `helper`).
 
-    Without counts, it prints that there is no tokenizer.
+    Each role has `least`, `most`, `mean` and `n`, the number of prompts. Without counts (None or
+    empty), it prints that there is no tokenizer.
     """
     for role, s in (counted or {}).items():
         typer.echo(
@@ -48,7 +49,11 @@ def echo_prompt_tokens(counted: Mapping[str, Mapping[str, Any]] | None) -> None:
 
 
 def echo_cost(counted: Mapping[str, Mapping[str, Any]], times: int) -> None:
-    """Print a dry run's estimate of cost by model, of so many evaluations alike."""
+    """Print a dry run's estimate of cost by model, of so many `times` the evaluation.
+
+    Each model has `currency`, and the cost of `prompts` (None if not counted) and of `answers` at
+    most.
+    """
     for model, each in counted.items():
         prompts = each["prompts"]
         read = "prompts not counted" if prompts is None else f"{times * prompts:.4g} for prompts"
@@ -165,7 +170,7 @@ def _folded(heads: Sequence[str]) -> list[Sequence[str]]:
 
 
 def attributes(kind: type) -> dict[str, str]:
-    """Return the meaning of each field of a class and its bases, by name.
+    """Return the meaning of each field of a dataclass and its bases, as text by the field's name.
 
     It is the comment beside or above the field, or stands in the docstring's section `Attributes:`.
     """
