@@ -51,7 +51,10 @@ class Axis:
 
     @property
     def values(self) -> str:
-        """Return the text of the default grid; empty if the user must give one."""
+        """Return the text of the default grid, the values to try unless the user gives some.
+
+        It is such as `0,10,20`, in the axis's unit; empty if the user must give one.
+        """
         return ",".join(self.named()) if self.named else self.usual
 
     def at(self, point: OperatingPoint, value: Value) -> OperatingPoint:
@@ -97,9 +100,10 @@ AXES = {
 
 
 def axis_of(name: str) -> Axis:
-    """Return the axis of this name, or one for any setting of that name in the setting's own unit.
+    """Return the axis, what a sweep can vary, of this name.
 
-    Settings are those of operating points and of radio channels. Raises UserError if there is none.
+    That is one of `AXES`, or else a setting of operating points or radio channels, in the setting's
+    own unit. Raises UserError if there is none.
     """
     if name in AXES:
         return AXES[name]
@@ -116,7 +120,8 @@ def axis_of(name: str) -> Axis:
 def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
     """Return the values of an axis that a text states, or its default grid for None.
 
-    The text is a list such as `0,10,20`, ranges `from:to[:step]` with both ends, or both mixed.
+    An axis is what a sweep varies; values are in its unit. The text is a list such as `0,10,20`,
+    ranges `from:to[:step]` with both ends, or both mixed.
 
     Raises:
         UserError: the text cannot be read, or there are more than `MOST_POINTS` values.
@@ -150,7 +155,7 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
 
 
 def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
-    """Return the default values of an axis that an operating point allows.
+    """Return the default values of an axis, what a sweep varies, that an operating point allows.
 
     Raises UserError if the axis has no default grid.
     """
@@ -225,7 +230,8 @@ class Setting:
     def place(self) -> dict[str, Value | None]:
         """Return what identifies the grid point in a table: `condition`, `variable` and `value`.
 
-        If several axes are crossed, there is one more column for each of them.
+        A grid point is an operating point with a number of vehicles. If several axes are crossed,
+        there is one more column for each of them.
         """
         place = {"condition": self.condition, "variable": self.variable}
         if not isinstance(self.value, tuple):
@@ -236,10 +242,10 @@ class Setting:
 
 
 def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tuple[Value, ...]]:
-    """Return all combinations of the values of several axes, one tuple for each grid point.
+    """Return all combinations of the values of several axes, one tuple for each.
 
-    `grids` has the values of each axis, in the order of `axes`, and so has each tuple one. Raises
-    UserError if there are more than `MOST_POINTS`.
+    An axis is what a sweep varies. `grids` has the values of each, in the order of `axes`, and so
+    has each tuple one. Raises UserError if there are more than `MOST_POINTS`.
     """
     values = list(product(*grids))
     if len(values) > MOST_POINTS:
@@ -253,7 +259,8 @@ def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tupl
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
     """Return the grid points of all panels with every setting, as plain values for a manifest.
 
-    A panel is a named set of grid points; they are rows of the same name in the result.
+    A panel is a named set of grid points, operating points with a number of vehicles. The result
+    has by the panel's name a dict for each.
     """
     rows: dict[str, list[dict[str, Any]]] = {}
     for name, settings in panels.items():

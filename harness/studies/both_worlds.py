@@ -20,8 +20,9 @@ def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
     """Compare success of the same episodes on frozen scenes and in closed loop, (S, E) each.
 
     On frozen scenes a decision tree says what follows an action; in closed loop the simulator does.
-    The axes are S channel seeds and E episodes. The result has, by the names in `COMPARED`, success
-    in both, their difference, and the share of episodes that end alike.
+    `frozen` and `closed` are 1 for success or 0; the axes are S channel seeds and E episodes. The
+    result has, by the names in `COMPARED`, success in both, their difference, and the share of
+    episodes that end alike, each with an interval over episodes.
     """
     return {
         "frozen": over_episodes(SUCCESS, frozen),

@@ -66,11 +66,10 @@ Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, 
 class WalkResult:
     """Hold the results of one operating point for S channel seeds and E of the episodes.
 
-    An operating point is everything a decision depends on besides scene and model. The n decisions
-    are those of all these episodes, and each row of `columns` is one of them.
-
-    `ends` has outcomes by metric, (S, E); `columns` has values of the n decisions, and `places`
-    each decision's index in the flattened (S, E).
+    An operating point is everything a decision depends on besides scene and model. `episodes` (E,)
+    has the episodes' numbers, and `ends` (S, E) how they end, such as success, by metric; NaN where
+    one was left out. The n decisions are those of all these episodes: `columns` has their values by
+    name, (n, ...), and `places` (n,) the index of each decision's episode in the flattened (S, E).
     """
 
     episodes: Ints  # their numbers, (E,)
@@ -95,13 +94,16 @@ class Source(Protocol):
     same_episodes: bool  # whether every seed plays the same episodes
 
     def manifest(self) -> dict[str, Any]:
-        """Return where the intents come from, as plain values for the study's manifest."""
+        """Return where the intents come from, as plain values for the study's manifest.
+
+        An intent is a vehicle's probabilities of actions.
+        """
         ...
 
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int]
     ) -> Iterator[Iterable[WalkResult]]:
-        """Yield for each grid point its results, in parts of some episodes.
+        """Yield the results of each grid point of `settings`, in parts of some episodes.
 
         A grid point is an operating point with a number of vehicles, those nearest to the ego.
         `seeds` are channel seeds, and all grid points have the same draws of the channel. A grid
@@ -116,7 +118,8 @@ SOURCES = Shipped[Source]("swarmdrive.sources", Source, {})  # of none but exten
 def metric_columns(part: Decided[Any]) -> dict[str, Floats]:
     """Return the columns of n decisions that a study's metrics need, by name, (n,) each.
 
-    The names are `COLUMNS`; `part` is the decisions of some episodes at one operating point.
+    The names are `COLUMNS`, such as `latency_ms` and `messages`; `part` is the decisions of some
+    episodes at one operating point.
     """
     every = columns(part)
     return {name: every[name] for name in COLUMNS}
@@ -133,13 +136,14 @@ def walk_through(
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:
     """Yield for each operating point the columns of its n decisions, and each one's episode.
 
-    The columns are (n, ...) by name. The episode is an index, (n,), into the (S, E) episodes of all
-    channel seeds, counted row by row.
+    An operating point is everything a decision depends on besides scene and model. The columns are
+    (n, ...) by name. The episode is an index, (n,), into the (S, E) episodes of all channel seeds,
+    counted row by row.
 
     Args:
-        world: where decisions come from and lead to.
+        world: where decisions come from and lead to, such as recorded scenes.
         points: the operating points.
-        ask: returns what vehicles intend in scenes.
+        ask: returns what vehicles intend in scenes: their probabilities of actions.
         seeds: channel seeds, S of them.
         episodes: numbers of the E episodes, ascending, (E,).
         ties: which of equally likely actions is taken, `drawn` or `first`.
@@ -180,8 +184,9 @@ def _below(arrays: Sequence[Floats]) -> Floats:
 class PanelResult:
     """Hold the results of one source at the grid points of a panel, as pandas tables.
 
-    A panel is a named set of grid points. `summary` has a row for each grid point, metric and kind
-    of interval, `episodes` one for each grid point, seed and episode.
+    A source is such as a run, and a panel a named set of grid points, operating points with a
+    number of vehicles. `summary` has a row for each grid point, metric and kind of interval, with
+    `mean`, `ci_low`, `ci_high` and `n`; `episodes` one for each grid point, seed and episode.
     """
 
     # a row a grid point, metric and interval: `source`, `panel`, the columns of `Setting.place`,
@@ -199,8 +204,9 @@ def play(
 ) -> PanelResult:
     """Compute the results of a source at every grid point, with every channel seed.
 
-    The same seed gives the same draws at all grid points. `panel` is the name of this set of grid
-    points in tables; `progress` is called with 1 after each of them.
+    A source is such as a run, and a grid point an operating point with a number of vehicles. The
+    same seed gives the same draws at all of them. `panel` is the name of this set of grid points in
+    tables; `progress` is called with 1 after each of them.
     """
     import pandas as pd
 
@@ -262,9 +268,10 @@ def _part(walked: WalkResult, seeds: int) -> _Part:
 
 
 def by_episode(walked: WalkResult, names: Sequence[str]) -> dict[str, Floats]:
-    """Return metrics of decisions by name, each (S, E); NaN where an episode was left out.
+    """Return metrics that are means over an episode's decisions, by name, each (S, E).
 
-    The axes are S channel seeds and E episodes.
+    `walked` has the decisions of S channel seeds and E episodes, and `names` are those of metrics.
+    A value is NaN where an episode was left out.
     """
     success = walked.ends["success_rate"]
 
@@ -309,7 +316,10 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
 
 
 def joined(parts: Sequence[PanelResult]) -> PanelResult:
-    """Return the tables of several panels or sources, concatenated."""
+    """Return the tables of several panels or sources, concatenated.
+
+    A panel is a named set of operating points, and a source such as a run.
+    """
     import pandas as pd
 
     summary = pd.concat([part.summary for part in parts], ignore_index=True)

@@ -172,7 +172,11 @@ class ReplayedRun:
         return [forest.ids[n] for n in forest.root.tolist()]
 
     def manifest(self) -> dict[str, Any]:
-        """Return where the intents come from, as plain values: run, dataset digest and latency."""
+        """Return where the intents come from, as plain values for a study's manifest.
+
+        Intents are vehicles' probabilities of actions. The values are the run's name and path, the
+        dataset's digest, how latency was set, and the decision points without an answer.
+        """
         return {
             "name": self.name,
             "run": str(self.run.path),
@@ -184,13 +188,15 @@ class ReplayedRun:
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int], read: Read = metric_columns
     ) -> Iterator[Sequence[WalkResult]]:
-        """Yield for each grid point the results of all episodes, with its number of vehicles.
+        """Yield the results of each grid point of `settings`, of all episodes at once.
 
         A grid point is an operating point with a number of vehicles: the ego and the helpers
-        nearest to it. `read` returns the columns of decisions to keep.
+        nearest to it. `seeds` are those of the channel, and `read` returns the columns of decisions
+        to keep.
 
         Raises:
-            UserError: an operating point needs a fusion call, and the run's model cannot make it.
+            UserError: an operating point needs a fusion call, in which the ego's model reads
+                messages, and the run's model cannot make it.
         """
         for setting in settings:
             replace(self._asker.spec, points=(setting.point,))  # which checks that they go together
@@ -221,7 +227,7 @@ class ReplayedRun:
         """Return the joules of each vehicle's answer in n scenes, (n, 1 + H); NaN where unknown.
 
         Column 0 is the ego's, which is unknown if its model is in a cloud; then come the H
-        helpers'.
+        helpers'. `point` is the operating point, which may name the computers.
         """
         manifest = self.run.manifest
         if manifest.timer is None:
@@ -229,10 +235,11 @@ class ReplayedRun:
         return manifest.timer.joules(manifest.latency, point, scenes, self._asker.answers)
 
     def energy_j(self, point: OperatingPoint, heard: Exchange, joules: Floats) -> Floats:
-        """Return the joules of each of n decisions with those of its answers, (n,); NaN if unknown.
+        """Return the joules of each of n decisions, (n,), for the answers made and the radio.
 
-        `joules` has those of the ego's and H helpers' answers, (n, 1 + H), and `heard` is what was
-        sent.
+        `point` is the operating point, `joules` has those of the ego's and H helpers' answers, (n,
+        1 + H), and `heard` says which helpers answered, and what was sent. It is NaN where it is
+        unknown.
         """
         timer = self.run.manifest.timer
         if timer is None:
@@ -243,7 +250,7 @@ class ReplayedRun:
     def spec(self) -> Spec:
         """Return the evaluation that made the run, with all that its answers depend on.
 
-        It has no conditions.
+        It has no conditions (operating points), at which a replay scores the answers.
         """
         return self._asker.spec
 
@@ -284,9 +291,9 @@ class ReplayedRun:
             return self._asker(scenes)
 
     def whole(self, scenes: Sequence[Scene]) -> Intents:
-        """Return the intents (distributions over actions) of all vehicles in these scenes.
+        """Return the intents (distributions over actions) of all vehicles in these n scenes.
 
-        The model is asked for what is not stored.
+        The model is asked for what is not stored, and its answers are stored in the run's folder.
         """
         with self._writing():
             return self._asker.whole(scenes)
@@ -296,8 +303,9 @@ class ReplayedRun:
     ) -> Intents:
         """Return the intents (distributions over actions) of helpers where `wanted`, a mask (n, H).
 
-        The axes are n scenes and H helpers. The model is asked `question` for what is not stored.
-        Raises UserError if it may not be asked and an answer is missing.
+        The axes are n scenes and H helpers. The model is asked for what is not stored: `question`
+        says whether plainly, or another way. Raises UserError if it may not be asked and an answer
+        is missing.
         """
         asked_scenes, places = wanted_in(scenes, wanted)
         if not self._asks and any(self._asker.lacks(asked_scenes, question, places)):
@@ -314,8 +322,9 @@ class ReplayedRun:
     def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
         """Return the vehicles' intents (distributions over actions) in n scenes, as stored.
 
-        Where the ego's is missing, the model is asked; if it may not be, `leave_out` is called with
-        the mask (n,) of these scenes, whose episodes are left out.
+        Those of helpers that the run did not ask are missing. Where the ego's is, the model is
+        asked; if it may not be, `leave_out` is called with the mask (n,) of these scenes, whose
+        episodes are left out.
         """
         lacks = self._asker.lacks(scenes, places=[EGO] * len(scenes))
         if any(lacks):
@@ -343,9 +352,9 @@ class ReplayedRun:
         """Return a function that gives the ego's answers after hearing messages in these scenes.
 
         In a fusion call the ego's model answers with the helpers' messages in its prompt. `codes`,
-        (K,), encode the K sets of messages that are asked about (`fusion.codes_of`), and `rewrites`
-        how they are shown. The model is asked what is not stored. Raises UserError if it may not
-        be.
+        (K,), are whole numbers that encode the K sets of messages that are asked about
+        (`fusion.codes_of`), and `rewrites` says how attacks and defences change the messages that
+        are shown. The model is asked what is not stored. Raises UserError if it may not be.
         """
         if not self._asks:
             raise UserError(
@@ -360,7 +369,7 @@ class ReplayedRun:
 
         An agent is a vehicle that decides for itself; runs in which only the ego decides do not use
         the function. `at` has the indices of the scenes in which agents decide, and `intents` their
-        plans.
+        plans, probabilities of actions.
         """
         return self._asker.call_of_agents(scenes, at, intents)
 
@@ -433,10 +442,10 @@ class _Nearest:
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
-    """Return how success is counted for each run, the same way for all.
+    """Return how success is averaged over the episodes of each run, the same way for all.
 
-    It is balanced, the mean over layouts with a danger and without, if it can be so for all of
-    them, else plain.
+    It is balanced, the mean over layouts (start situations) with a danger (a vehicle that the ego
+    would meet) and without, if it can be so for all of them, else plain.
     """
     rules = alike([Success(run.dataset.dangerous) for run in runs])
     return dict(zip(runs, rules, strict=True))

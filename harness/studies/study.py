@@ -41,9 +41,10 @@ class Study:
     A study plays answers at many operating points, and sums up. Its manifest is a JSON file that
     says what it was made of.
 
-    `kind` names its manifest's file; `headline` is the outcome, and `about` says how it was made.
-    `data` has tables to write by file name, `answer` is what --json prints, and `figures` draws the
-    pictures by file name.
+    `kind` names its manifest's file; `headline` is the outcome in sentences, `about` says how it
+    was made, and `caveats` what a reader must know first. `tables` are to be shown, and `data` to
+    be written, by file name. `answer` is what --json prints, and `figures` draws the pictures by
+    file name. `more` is HTML that its page shows below the tables.
     """
 
     kind: str  # names its manifest, `<kind>.json`
@@ -63,7 +64,7 @@ class Study:
 
 
 def p_cell(p: float | None) -> str:
-    """Return a p-value as a cell, bold if it is at most `LEVEL`; a dash for None."""
+    """Return a p-value as the text of a cell, bold if it is at most `LEVEL`; a dash for None."""
     if p is None:
         return "–"
     return strong("< 0.001" if p < 0.001 else f"{p:.3f}", p <= LEVEL)
@@ -75,7 +76,7 @@ def ends(e: Estimate) -> dict[str, Any]:
 
 
 def corrected(p_values: Sequence[float | None]) -> list[float | None]:
-    """Return p-values corrected together by Holm's method; None stays None."""
+    """Return p-values corrected together by Holm's method, in their order; None stays None."""
     corrected_values = iter(holm([p for p in p_values if p is not None]))
     return [None if p is None else next(corrected_values) for p in p_values]
 
@@ -90,7 +91,7 @@ def percent(row: Any, value: str, low: str, high: str) -> str:
 
 
 def write_study(study: Study, out: Path) -> Path:
-    """Write a study's figures, tables, page and manifest into a folder; return the page.
+    """Write a study's figures, tables, page and manifest into a folder; return the page's path.
 
     Figures are skipped if matplotlib is not installed. Raises UserError if the folder holds
     something else.
@@ -119,7 +120,7 @@ def write_study(study: Study, out: Path) -> Path:
 def undrawn(study: Study) -> UserError | None:
     """Return the error that keeps a study's figures from being drawn; None if they can be.
 
-    It is that Matplotlib is not installed.
+    It is that Matplotlib, which draws them, is not installed.
     """
     if study.figures is dict:
         return None
@@ -161,7 +162,10 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
 
 
 def refuse_taken(out: Path, kind: str) -> None:
-    """Raise UserError if a folder holds a finished run, or a finished study of another kind."""
+    """Raise UserError if a folder holds a finished run, or a finished study of another kind.
+
+    `kind` is the kind of study that is to be written to `out`, such as `sweep`.
+    """
     for name in ("run", "suite", *studies()):
         if name != kind and (out / f"{name}.json").exists():
             raise UserError(
@@ -173,8 +177,9 @@ def refuse_taken(out: Path, kind: str) -> None:
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
     """Raise UserError if a folder holds a run, another kind of study, or one with other settings.
 
-    `manifest` is what its `<kind>.json` must state; of sources, only name and latency count. Keys
-    that the study there does not state, since its version of the program had none, are ignored.
+    `kind` is the kind of study that is to be written to `out`, and `manifest` what its
+    `<kind>.json` must state; of sources, only name and latency count. Keys that the study there
+    does not state, since its version of the program had none, are ignored.
     """
     refuse_taken(out, kind)
     try:
@@ -199,8 +204,10 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
 class Cells:
     """Keep finished parts of a study in a file, one a line, so that a killed study can continue.
 
-    A part that was made of other settings than this study's is not taken, nor is one that was not
-    computed by this user on this machine: anybody may have written the file.
+    It is made from the file, the digest of all settings that decide a part, and whether parts are
+    `computed` here, unlike a model's replies. A part that was made of other settings than this
+    study's is not taken, nor is a computed one that was not computed by this user on this machine:
+    anybody may have written the file.
     """
 
     def __init__(self, path: Path, depends_on: str, computed: bool = True) -> None:

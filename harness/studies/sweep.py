@@ -60,12 +60,12 @@ def settings(
     """Return the grid points of one axis, or of several crossed, for each condition.
 
     `sources` are the runs and models that are swept. A condition is an operating point by its name;
-    `axes` are what varies, and `grids` has the values of each. A grid of None
+    `axes` are what varies, such as packet loss, and `grids` has the values of each. A grid of None
     stands for the axis's default values that the condition allows.
 
     Raises:
-        UserError: there is no such condition, it has no channel or an axis changes nothing in it,
-            a grid has more vehicles than the scenes, or there are too many points.
+        UserError: there is no such condition, it has no channel or an axis changes nothing in it, a
+            grid has more vehicles than the scenes, or there are too many points.
     """
     runs = [source for source in sources if isinstance(source, ReplayedRun)]
     vehicles = min(run.vehicles for run in runs)
@@ -105,7 +105,9 @@ def settings(
 def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
     """Return an operating point by name: the runs' own, one of the paper's, or a change of either.
 
-    Raises UserError if there is none, it has no channel, or it differs between the runs.
+    An operating point is everything a decision depends on besides scene and model; a change is
+    typed such as `6g:max_helpers=1`. Raises UserError if there is none, it has no channel, or it
+    differs between the runs.
     """
     points = {run.points[name] for run in runs if name in run.points}
     if len(points) > 1:
@@ -123,8 +125,10 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
 def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
     """Return the grid points of the paper's panels, by the panel's name.
 
-    The panels are the runs' conditions, and sweeps of the number of vehicles, of packet loss and of
-    the entropy threshold tau. In the sweep of vehicles, packet loss grows with their density.
+    A panel is a set of grid points, operating points with a number of vehicles. The panels are the
+    runs' `conditions` (operating points, by name), and sweeps of the number of vehicles, of packet
+    loss and of the entropy threshold tau. In the sweep of vehicles, packet loss grows with their
+    density.
     """
     vehicles = min(run.vehicles for run in runs)
     points = {name: point for run in runs for name, point in run.points.items()}
@@ -147,6 +151,9 @@ def panels_over(
     apart: bool = False,
 ) -> dict[str, tuple[Setting, ...]]:
     """Return the grid points of a sweep by panel.
+
+    A panel is a named set of grid points, operating points with a number of vehicles; an axis is
+    what the sweep varies.
 
     Args:
         runs: the runs whose answers are scored.
@@ -178,7 +185,10 @@ def panels_over(
 
 
 def folder_of(run: Path, panels: Iterable[str]) -> Path:
-    """Return the default folder of a run's sweep, inside the run's folder."""
+    """Return the default folder of a run's sweep, in the run's folder and named after panels.
+
+    `panels` are their names, such as what is varied.
+    """
     return folder_in(run, f"sweep-{'-'.join(panels).replace(CROSS, '-')}")
 
 
@@ -191,9 +201,9 @@ def run_sweep(
 ) -> Study:
     """Score every source at every grid point of all panels, and return the study.
 
-    A source is a run's answers, or what an extension draws; a panel is a named set of grid points.
-    All share the channel's random numbers, keyed by `seeds`. `out` is the study's folder;
-    `progress` is called with 1 after each grid point.
+    A source is a run's answers, or what an extension draws; a panel is a named set of grid points,
+    operating points with a number of vehicles. All share the channel's random numbers, keyed by
+    `seeds`. `out` is the study's folder; `progress` is called with 1 after each grid point.
 
     Raises:
         UserError: the folder holds another sweep.
@@ -262,7 +272,10 @@ def _figures(
 
 
 def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
-    """Return a phrase with the numbers of episodes and seeds of each source."""
+    """Return a phrase with the numbers of episodes and seeds of each source, such as a run.
+
+    `seeds` are those of the channel.
+    """
     of_sources = []
     for source in sources:
         whose = "" if source.same_episodes else " of their own"
@@ -323,9 +336,10 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
 
 
 def in_a_sentence(table: Table) -> str:
-    """Return a sentence on the headline metric at both ends of an axis and where it is best.
+    """Return a phrase with the headline metric at both ends of an axis and where it is best.
 
-    For crossed axes it is about the worst and the best grid point.
+    `table` is one of those that `tables` returns, and the axis what a sweep varies. For crossed
+    axes it is about the worst and the best combination of values.
     """
 
     def success(row: Sequence[str]) -> float:

@@ -20,8 +20,9 @@ def paper_values(
 ) -> "pd.DataFrame":
     """Return the rows of the paper's values of a metric in a panel of its figures.
 
-    `marks` is the table of all of the paper's values; None gives no rows. `place` selects rows by
-    further columns, such as `condition`. Columns are `value`, `low` and `high`, in the metric's
+    A panel is a set of operating points that are shown together. `marks` is the table of all of the
+    paper's values; None gives no rows. `place` selects rows by further columns, such as
+    `condition`. Columns are `value` (of what the panel varies), `low` and `high`, in the metric's
     unit.
     """
     import pandas as pd
@@ -37,8 +38,8 @@ def paper_values(
 def cross(axes: Any, paper_rows: "pd.DataFrame", x: Any) -> None:
     """Draw the paper's values at `x`: a cross for one value, an error bar for a range.
 
-    `axes` are Matplotlib's; `paper_rows` has the ends of each value in `low` and `high`. `x` is one
-    place for all rows, or an array with one for each.
+    `axes` are Matplotlib's; `paper_rows` has the ends of each value in `low` and `high`. `x`, the
+    coordinate on the x axis, is one for all rows, or an array with one for each.
     """
     low, high = (paper_rows[end].to_numpy(dtype=float) for end in ("low", "high"))
     x, single = np.broadcast_to(x, low.shape), low == high
@@ -53,17 +54,20 @@ def cross(axes: Any, paper_rows: "pd.DataFrame", x: Any) -> None:
 
 
 def lead_in(rows: "pd.DataFrame") -> str:
-    """Return the name of the metric that figures of a summary's rows show: balanced success.
+    """Return the name of the metric that figures of a summary's rows show.
 
-    It is plain success unless all sources (`source`, such as runs) have the balanced one.
+    `rows` are those of a study's summary. Balanced success, the mean over episodes with a danger (a
+    vehicle that the ego would meet) and without, is shown if all sources (`source`, such as runs)
+    have it, else plain success.
     """
     return headline_metric(*(set(of.metric) for _, of in rows.groupby("source")))
 
 
 def interval_of(rows: "pd.DataFrame") -> str:
-    """Return which kind of interval of a summary's rows is drawn.
+    """Return which kind of interval is drawn, by the name in a summary's column `interval`.
 
-    It is `episodes`, over episodes, if the rows have it, else `seed means`, over channel seeds.
+    It is `episodes`, over episodes, if these rows of the summary have it, else `seed means`, over
+    channel seeds.
     """
     return "episodes" if (rows.interval == "episodes").any() else "seed means"
 

@@ -32,9 +32,10 @@ SHORT = 13  # characters of a name that fit under a bar
 def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) -> Figure:
     """Draw bars of latency, success and messages of the operating points, with 95 % intervals.
 
-    `core` has the rows of a study's summary about operating points, one for each of them and each
-    metric. `paper` has the paper's values to draw beside them: `low` and `high` by `panel`,
-    `condition`, `value` and `metric`, equal for a single value; None to draw none.
+    An operating point is everything a decision depends on besides scene and model. `core` has the
+    rows of a study's summary about them, one for each of them and each metric. `paper` has the
+    paper's values to draw beside them: `low` and `high` by `panel`, `condition`, `value` and
+    `metric`, equal for a single value; None to draw none.
     """
     figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = drawn = figure.subplots(1, 3)

@@ -24,8 +24,8 @@ def heat_map(
 ) -> Figure:
     """Draw heat maps of percentages, one panel for each array of `panels`, by its title.
 
-    An array is (R, C), of R rows and C columns. `rows` and `columns` are the names along both axes,
-    `row` and `column` the titles of the axes.
+    An array is (R, C), of R rows and C columns, with values from 0 to 100. `rows` and `columns` are
+    the names along both axes, `row` and `column` the titles of the axes.
     """
     room = COLUMN_IN * len(columns) / CHARACTER_IN
     beside = len(columns) <= MOST_BESIDE and max(map(len, panels)) <= room

@@ -20,8 +20,9 @@ from harness.studies.figures.axes import key, lettered, plain
 class Steps:
     """Describe a step curve of a figure, whose points ascend in x and y.
 
-    `label` is its name in the legend, `look` has Matplotlib's arguments for how the line is drawn,
-    and `name` is written beside its last point.
+    `x` is where each step begins, in the axis's unit, and `y` its height. `label` is the curve's
+    name in the legend, `look` has Matplotlib's arguments for how the line is drawn, and `name` is
+    written beside its last point.
     """
 
     label: str  # the curve's name in the legend; empty for none
@@ -36,8 +37,9 @@ class Steps:
 class Rows:
     """Describe a panel of estimates: a row for each of `names`, and in it one of each series.
 
-    `series` has a series' estimates by its name, in the order of the rows. An unknown one is None;
-    each is drawn times `scale`, 100 for percent; `quantity` is what it is, with its unit.
+    A series is such as the estimates of one model: `series` has them by its name, in the order of
+    the rows. An unknown one is None; each is drawn times `scale`, 100 for percent; `quantity` is
+    what it is, with its unit.
     """
 
     quantity: str  # along the panel, with its unit
@@ -48,10 +50,10 @@ class Rows:
 
 @styled
 def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
-    """Draw estimates with their 95 % intervals, a panel for each `Rows`, one below the other.
+    """Draw estimates with their 95 % intervals, a panel for each of `panels`, one below the other.
 
-    A series has a colour, by its name in `colours`, and a marker. Where an interval is unknown, the
-    point stands alone.
+    A series of estimates has a colour, by its name in `colours`, and a marker. Where an interval is
+    unknown, the point stands alone.
     """
     heights = [len(panel.names) * (0.1 + 0.1 * len(panel.series)) + 0.5 for panel in panels]
     # One below the other, as a telephone can show them.
@@ -93,10 +95,10 @@ def intervals(panels: Sequence[Rows], colours: Mapping[str, str]) -> Figure:
 
 @styled
 def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> Figure:
-    """Draw success in percent against a cost, as step curves.
+    """Draw success in percent against a cost, as step curves, side by side.
 
-    A panel is its title, the label of the cost with its unit, and its curves, whose y is success in
-    percent; `success` is the metric's name for people.
+    Each of `panels` is its title, the label of the cost with its unit, and its curves, whose x is
+    the cost and y success in percent; `success` is the metric's name for people.
     """
     width = max(3.6 * len(panels), 4.4)
     figure = Figure(figsize=(width, 3.6), layout=ConstrainedLayoutEngine(w_pad=0.1))
