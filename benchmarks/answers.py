@@ -15,7 +15,8 @@ from pages import markdown, options, write_tables
 
 from harness.core.figures import interval_of
 from harness.core.statistics import Estimate
-from harness.runs.metrics import ALL, BALANCED, BASELINE, GAINS
+from harness.runs.headline import BALANCED
+from harness.runs.metric_names import ALL, BASELINE, GAINS
 
 SMALLEST = "--only constant-v2 --layouts 1"
 MODES = ("json", "constrained", "readout", "decision")

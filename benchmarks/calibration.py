@@ -24,8 +24,11 @@ from harness.core.resources import MARKER
 from harness.core.statistics import Estimate
 from harness.extensions.calibration.calibrations import FOLDER, Level
 from harness.runs import reliability
+from harness.runs.estimates import difference
 from harness.runs.folder import Run, read
-from harness.runs.metrics import BALANCED, by_episode, difference, entry, metrics_of
+from harness.runs.headline import BALANCED
+from harness.runs.metric_values import by_episode
+from harness.runs.metrics import entry, metrics_of
 from harness.runs.summary import judged_of
 
 SMALLEST = "--only proxy --layouts 2"

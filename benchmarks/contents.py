@@ -40,7 +40,9 @@ from harness.extensions.contents.study import (
 )
 from harness.report.document import Table
 from harness.runs.folder import read
-from harness.runs.metrics import BALANCED, METRICS, SUCCESS, by_episode
+from harness.runs.headline import BALANCED, SUCCESS
+from harness.runs.metric_values import by_episode
+from harness.runs.metrics import METRICS
 from harness.runs.success import Success, alike
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study

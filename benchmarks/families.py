@@ -11,7 +11,10 @@ from harness.core.figures import interval_of
 from harness.core.statistics import Estimate, known_mean, mean_of, paired_difference
 from harness.runs import folder, suite
 from harness.runs.folder import Run
-from harness.runs.metrics import ALL, BALANCED, BASELINE, GAINS, METRICS, by_episode, entry
+from harness.runs.headline import BALANCED
+from harness.runs.metric_names import ALL, BASELINE, GAINS
+from harness.runs.metric_values import by_episode
+from harness.runs.metrics import METRICS, entry
 from harness.runs.success import by_condition, mean_difference
 
 

@@ -29,7 +29,8 @@ from harness.core.statistics import (
     seed_interval,
     seed_rate_interval,
 )
-from harness.runs.metrics import SUCCESS, difference, over_episodes, over_seeds
+from harness.runs.estimates import difference, over_episodes, over_seeds
+from harness.runs.headline import SUCCESS
 
 SMALLEST = "--runs 2"
 # an episode has so many answers, at least and at most

@@ -17,7 +17,7 @@ from pages import markdown, options, write_tables
 
 from harness.core.arrays import Floats
 from harness.core.figures import interval_of
-from harness.runs.metrics import BASELINE
+from harness.runs.metric_names import BASELINE
 from harness.runs.success import by_condition
 
 SMALLEST = "--only constant --layouts 1"

@@ -28,7 +28,8 @@ from harness.core.figures import interval_of
 from harness.dataset.load import find, load
 from harness.report.drawing.colours import GREY, MARKERS, conditions
 from harness.report.drawing.pictures import save, styled
-from harness.runs.metrics import BALANCED, BASELINE, GAINS
+from harness.runs.headline import BALANCED
+from harness.runs.metric_names import BASELINE, GAINS
 from harness.world import scenarios
 
 SMALLEST = "--only proxy --layouts 1 --dataset blind-merge-v2"

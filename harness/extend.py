@@ -23,7 +23,7 @@ from harness.radio.constant import link_up
 from harness.report.document import Section, Table
 from harness.runs.folder import Run
 from harness.runs.folder import read as read_run
-from harness.runs.metrics import Metric
+from harness.runs.metric import Metric
 from harness.studies.study import Study
 from harness.world.parameters import Parameters
 from harness.world.road import (

@@ -36,8 +36,8 @@ from harness.prompts import versions as prompts
 from harness.report.details import prompts_of
 from harness.runs import folder, writer
 from harness.runs.decisions import Decisions
+from harness.runs.grid import Grid
 from harness.runs.headline import PAIRED
-from harness.runs.metrics import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency, Score
 from harness.runs.settings import Settings
 from harness.runs.summary import Figures, counted

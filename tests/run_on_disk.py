@@ -17,7 +17,8 @@ from harness.radio.profiles import CHANNELS
 from harness.runs import folder, formats, writer
 from harness.runs.answer_times import times
 from harness.runs.decisions import Decisions, schema
-from harness.runs.metrics import Grid, World
+from harness.runs.grid import Grid
+from harness.runs.metric import World
 from harness.runs.records import Answer, ClosedLoop, Episode, FrozenScenes, Latency, Manifest
 from harness.runs.summary import Figures, counted
 

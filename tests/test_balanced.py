@@ -27,9 +27,11 @@ from harness.report.matrix import BEST, WORSE, headline, lines
 from harness.report.runs import Runs
 from harness.report.words import headline as of_one
 from harness.runs.folder import Run, read
-from harness.runs.headline import SUCCESS, headline_of
+from harness.runs.headline import BALANCED, SUCCESS, headline_of
 from harness.runs.listing import runs
-from harness.runs.metrics import BALANCED, GAINS, METRICS, of_ends
+from harness.runs.metric_names import GAINS
+from harness.runs.metric_values import of_ends
+from harness.runs.metrics import METRICS
 from harness.runs.success import Success, alike, half_difference
 from harness.runs.suite import plays
 

@@ -13,8 +13,10 @@ from evaluating import same_files
 
 from harness.core.resources import DATASET
 from harness.dataset import load
+from harness.runs.estimates import written
 from harness.runs.folder import read
-from harness.runs.metrics import BALANCED, GAINS, SUCCESS, written
+from harness.runs.headline import BALANCED, SUCCESS
+from harness.runs.metric_names import GAINS
 
 Said = tuple[int, str, str]
 

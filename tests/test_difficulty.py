@@ -35,7 +35,9 @@ from harness.report.compare.pair import pair
 from harness.report.words import adjusted_lines, as_good_as, figures
 from harness.runs.difficulty import FILE, Pool, adjusted_scores
 from harness.runs.folder import read
-from harness.runs.metrics import ADJUSTED, BALANCED, GAIN, SUCCESS, Grid
+from harness.runs.grid import Grid
+from harness.runs.headline import BALANCED, SUCCESS
+from harness.runs.metric_names import ADJUSTED, GAIN
 from harness.runs.records import Score
 from harness.runs.success import Success
 from harness.runs.writer import csv_text

@@ -20,15 +20,17 @@ from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
 from harness.report.compare.text import terminal
+from harness.runs.built_in_metrics import BUILT_IN
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, read
-from harness.runs.metrics import BUILT_IN, METRICS, Metric, entry, metrics_of
+from harness.runs.metric import Metric
+from harness.runs.metrics import METRICS, entry, metrics_of
 from harness.runs.records import Score
 
 GOLDEN = Path(__file__).parent / "golden_runs" / "data"
 PACKAGE = """
 from harness.core.figures import Unit
-from harness.runs.metrics import Metric
+from harness.runs.metric import Metric
 
 SURE = Metric("sure_rate", "share of decisions that are sure", Unit("%", 1, 100.0), "higher", "rate", 1.0,
               decisions=lambda d: (d["entropy_nats"] < 0.1).astype(float))

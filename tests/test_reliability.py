@@ -19,7 +19,8 @@ from harness.report.compare.pair import pair
 from harness.report.runs import Runs
 from harness.runs.contradictions import contradictions
 from harness.runs.folder import read
-from harness.runs.metrics import ONE_OPTIMAL, entry
+from harness.runs.metric_names import ONE_OPTIMAL
+from harness.runs.metrics import entry
 from harness.runs.records import Score
 from harness.runs.reliability import (
     BINS,

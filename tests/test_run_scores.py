@@ -35,7 +35,8 @@ from harness.evaluate.answers import answer_of
 from harness.evaluate.latency import inference_s
 from harness.evaluate.requests import requests
 from harness.runs.headline import PAIRED
-from harness.runs.metrics import METRICS, of_decisions
+from harness.runs.metric_values import of_decisions
+from harness.runs.metrics import METRICS
 from harness.runs.records import Answer, Latency, Score, Variant
 from harness.runs.writer import csv_text
 

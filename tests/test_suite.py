@@ -19,7 +19,8 @@ from harness.dataset.build import build
 from harness.report.words import compared
 from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.listing import runs
-from harness.runs.metrics import METRICS, of_ends
+from harness.runs.metric_values import of_ends
+from harness.runs.metrics import METRICS
 from harness.runs.suite import read
 from harness.world import scenarios
 

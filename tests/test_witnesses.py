@@ -15,7 +15,7 @@ from harness.dataset.load import Dataset
 from harness.evaluate.live_world import LiveSource
 from harness.runs.folder import Run, read
 from harness.runs.headline import PAIRED
-from harness.runs.metrics import GAIN
+from harness.runs.metric_names import GAIN
 from harness.runs.records import Score
 
 NAMES = [f"success_rate_{k}_witness{'' if k == 1 else 'es'}" for k in range(4)]

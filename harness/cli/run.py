@@ -47,7 +47,8 @@ class Column:
         """Return a score of the column's metric as text; a dash for None."""
         if score is None or score.value is None:
             return "-"
-        from harness.runs.metrics import entry, written
+        from harness.runs.estimates import written
+        from harness.runs.metrics import entry
 
         return written(score) if self.interval else entry(score.metric).unit.text(score.value)
 

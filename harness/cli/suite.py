@@ -126,7 +126,7 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     from harness.report.findings import LAST, Kind, findings
     from harness.report.suite import seeds_of
     from harness.runs.headline import IN_WORDS, headline_of
-    from harness.runs.metrics import BASELINE
+    from harness.runs.metric_names import BASELINE
     from harness.world.drivers import ALWAYS
 
     text, m = console(), done.variant

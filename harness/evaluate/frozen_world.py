@@ -19,7 +19,8 @@ from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
 from harness.runs.difficulty import REFERENCES, Layout
-from harness.runs.metrics import World, by_danger
+from harness.runs.metric import World
+from harness.runs.metric_values import by_danger
 from harness.runs.records import Episode, FrozenScenes
 from harness.runs.settings import FrozenSettings
 from harness.world.lookouts import radios

@@ -28,7 +28,7 @@ from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
 from harness.evaluate.walk import Decided, Due, SceneWorld
-from harness.runs import metrics
+from harness.runs import metric
 from harness.runs.records import ClosedLoop, Episode
 from harness.runs.settings import DriveSettings
 from harness.world import conflict_measures, reference, scenarios
@@ -57,7 +57,7 @@ class LiveSource:
     scenario_name: str = scenarios.DEFAULT
     choice: Choice | None = None  # what chose some of the episodes, such as a sample; None for all
     name: ClassVar[str] = "drive"
-    kind: ClassVar[metrics.World] = "closed-loop"
+    kind: ClassVar[metric.World] = "closed-loop"
 
     @cached_property
     def scenario(self) -> Scenario:

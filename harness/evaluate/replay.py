@@ -17,7 +17,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.branches import Course, Trajectory
 from harness.evaluate.live_world import ended, looks
 from harness.runs.folder import Run
-from harness.runs.metrics import BASELINE
+from harness.runs.metric_names import BASELINE
 from harness.runs.records import ClosedLoop, Decision, Episode, Manifest
 from harness.world import lockstep
 from harness.world.parameters import Parameters

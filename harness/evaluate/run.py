@@ -60,7 +60,8 @@ from harness.runs.contradictions import sound
 from harness.runs.decisions import Decisions
 from harness.runs.difficulty import Layout, adjusted_scores
 from harness.runs.formats import FORMAT, LOOKS
-from harness.runs.metrics import Grid, metrics_of
+from harness.runs.grid import Grid
+from harness.runs.metrics import metrics_of
 from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
 from harness.runs.settings import FILE, of_words, text_of
 from harness.runs.stopping import InterimLooks

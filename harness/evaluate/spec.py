@@ -30,7 +30,7 @@ from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs import formats, role_agents
 from harness.runs.folder import read
-from harness.runs.metrics import World
+from harness.runs.metric import World
 from harness.runs.records import ClosedLoop, FrozenScenes, Manifest
 from harness.runs.settings import (
     DriveSettings,

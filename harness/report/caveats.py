@@ -16,8 +16,10 @@ from harness.prompts.readout import MOST_SHARE
 from harness.report.apart import said_of
 from harness.runs import doubts, pinned
 from harness.runs.folder import Run
+from harness.runs.headline import BALANCED
 from harness.runs.listing import UNREAD
-from harness.runs.metrics import ALL, BALANCED, GAINS, entry
+from harness.runs.metric_names import ALL, GAINS
+from harness.runs.metrics import entry
 from harness.runs.records import ClosedLoop, Manifest, Score
 from harness.runs.unanswered import tally
 from harness.world.drivers import BLIND

@@ -14,8 +14,9 @@ from harness.core.statistics import Estimate
 from harness.report.runs import Runs
 from harness.report.words import score_texts
 from harness.runs.folder import Run
-from harness.runs.headline import IN_WORDS, headline_of
-from harness.runs.metrics import BALANCED, LATENCY, SUCCESS, entry
+from harness.runs.headline import BALANCED, IN_WORDS, SUCCESS, headline_of
+from harness.runs.metric_names import LATENCY
+from harness.runs.metrics import entry
 from harness.runs.records import Score
 from harness.runs.success import Success
 

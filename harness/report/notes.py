@@ -8,8 +8,9 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import Unit
 from harness.core.plugins import Plugins
 from harness.report.apart import said_of
+from harness.runs.estimates import written
 from harness.runs.folder import Run
-from harness.runs.metrics import ALL, written
+from harness.runs.metric_names import ALL
 from harness.runs.records import Latency, Score, role_word, roles
 from harness.runs.suite import SuiteRun
 from harness.runs.timers import timer

@@ -20,7 +20,7 @@ from harness.report.references import driven, in_trees, label, sentences
 from harness.report.runs import Runs
 from harness.runs.folder import Run
 from harness.runs.headline import IN_WORDS, headline_of
-from harness.runs.metrics import LATENCY
+from harness.runs.metric_names import LATENCY
 from harness.runs.records import Score, role_word
 from harness.runs.reliability import BINS, LEAST
 from harness.runs.summary import judged_of

@@ -17,8 +17,10 @@ from harness.core.statistics import Estimate, resampled_estimate
 from harness.report.compare.pair import pair
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run
-from harness.runs.headline import headline_of
-from harness.runs.metrics import BASELINE, METRICS, SUCCESS, of_ends
+from harness.runs.headline import SUCCESS, headline_of
+from harness.runs.metric_names import BASELINE
+from harness.runs.metric_values import of_ends
+from harness.runs.metrics import METRICS
 from harness.runs.records import Answer
 from harness.runs.success import Success
 

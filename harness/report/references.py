@@ -9,8 +9,10 @@ from harness.core.arrays import Floats
 from harness.core.statistics import rate_interval
 from harness.dataset.load import Dataset
 from harness.report.words import score_texts
+from harness.runs.estimates import halved
 from harness.runs.folder import Run
-from harness.runs.metrics import SUCCESS, by_danger, halved, known_in
+from harness.runs.headline import SUCCESS
+from harness.runs.metric_values import by_danger, known_in
 from harness.runs.records import Score
 from harness.world.drivers import CONSTANT, OPEN_LOOP, UNIFORM, constant
 from harness.world.scenario import Scenario

@@ -22,7 +22,8 @@ from harness.report.references import in_trees
 from harness.runs.contradictions import refuse
 from harness.runs.folder import Run
 from harness.runs.headline import IN_WORDS, headline_of
-from harness.runs.metrics import BASELINE, GAINS, entry
+from harness.runs.metric_names import BASELINE, GAINS
+from harness.runs.metrics import entry
 from harness.runs.records import Score
 from harness.runs.run_dataset import dataset_of
 from harness.runs.suite import SuiteRun, mean

@@ -13,10 +13,11 @@ from harness.core.figures import interval_of as shown_estimate
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
 from harness.report.caveats import doubted
-from harness.runs import metrics
+from harness.runs.estimates import written
 from harness.runs.folder import Run
-from harness.runs.headline import ANY_TIME, IN_WORDS, best_of, headline_of
-from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, LATENCY, SUCCESS, entry, written
+from harness.runs.headline import ANY_TIME, IN_WORDS, SUCCESS, best_of, headline_of
+from harness.runs.metric_names import ADJUSTED, ALL, BASELINE, GAINS, LATENCY
+from harness.runs.metrics import entry
 from harness.runs.records import Score
 from harness.runs.success import half_difference, mean_difference, p_of_mean
 from harness.runs.suite import SuiteRun, plays
@@ -143,7 +144,7 @@ def figures(run: Run) -> list[dict[str, str]]:
         scores[f"gain over {base}"] = run.score(best, GAINS[metric])
     scores[f"unsafe episodes under {best}"] = run.score(best, "unsafe_rate")
     scores[f"latency of a decision under {best}"] = run.score(best, LATENCY)
-    scores["ego's answers that could not be read"] = run.score(metrics.ALL, "failed_rate_ego")
+    scores["ego's answers that could not be read"] = run.score(ALL, "failed_rate_ego")
     return [
         {"what": what, **score_texts(score)} for what, score in scores.items() if score is not None
     ]

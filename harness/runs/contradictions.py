@@ -18,9 +18,10 @@ from harness.dataset.suites import PREFIX, named
 from harness.runs import pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run, read
-from harness.runs.headline import PAIRED
+from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.manifest_contradictions import of_manifest
-from harness.runs.metrics import BALANCED, BASELINE, GAINS, METRICS
+from harness.runs.metric_names import BASELINE, GAINS
+from harness.runs.metrics import METRICS
 from harness.runs.records import Episode, FrozenScenes, Score
 from harness.runs.reliability import SAME
 from harness.runs.suite import SUMMARY, SuiteRun

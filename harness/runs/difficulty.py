@@ -13,8 +13,11 @@ from msgspec import Struct
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.covariate import corrected
 from harness.core.statistics import LEVEL, Estimate, known_mean, mean_of
-from harness.runs import metrics
-from harness.runs.metrics import ADJUSTED, BASELINE, GAINS, SUCCESS, Grid, over_episodes
+from harness.runs import estimates
+from harness.runs.estimates import over_episodes
+from harness.runs.grid import Grid
+from harness.runs.headline import SUCCESS
+from harness.runs.metric_names import ADJUSTED, BASELINE, GAINS
 from harness.runs.records import Episode, Score
 from harness.runs.success import Success, by_condition
 
@@ -83,7 +86,7 @@ class Pool:
         """
 
         def plain(part: Bools) -> Estimate:
-            return metrics.difference(SUCCESS, [(a[:, part].T, b[:, part].T)], level)
+            return estimates.difference(SUCCESS, [(a[:, part].T, b[:, part].T)], level)
 
         return self._corrected(success, plain, known_mean(a - b, 0), -1.0, level)
 

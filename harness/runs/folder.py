@@ -30,8 +30,9 @@ from harness.runs.answers import Answered, Answers
 from harness.runs.decisions import Decisions, arrow_file
 from harness.runs.difficulty import FILE as DIFFICULTY
 from harness.runs.difficulty import Layout
+from harness.runs.grid import Grid
 from harness.runs.headline import ANY_TIME, PAIRED
-from harness.runs.metrics import Grid, World
+from harness.runs.metric import World
 from harness.runs.records import (
     Answer,
     ClosedLoop,

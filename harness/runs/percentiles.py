@@ -1,4 +1,4 @@
-"""Compute intervals of latency percentiles, and of their differences between two runs.
+"""Compute latency percentiles, their intervals, and those of their differences between two runs.
 
 A percentile is taken over all decisions or answers of a run; it is not a mean of percentiles of
 episodes. Its interval is a percentile bootstrap (Efron and Tibshirani 1993, chapter 13): whole
@@ -13,12 +13,23 @@ import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import Estimate, known_mean, resampled
-from harness.runs.metrics import PERCENTILES
 
+PERCENTILES = (50, 95, 99)
 RESAMPLES, RESAMPLING_SEED = 999, 0
 AT_ONCE = 4_000_000  # how many numbers are in memory at once
 
 Decided = tuple[Ints, Floats]  # the episode's index and the value of each decision of one seed
+
+
+def percentiles(latency_ms: Floats) -> Floats:
+    """Return the `PERCENTILES` of latencies (n,), ms; NaN if none is known.
+
+    Unknown latencies, which are NaN, are left out.
+    """
+    measured = latency_ms[~np.isnan(latency_ms)]
+    return (
+        np.percentile(measured, PERCENTILES) if len(measured) else np.full(len(PERCENTILES), np.nan)
+    )
 
 
 def differences(

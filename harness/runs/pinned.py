@@ -7,7 +7,7 @@ Taken together, the same differences have a narrower one: `success.mean_differen
 from harness.core.statistics import Estimate, mean_of, rate_difference
 from harness.runs.folder import Run
 from harness.runs.headline import BALANCED
-from harness.runs.metrics import BASELINE, GAINS
+from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.records import Score
 from harness.runs.success import Pairs, by_condition
 

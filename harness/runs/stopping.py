@@ -16,7 +16,7 @@ from harness.runs.formats import LOOKS
 if TYPE_CHECKING:
     from harness.core.arrays import Floats
     from harness.core.statistics import Estimate
-    from harness.runs.metrics import Grid
+    from harness.runs.grid import Grid
     from harness.runs.records import Episode, Score
     from harness.runs.success import Success
 

@@ -21,8 +21,12 @@ from harness.core.statistics import (
     paired_difference,
     resampled,
 )
+from harness.runs.estimates import over_episodes
+from harness.runs.grid import Grid
 from harness.runs.headline import BALANCED, IN_WORDS, PAIRED, SUCCESS
-from harness.runs.metrics import BASELINE, GAINS, METRICS, Grid, of_ends, over_episodes
+from harness.runs.metric_names import BASELINE, GAINS
+from harness.runs.metric_values import of_ends
+from harness.runs.metrics import METRICS
 from harness.runs.records import Episode, Score
 
 Setting = TypeVar("Setting")

@@ -16,7 +16,7 @@ from harness.runs import folder
 from harness.runs.folder import Run
 from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.listing import own_name
-from harness.runs.metrics import BASELINE, GAINS
+from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant
 from harness.runs.success import Plays, by_condition, is_gain
 from harness.runs.writer import csv_text

@@ -17,33 +17,15 @@ from harness.core.statistics import (
     seed_rate_interval,
 )
 from harness.runs.decisions import Decisions
-from harness.runs.headline import PAIRED
-from harness.runs.metrics import (
-    ALL,
-    BALANCED,
-    BASELINE,
-    GAIN,
-    GAINS,
-    LATENCY,
-    METRICS,
-    PERCENTILES,
-    SUCCESS,
-    Grid,
-    World,
-    by_episode,
-    difference,
-    entry,
-    halved,
-    in_range,
-    known_in,
-    least_by_place,
-    mean_by_place,
-    metrics_of,
-    over_episodes,
-    over_seeds,
-    percentiles,
-    sum_by_place,
-)
+from harness.runs.estimates import difference, halved, in_range, over_episodes, over_seeds
+from harness.runs.grid import Grid
+from harness.runs.headline import BALANCED, PAIRED, SUCCESS
+from harness.runs.metric import World
+from harness.runs.metric_names import ALL, BASELINE, GAIN, GAINS, LATENCY
+from harness.runs.metric_values import by_episode, known_in
+from harness.runs.metrics import METRICS, entry, metrics_of
+from harness.runs.percentiles import PERCENTILES, percentiles
+from harness.runs.places import least_by_place, mean_by_place, sum_by_place
 from harness.runs.records import Answer, AnswerFacts, Episode, Score, roles
 from harness.runs.reliability import Judged, estimates
 

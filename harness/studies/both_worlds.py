@@ -10,7 +10,8 @@ from harness.core.arrays import Floats
 from harness.core.parallel import Workers
 from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset
-from harness.runs.metrics import SUCCESS, difference, over_episodes
+from harness.runs.estimates import difference, over_episodes
+from harness.runs.headline import SUCCESS
 from harness.world.drivers import DRIVERS
 
 COMPARED = ("frozen", "closed", "difference", "agreement")

@@ -14,18 +14,11 @@ from harness.core.statistics import Estimate, known_mean, seed_interval
 from harness.evaluate.table import columns
 from harness.evaluate.walk import Ask, Decided, World, walk
 from harness.runs.decisions import DECIMALS
-from harness.runs.metrics import (
-    BALANCED,
-    METRICS,
-    PERCENTILES,
-    halved,
-    in_range,
-    known_in,
-    of_decisions,
-    over_episodes,
-    over_seeds,
-    percentiles,
-)
+from harness.runs.estimates import halved, in_range, over_episodes, over_seeds
+from harness.runs.headline import BALANCED
+from harness.runs.metric_values import known_in, of_decisions
+from harness.runs.metrics import METRICS
+from harness.runs.percentiles import PERCENTILES, percentiles
 from harness.studies.axes import Setting
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import pytest
 
 from harness.cli.terminal import table
 from harness.core.figures import PERCENT
-from harness.runs.metrics import over_episodes
+from harness.runs.estimates import over_episodes
 
 
 def test_an_interval_that_nobody_knows_is_a_dash():

@@ -24,7 +24,9 @@ from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
 from harness.report.compare.pair import ORDER, SETTINGS, pair
-from harness.runs.metrics import BALANCED, METRICS, ONE_OPTIMAL
+from harness.runs.headline import BALANCED
+from harness.runs.metric_names import ONE_OPTIMAL
+from harness.runs.metrics import METRICS
 
 Said = tuple[int, str, str]
 WITNESSED = {name for name in METRICS if name.startswith("success_dangerous_rate_")}

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.core.statistics import known_mean
-from harness.runs.metrics import PERCENTILES
-from harness.runs.percentiles import Decided, differences
+from harness.runs.percentiles import PERCENTILES, Decided, differences
 
 DECISIONS = st.lists(
     st.tuples(st.integers(0, 3), st.sampled_from([0.0, 20.5, 21.0, 145.0, float("nan")])),

@@ -21,7 +21,7 @@ from harness.evaluate.table import table
 from harness.evaluate.walk import walk
 from harness.runs import writer
 from harness.runs.decisions import Decisions
-from harness.runs.metrics import Grid
+from harness.runs.grid import Grid
 from harness.runs.records import Answer, Decision, Episode, Latency
 from harness.runs.summary import counted
 

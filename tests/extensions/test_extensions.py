@@ -40,7 +40,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.lifecycle import begin, unfinished
 from harness.radio.profiles import MODELS
 from harness.report import sections
-from harness.runs import metrics
+from harness.runs import metric_values
 from harness.runs.folder import read
 from harness.runs.metrics import METRICS, entry
 from harness.runs.settings import of_words, text_of, words
@@ -270,7 +270,7 @@ def test_what_sections_and_metrics_print_is_no_output_of_a_command(
     )
     assert sections._written("loud", None) is None
     loud = replace(METRICS["success_rate"], name="loud")
-    assert list(metrics._values(loud, lambda: print("from a metric") or np.zeros(2), 2)) == [
+    assert list(metric_values._values(loud, lambda: print("from a metric") or np.zeros(2), 2)) == [
         0.0,
         0.0,
     ]

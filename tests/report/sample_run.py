@@ -19,7 +19,7 @@ from harness.evaluate.requests import requests
 from harness.evaluate.table import table
 from harness.evaluate.walk import walk
 from harness.runs import formats, writer
-from harness.runs.metrics import Grid
+from harness.runs.grid import Grid
 from harness.runs.records import Manifest
 from harness.runs.summary import Figures, counted
 

@@ -19,7 +19,7 @@ from harness.report.page import render
 from harness.report.runs import gather
 from harness.report.words import score_texts
 from harness.runs.folder import read
-from harness.runs.metrics import SUCCESS
+from harness.runs.headline import SUCCESS
 
 
 def marked(*ended):

@@ -19,7 +19,7 @@ from harness.dataset.load import Dataset
 from harness.report.charts import success_latency
 from harness.report.references import in_trees, label, sentences
 from harness.runs.folder import read
-from harness.runs.metrics import SUCCESS
+from harness.runs.headline import SUCCESS
 from harness.world import scenarios
 from harness.world.drivers import CONSTANTS, OPEN_LOOPS, choose, constant, open_loop
 

@@ -17,7 +17,7 @@ from harness.report.templating import visible
 from harness.report.words import cell
 from harness.runs import pinned
 from harness.runs.headline import IN_WORDS, headline_of
-from harness.runs.metrics import BASELINE, GAINS
+from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.records import Score
 from harness.runs.success import Pairs
 from harness.runs.suite import SuiteRun, plays

@@ -310,7 +310,7 @@ def _line_json(line: "Line") -> dict[str, Any]:
 
 def _show_board(lines: "Sequence[Line]") -> None:
     """Print the lines of a board as a table."""
-    from harness.runs.metrics import BASELINE
+    from harness.runs.metric_names import BASELINE
 
     by = next(iter(lines[0].success))
     rows = []

@@ -30,8 +30,10 @@ from harness.extensions.contents.study import (
 )
 from harness.report.document import Table, strong
 from harness.report.drawing.colours import COLOURS, MARKERS
+from harness.runs.estimates import difference, over_episodes
 from harness.runs.headline import SUCCESS
-from harness.runs.metrics import LATENCY, difference, entry, over_episodes
+from harness.runs.metric_names import LATENCY
+from harness.runs.metrics import entry
 from harness.studies.axes import Setting
 from harness.studies.paper_numbers import paper_numbers
 from harness.studies.study import Study, p_cell, percent

@@ -26,8 +26,10 @@ from harness.core.statistics import Estimate, mean_of
 from harness.evaluate.dry_run import lacking
 from harness.evaluate.walk import Decided
 from harness.report.suite import MEAN
+from harness.runs.estimates import over_episodes
 from harness.runs.headline import BALANCED, IN_WORDS, SUCCESS
-from harness.runs.metrics import LATENCY, entry, over_episodes
+from harness.runs.metric_names import LATENCY
+from harness.runs.metrics import entry
 from harness.runs.success import Success, mean_difference, p_of_mean
 from harness.runs.suite import contents_of
 from harness.studies.axes import Setting, axis_of, described, grid

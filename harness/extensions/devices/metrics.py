@@ -3,7 +3,7 @@
 from functools import partial
 
 from harness.core.figures import Unit
-from harness.runs.metrics import Metric
+from harness.runs.metric import Metric
 
 JOULES, BEHIND = Unit("J", 2), "busy_ratio"
 _metric = partial(Metric, better="lower", optional=True, behind=BEHIND)

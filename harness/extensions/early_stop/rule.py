@@ -17,8 +17,9 @@ from harness.core.statistics import Estimate, known_mean
 from harness.extensions.early_stop.sequences import any_time, any_time_difference
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run
+from harness.runs.grid import Grid
 from harness.runs.headline import ANY_TIME
-from harness.runs.metrics import BASELINE, GAINS, Grid
+from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.records import Episode, Score
 from harness.runs.settings import DriveSettings
 from harness.runs.stopping import InterimLooks, StoppingRule, looked_otherwise

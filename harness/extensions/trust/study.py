@@ -32,7 +32,9 @@ from harness.dataset.load import Scene
 from harness.evaluate.walk import Decided
 from harness.radio.profiles import CHANNELS
 from harness.report.document import Table, strong
-from harness.runs.metrics import SUCCESS, mean_by_place, over_episodes
+from harness.runs.estimates import over_episodes
+from harness.runs.headline import SUCCESS
+from harness.runs.places import mean_by_place
 from harness.runs.success import Success
 from harness.studies.axes import NONE, Setting, axis_of, usual_at
 from harness.studies.play import WalkResult

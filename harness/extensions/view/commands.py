@@ -99,7 +99,8 @@ def history(
     """
     from harness.extensions.view.history import history as history_of
     from harness.extensions.view.history import write
-    from harness.runs.metrics import entry, written
+    from harness.runs.estimates import written
+    from harness.runs.metrics import entry
 
     wrong: dict[str, UserError] = {}
     groups = history_of(folder, metric, condition, dataset, wrong.__setitem__)

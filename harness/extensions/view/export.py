@@ -19,7 +19,7 @@ from harness.report.runs import gather
 from harness.runs.folder import Run
 from harness.runs.headline import IN_WORDS, headline_of
 from harness.runs.listing import Listed, runs
-from harness.runs.metrics import BASELINE, GAINS
+from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.suite import SuiteRun
 
 INDEX, PAGE = "index.html", "report.html"

@@ -17,7 +17,8 @@ from harness.report.words import cell
 from harness.runs.folder import Run, read
 from harness.runs.headline import headline_of
 from harness.runs.listing import runs as listed
-from harness.runs.metrics import ALL, entry
+from harness.runs.metric_names import ALL
+from harness.runs.metrics import entry
 from harness.runs.records import Score
 
 

@@ -16,17 +16,12 @@ from harness.core.statistics import LEVEL, Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import Pair, Side
 from harness.runs import percentiles, reliability
+from harness.runs.estimates import difference
 from harness.runs.folder import Run
-from harness.runs.headline import headline_of
-from harness.runs.metrics import (
-    ADJUSTED,
-    METRICS,
-    ONE_OPTIMAL,
-    SUCCESS,
-    difference,
-    entry,
-    known_in,
-)
+from harness.runs.headline import SUCCESS, headline_of
+from harness.runs.metric_names import ADJUSTED, ONE_OPTIMAL
+from harness.runs.metric_values import known_in
+from harness.runs.metrics import METRICS, entry
 from harness.runs.records import Answer
 from harness.runs.sources import prompt_of
 from harness.runs.success import Success

@@ -18,7 +18,8 @@ from harness.report.words import facts
 from harness.runs.contradictions import sound
 from harness.runs.difficulty import Pool
 from harness.runs.folder import Run
-from harness.runs.metrics import by_episode, metrics_of
+from harness.runs.metric_values import by_episode
+from harness.runs.metrics import metrics_of
 from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
 from harness.runs.reliability import Judged

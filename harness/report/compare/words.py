@@ -24,7 +24,8 @@ from harness.report.compare.pair import Pair, Side, where
 from harness.report.findings import FIRST, Kind, findings, of_runs
 from harness.report.words import SHOWN_FROM, as_good_as, p_value
 from harness.runs.headline import IN_WORDS, SUCCESS, headline_metric, headline_of
-from harness.runs.metrics import ADJUSTED, ONE_OPTIMAL, entry
+from harness.runs.metric_names import ADJUSTED, ONE_OPTIMAL
+from harness.runs.metrics import entry
 from harness.runs.records import role_word
 from harness.runs.success import Success
 

@@ -15,8 +15,9 @@ from harness.core.statistics import mean_of, paired_difference
 from harness.dataset.load import Dataset
 from harness.extensions.contents.study import NOTHING, Outcome, holding, witnesses
 from harness.report.suite import MEAN
+from harness.runs.estimates import over_episodes
 from harness.runs.folder import read
-from harness.runs.metrics import BALANCED, SUCCESS, over_episodes
+from harness.runs.headline import BALANCED, SUCCESS
 from harness.runs.success import Success
 from harness.studies.replayed_run import ReplayedRun
 

@@ -31,7 +31,8 @@ from harness.extensions.mixed_helpers.grid.study import (
     run_cells,
 )
 from harness.prompts import versions
-from harness.runs.metrics import BALANCED, LATENCY, SUCCESS
+from harness.runs.headline import BALANCED, SUCCESS
+from harness.runs.metric_names import LATENCY
 from harness.runs.settings import Settings
 from harness.runs.success import Success
 from harness.studies.study import write_study

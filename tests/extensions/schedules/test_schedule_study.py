@@ -41,7 +41,8 @@ from harness.extensions.schedules.study import (
     in_order,
 )
 from harness.runs.folder import read
-from harness.runs.metrics import METRICS, of_decisions
+from harness.runs.metric_values import of_decisions
+from harness.runs.metrics import METRICS
 from harness.runs.success import Success
 from harness.studies import axes
 from harness.studies.replayed_run import ReplayedRun, counted

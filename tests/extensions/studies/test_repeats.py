@@ -39,8 +39,9 @@ from harness.extensions.studies.repeats.study import (
     run_repeats,
     stable,
 )
+from harness.runs.headline import SUCCESS
 from harness.runs.listing import runs
-from harness.runs.metrics import ALL, SUCCESS
+from harness.runs.metric_names import ALL
 from harness.studies.study import write_study
 
 pytestmark = pytest.mark.usefixtures("svg_alone")

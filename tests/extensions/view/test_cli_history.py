@@ -15,7 +15,7 @@ from run_on_disk import Row, configure, made_up
 from harness.coordination.named_points import POINTS
 from harness.extensions.view.history import history
 from harness.runs.folder import read
-from harness.runs.metrics import BALANCED
+from harness.runs.headline import BALANCED
 
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]

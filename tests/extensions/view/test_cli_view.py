@@ -22,7 +22,7 @@ from harness.report.document import Section, document
 from harness.report.words import cell
 from harness.runs.folder import read
 from harness.runs.headline import headline_of
-from harness.runs.metrics import GAINS
+from harness.runs.metric_names import GAINS
 
 Said = tuple[int, str, str]
 LISTENS = "0A"  # of /proc/net/tcp

@@ -31,7 +31,8 @@ from harness.prompts.versions import ROLES, Prompt, load
 from harness.report.document import Table
 from harness.runs.folder import Run
 from harness.runs.headline import BALANCED, SUCCESS
-from harness.runs.metrics import METRICS, by_episode
+from harness.runs.metric_values import by_episode
+from harness.runs.metrics import METRICS
 from harness.runs.success import Success, alike, mean_difference
 from harness.studies.study import Study, ends
 

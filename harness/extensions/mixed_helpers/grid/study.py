@@ -31,9 +31,13 @@ from harness.evaluate.spec import Spec
 from harness.report.compare.page import beside
 from harness.report.document import Table, linked
 from harness.report.drawing.colours import conditions
+from harness.runs.estimates import over_episodes
 from harness.runs.folder import Run
-from harness.runs.headline import headline_of
-from harness.runs.metrics import LATENCY, METRICS, SUCCESS, by_episode, mean_by_place, over_episodes
+from harness.runs.headline import SUCCESS, headline_of
+from harness.runs.metric_names import LATENCY
+from harness.runs.metric_values import by_episode
+from harness.runs.metrics import METRICS
+from harness.runs.places import mean_by_place
 from harness.runs.records import Answer, is_helper
 from harness.runs.success import Success
 from harness.studies.study import Study, corrected, ends, p_cell

@@ -17,7 +17,7 @@ from harness.core.errors import UserError
 from harness.core.versions import versions
 from harness.report.document import Table
 from harness.runs.contradictions import sound
-from harness.runs.metrics import World
+from harness.runs.metric import World
 from harness.runs.records import Variant
 from harness.studies.both_worlds import COMPARED, compared
 

@@ -30,8 +30,12 @@ from harness.report.compare.page import beside
 from harness.report.document import Table
 from harness.report.drawing.colours import conditions
 from harness.report.findings import Kind, of_runs
+from harness.runs.estimates import in_range
 from harness.runs.folder import Run
-from harness.runs.metrics import ALL, METRICS, SUCCESS, by_episode, in_range
+from harness.runs.headline import SUCCESS
+from harness.runs.metric_names import ALL
+from harness.runs.metric_values import by_episode
+from harness.runs.metrics import METRICS
 from harness.runs.records import Score
 from harness.studies.study import DRAWN, Study
 

@@ -1,0 +1,99 @@
+"""Estimates of metrics and of their differences: means with intervals, and p-values."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from harness.core import multiplicity
+from harness.core.arrays import Floats
+from harness.core.figures import interval_of
+from harness.core.statistics import (
+    LEVEL,
+    Estimate,
+    episode_interval,
+    known_mean,
+    mean_of,
+    paired_difference,
+    rate_interval,
+    seed_interval,
+    seed_rate_interval,
+)
+from harness.runs.metrics import entry
+from harness.runs.records import Score
+
+
+def over_seeds(name: str, values: Floats) -> Estimate:
+    """Return the mean of a metric's values with a 95 % interval over channel seeds.
+
+    `values` are (S, E), by S channel seeds and E episodes, NaN where unknown; `name` is the
+    metric's.
+    """
+    if entry(name).interval == "rate":
+        return in_range(name, seed_rate_interval(values))
+    return in_range(name, seed_interval(known_mean(values, axis=1)))
+
+
+def over_episodes(name: str, values: Floats) -> Estimate:
+    """Return the mean of a metric's values with a 95 % interval over episodes.
+
+    `values` are (S, E), by S channel seeds and E episodes, NaN where unknown; `name` is the
+    metric's.
+    """
+    means = known_mean(values, axis=0)
+    rate = entry(name).interval == "rate"
+    return rate_interval(means) if rate else in_range(name, episode_interval(means))
+
+
+def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float = LEVEL) -> Estimate:
+    """Return the difference a - b of a metric with its interval over episodes.
+
+    `pairs` has the metric's values a and b of the same episodes, (E, S) each, by E episodes and S
+    channel seeds: one pair, or of balanced success one for each half, with a danger and without, in
+    which the episodes of the other half are NaN. `level` is the confidence of the interval.
+    """
+    if entry(name).interval != "rate":
+        ((a, b),) = pairs
+        return episode_interval(a - b, level=level)
+    result = paired_difference([known_mean(a - b, axis=1) for a, b in pairs], level)
+    if len(pairs) == 1:
+        return result
+    return replace(result, n_excluded=max((result.n_excluded - result.n) // 2, 0))
+
+
+def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False) -> Estimate:
+    """Return a metric's estimate: for balanced success the mean of those of its two halves.
+
+    A half is the episodes with a danger, or those without. `estimate` returns the estimate of the
+    metric with a name. Halves have no episode in common, so that their intervals are independent.
+    `shared` says that they share units, such as seeds: n is then that of each half, else the sum.
+    """
+    halves = entry(name).halves
+    if not halves:
+        return estimate(name)
+    first, second = map(estimate, halves)
+    mean = mean_of([first, second])
+    n, n_excluded = (
+        (first.n, first.n_excluded) if shared else (mean.n, (mean.n_excluded - mean.n) // 2)
+    )
+    return replace(mean, n=n, n_excluded=max(n_excluded, 0))
+
+
+def p_value(name: str, pairs: Sequence[tuple[Floats, Floats]]) -> float | None:
+    """Return the p-value of no difference in a metric; None if the difference has no interval.
+
+    `pairs` has the values of both sides, (E, S) each, as `difference` takes them: E episodes by S
+    channel seeds.
+    """
+    return multiplicity.p_value(lambda level: difference(name, pairs, level))
+
+
+def in_range(name: str, e: Estimate) -> Estimate:
+    """Return an estimate with its interval cut to the metric's range, from 0 to `most`."""
+    low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, entry(name).most))
+    return Estimate(e.value, low, high, e.n, e.n_excluded)
+
+
+def written(score: Score) -> str:
+    """Return a score and its interval as text, with the metric's unit but without its name."""
+    return interval_of(score, entry(score.metric).unit)

@@ -1,0 +1,58 @@
+"""The grid of a run: its conditions, seeds and episodes, the axes of its figures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from harness.core.arrays import Ints
+from harness.runs.decisions import Decisions
+from harness.runs.records import Episode
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Hold the conditions, seeds and episodes of a run: the axes (C, S, E) of its figures.
+
+    Each combination is a cell: one episode under one condition with one seed.
+    """
+
+    conditions: tuple[str, ...]  # names of the C conditions, operating points of the run
+    seeds: tuple[int, ...]  # the S seeds of the channel's draws
+    episodes: tuple[int, ...]  # numbers of the E episodes, one for each layout
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return len(self.conditions), len(self.seeds), len(self.episodes)
+
+    def places(self, decisions: Decisions) -> Ints:
+        """Return the index of each of n decisions' cells in a flattened array (C, S, E), (n,).
+
+        Raises ValueError for a decision outside the grid.
+        """
+        condition = decisions.codes("condition", self.conditions)
+        seed, episode = (
+            _position(decisions.whole(name), names)
+            for name, names in (("seed", self.seeds), ("episode", self.episodes))
+        )
+        return np.ravel_multi_index((condition, seed, episode), self.shape)
+
+    def ordered(self, episodes: Sequence[Episode]) -> list[Episode]:
+        """Return the episodes in the order of the cells: by condition, seed and episode.
+
+        Raises ValueError unless each cell has exactly one.
+        """
+        by_cell = {(e.condition, e.seed, e.episode): e for e in episodes}
+        cells = [*product(self.conditions, self.seeds, self.episodes)]
+        if len(by_cell) != len(episodes) or set(by_cell) != set(cells):
+            raise ValueError("not every episode is there once in every condition and seed")
+        return [by_cell[cell] for cell in cells]
+
+
+def _position(values: Ints, names: Sequence[int]) -> Ints:
+    order = np.argsort(names)
+    place = order[np.minimum(np.searchsorted(names, values, sorter=order), len(names) - 1)]
+    if (np.asarray(names)[place] != values).any():
+        raise ValueError("a decision of another seed or episode")
+    return np.asarray(place)

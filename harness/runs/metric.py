@@ -1,0 +1,99 @@
+"""What a metric is: its name, meaning, unit and function."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from harness.core.arrays import Floats
+from harness.core.figures import PERCENT, Unit
+from harness.runs import reliability
+from harness.runs.records import Answer, AnswerFacts, Episode, Role
+
+World = Literal["frozen", "closed-loop"]
+Better = Literal["higher", "lower", "neither"]
+Answers = Sequence[Answer | AnswerFacts]
+MS, SECONDS, METRES = Unit("ms"), Unit("s", 2), Unit("m")
+NATS = Unit("nats", 3)
+COUNT, MEAN_COUNT, SCORE = Unit(decimals=1), Unit(decimals=2), Unit(decimals=3)
+
+
+class Columns(Protocol):
+    """Describe a table of n decisions: `table[name]` is a column (n,), NaN where unknown."""
+
+    def __getitem__(self, name: str, /) -> Floats: ...
+
+
+@dataclass(frozen=True)
+class Metric:
+    """Define one metric, with values of 0 or more, by its name, meaning, unit and function.
+
+    The function is one of `decisions`, `episodes`, `answers` and `pooled`, by what it takes; a
+    metric without any is computed where `summary.csv` is made.
+    """
+
+    name: str  # its name in tables, with the unit at the end
+    meaning: str  # its meaning, in words for people
+    unit: Unit  # how it is written
+    better: Better  # which change of it is better
+    # `rate` for a share of events, whose interval is Wilson's; `mean` for Student's t
+    interval: Literal["rate", "mean"] = "mean"
+    most: float = math.inf  # the greatest value that it can have
+    # whether the p of its differences is corrected (decision 0084); all others are exploratory
+    primary: bool = False
+    label: str = ""  # its name for people; by default the name with spaces
+    # returns its values for decisions (n,), whose mean is the episode's
+    decisions: Callable[[Any], Floats] | None = None
+    # returns an episode's value; None where unknown
+    episodes: Callable[[Episode], Any] | None = None
+    # returns its values for the answers (n,) of one role; NaN where unknown
+    answers: Callable[[Answers], Floats] | None = None
+    role: Role | None = None  # whose answers
+    percentile: int | None = None  # the percent of all decisions whose latency is at most so long
+    # returns its value for all decisions, which has no mean
+    pooled: reliability.Figure | None = None
+    total: bool = False  # whether an episode has the sum over its decisions instead of the mean
+    world: World | None = None  # the world in which it is known; None for every world
+    optional: bool = False  # whether a run in which it is nowhere known has no row of it
+    half: bool = False  # whether it is of the episodes with a danger alone, or of those without
+    # names of two metrics whose mean it is: of the episodes with a danger, and of those without
+    halves: tuple[str, ...] = ()
+    # the metric that it corrects by the layouts' difficulty, where two runs are compared
+    corrects: str = ""
+    # whether another has taken its place: tables and, where it is still computed, comparisons keep
+    # it, and pages leave it out
+    superseded: bool = False
+    # of an extension that ships: the metric behind whose rows its own stand
+    behind: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.label:
+            object.__setattr__(self, "label", self.name.replace("_", " "))
+
+    @property
+    def compared(self) -> bool:
+        """Return whether two runs are compared in the metric.
+
+        It is so if it has a value for each episode or over all decisions.
+        """
+        ways = (
+            self.decisions,
+            self.episodes,
+            self.percentile,
+            self.pooled,
+            self.halves,
+            self.corrects,
+        )
+        return any(ways)
+
+
+def decision_share(
+    name: str, meaning: str, column: str, better: Better = "lower", **more: Any
+) -> Metric:
+    """Build the metric of a share of decisions, one column of their table."""
+    return Metric(name, meaning, PERCENT, better, "rate", 1.0, decisions=of_column(column), **more)
+
+
+def of_column(name: str) -> Callable[[Columns], Floats]:
+    """Build the function of one column of decisions."""
+    return lambda d: d[name]
