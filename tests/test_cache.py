@@ -105,6 +105,17 @@ def file(tmp_path: Path) -> Path:
 # -- what is in the key ----------------------------------------------------------------------------
 
 
+def test_engines_of_packages_that_state_the_same_of_themselves_answer_each_for_itself(
+    file: Path,
+) -> None:
+    one, other = (Talker(), Talker())
+    Cached(one, file, "engine a of package x").complete([BASE])
+    [done] = Cached(other, file, "engine b of package x").complete([BASE])
+    assert not done.cached
+    [again] = Cached(other, file, "engine b of package x").complete([BASE])
+    assert again.cached
+
+
 def test_every_field_of_a_request_is_in_the_key_or_named_with_a_reason() -> None:
     names = {f.name for f in fields(Request)}
     assert set(CHANGED) == names, "a new field: say here what another value of it would be"

@@ -219,6 +219,10 @@ class Completion:
                 object.__setattr__(self, name, text.encode("utf-8", "replace").decode())
 
 
+# Fields of a completion that only a read-out has: its letters' probability, and what follows them.
+OF_LETTERS = ("label_mass", "letter_share", "follows_letter", "flipped")
+
+
 def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:
     """Return the completion of a request that got no answer: its text is empty.
 

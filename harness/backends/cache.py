@@ -36,7 +36,7 @@ from harness.backends.base import (
     window,
 )
 from harness.backends.card import Card
-from harness.backends.registry import capabilities
+from harness.backends.registry import ENGINES, capabilities
 from harness.core import kept
 from harness.core.config import LONGEST_S
 from harness.core.errors import printable
@@ -222,7 +222,9 @@ def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
     """
     if file is None or not capabilities(card.engine).renders:
         return backend
-    return Cached(cast("Rendering", backend), file)
+    engine = card.engine
+    of_package = "" if ENGINES.is_ours(engine) else ENGINES.of_package(engine)
+    return Cached(cast("Rendering", backend), file, of_package)
 
 
 class Cached:
@@ -231,9 +233,12 @@ class Cached:
     Errors are not cached. A cached answer has no seconds.
     """
 
-    def __init__(self, backend: Rendering, file: Path) -> None:
+    def __init__(self, backend: Rendering, file: Path, of_package: str = "") -> None:
         self.backend = backend
         self._identity = backend.identity()
+        identity: Mapping[str, Any] = self._identity
+        if of_package:  # another engine may state the same of itself
+            identity = {"engine": of_package, "identity": self._identity}
         exact = self._identity.get("dtype") in _EXACT
         self._batch_size: int | None = None if exact else getattr(backend, "batch_size", None)
         self._file: CompletionFile | None = CompletionFile(file)
@@ -241,9 +246,9 @@ class Cached:
         self._doubt = doubt(backend)
         self._sources, taken = _sources(several(backend))
         # What an answer is kept under, by its source; None where the identity says who answers
-        self._identities: dict[str | None, Mapping[str, Any]] = {None: self._identity}
+        self._identities: dict[str | None, Mapping[str, Any]] = {None: identity}
         if self._sources:
-            self._identities = {source: {**self._identity, "source": source} for source in taken}
+            self._identities = {source: {**identity, "source": source} for source in taken}
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         prompts = self.backend.rendered(requests)

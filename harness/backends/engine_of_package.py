@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
-from harness.backends.base import Backend, Completion, Request, Served, forget
+from harness.backends.base import OF_LETTERS, Backend, Completion, Request, Served, forget
+from harness.backends.token_counts import too_few
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.plugins import line_or_none, texts
@@ -19,6 +20,7 @@ from harness.core.strangers import worded
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
+    from harness.backends.registry import Capabilities
     from harness.runs.records import Latency
 
 N = TypeVar("N", None, int)
@@ -33,9 +35,10 @@ class EngineOfPackage:
     A wrong answer becomes a one-line UserError. All other attributes are passed on to that backend.
     """
 
-    def __init__(self, backend: Backend, card: "Card") -> None:
+    def __init__(self, backend: Backend, card: "Card", can: "Capabilities") -> None:
         self._backend, self._what = backend, f"engine {printable(card.engine)}"
         self._delays_s = {0.0, card.slow_s}
+        self._can = can
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         with worded(self._what):
@@ -50,7 +53,7 @@ class EngineOfPackage:
         if not isinstance(completion, Completion):
             raise TypeError(f"it gives a {type(completion).__name__} and no Completion")
         where = f"{self._what}, answer {printable(request.id)}"
-        fields = dict(vars(completion))
+        fields = {name: _plain(value) for name, value in vars(completion).items()}
         if fields.get("request_id") != request.id:
             raise UserError(
                 f"{where}: request_id is {printable(repr(fields.get('request_id')))}; give answers "
@@ -63,6 +66,12 @@ class EngineOfPackage:
             raise UserError(
                 f"{where}: slow_s is {completion.slow_s:g}, which its card does not declare"
             )
+        for name in () if request.bare else OF_LETTERS:
+            if getattr(completion, name) is not None:
+                raise UserError(f"{where}: {name} is stated, which only a read-out has")
+        counts = (completion.prompt_tokens, completion.completion_tokens)
+        if few := too_few(request, self._can, completion.text, *counts):
+            raise UserError(f"{where}: {few}, too few; count them all, or state None")
         return replace(completion, error=SILENT) if completion.error == "" else completion
 
     def identity(self) -> dict[str, Any]:
@@ -137,6 +146,15 @@ class EngineOfPackage:
         if attribute is UNSTATED:
             raise AttributeError(name)
         return attribute
+
+
+def _plain(value: object) -> object:
+    """Return a text or number of a subclass, such as NumPy's, as one that files can hold."""
+    if isinstance(value, str):
+        return str.__str__(value)
+    if isinstance(value, float):
+        return float.__float__(value)
+    return value
 
 
 def _copy(request: Request) -> Request:

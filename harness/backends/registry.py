@@ -219,7 +219,9 @@ def open_backend(
             backend: Backend = import_object(engine.opens)(card, **options)
         return backend
     with worded(what):
-        return EngineOfPackage(import_object(engine.opens)(card, **options), card)
+        return EngineOfPackage(
+            import_object(engine.opens)(card, **options), card, engine.capabilities
+        )
 
 
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:

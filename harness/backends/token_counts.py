@@ -1,9 +1,12 @@
 """Bound token counts by their texts: latency and energy follow from them."""
 
 import math
+from typing import TYPE_CHECKING
 
 from harness.backends.base import Request
-from harness.backends.registry import Capabilities
+
+if TYPE_CHECKING:
+    from harness.backends.registry import Capabilities
 
 MOST_CHARACTERS = 16  # of a token, on average over a text: whoever counts fewer has not counted
 
@@ -15,7 +18,7 @@ def least_tokens(characters: int) -> int:
 
 def too_few(
     request: Request,
-    can: Capabilities,
+    can: "Capabilities",
     text: str,
     prompt_tokens: int | None,
     completion_tokens: int | None,

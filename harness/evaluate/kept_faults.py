@@ -7,15 +7,13 @@ from typing import Any
 
 from msgspec import UNSET, UnsetType, structs
 
-from harness.backends.base import Completion, Request
+from harness.backends.base import OF_LETTERS, Completion, Request
 from harness.backends.token_counts import too_few
 from harness.evaluate import repair
 from harness.evaluate.answers import answer_of, digests
 from harness.evaluate.spec import Spec
 from harness.runs.records import Answer, FirstTurn
 
-# What only a read-out has: the probability of its letters, and how much it follows them.
-OF_LETTERS = ("label_mass", "letter_share", "follows_letter", "flipped")
 SUMMED = ("prompt_tokens", "completion_tokens", "seconds", "slow_s")  # over the turns of an answer
 
 

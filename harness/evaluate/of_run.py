@@ -59,7 +59,12 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
     Raises UserError if a channel, network, schedule or other file that they name has changed since.
     """
     manifest = run.manifest
-    points = {str(c["name"]): OperatingPoint.from_dict(c) for c in manifest.conditions}
+    points = {}
+    for condition in manifest.conditions:
+        try:
+            points[str(condition["name"])] = OperatingPoint.from_dict(condition)
+        except UserError as error:
+            raise UserError(f"{printable(run.path)}: {error}") from None
     kept = kept_of(points.values())
     records_by_kind: dict[str, tuple[Mapping[str, Any], Callable[[str, Any], bool]]] = {
         "channel profile": (manifest.channels, CHANNELS.unchanged),

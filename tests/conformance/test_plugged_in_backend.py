@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
+import numpy as np
 import pytest
 from msgspec import structs
 from packaged import register
@@ -92,6 +94,7 @@ def test_what_it_cannot_do_is_refused_by_its_capabilities(
 
 
 PROXY = cards.load("proxy")
+CAN = registry.Capabilities(language_model=True)
 REQUEST = Request("00001-0/v1", "ego", ({"role": "user", "content": "?"},), ("STAY", "GO"), 9)
 DONE = Completion(REQUEST.id, "{}", 3, 1, "stop", None, 1)
 
@@ -133,6 +136,11 @@ def stopped(request: Request) -> Any:
         (other(prompt_tokens=-5), "prompt_tokens = -5; allowed: a whole number, 0 or more"),
         (other(completion_tokens=10**30), "completion_tokens = 1000"),
         (other(label_mass="x"), "label_mass = 'x'; allowed: a number"),
+        (other(label_mass=0.5), "label_mass is stated, which only a read-out has"),
+        (
+            other(text="a" * 99),
+            "1 tokens of a text with 99 characters, too few; count them all, or",
+        ),
         (other(letter_share=99.0), "letter_share = 99.0; allowed: a number from 0 to 1"),
         (other(finish_reason="done"), "unknown finish_reason in engine proxy, answer 00001-0/v1"),
         (other(error="busy"), "an error has finish_reason error, and nothing else has"),
@@ -140,7 +148,7 @@ def stopped(request: Request) -> Any:
 )
 def test_answers_that_cannot_be_are_one_line(answers: Callable[[Request], Any], said: str) -> None:
     with pytest.raises(UserError, match=said):
-        EngineOfPackage(Engine(answers), PROXY).complete([REQUEST])
+        EngineOfPackage(Engine(answers), PROXY, CAN).complete([REQUEST])
 
 
 LONE = "\udc80"
@@ -178,7 +186,7 @@ ODD_FACTS = [
 @pytest.mark.parametrize(("fact", "odd"), ODD_FACTS)
 def test_what_an_engine_says_of_itself_is_asked_behind_the_door(fact: str, odd: Any) -> None:
     given = staticmethod(odd) if callable(odd) else odd
-    engine: Any = EngineOfPackage(type("Odd", (Engine,), {fact: given})(stopped), PROXY)
+    engine: Any = EngineOfPackage(type("Odd", (Engine,), {fact: given})(stopped), PROXY, CAN)
     asked = ([REQUEST],) if fact == "rendered" else ()
     with pytest.raises(UserError, match=r"^engine proxy(, [a-z]+)?(: | fails \()") as error:
         getattr(engine, fact)(*asked)
@@ -186,12 +194,12 @@ def test_what_an_engine_says_of_itself_is_asked_behind_the_door(fact: str, odd: 
 
 
 def test_an_engine_that_says_nothing_of_itself_has_what_is_usual() -> None:
-    engine = EngineOfPackage(Engine(stopped), PROXY)
+    engine = EngineOfPackage(Engine(stopped), PROXY, CAN)
     assert (engine.window, engine.batch_size, engine.doubt) == (0, None, None)
     assert (engine.several, engine.served(), getattr(engine, "chat", 5)) == ([], [], 5)
     engine.forget()
     said = {"served": lambda engine: [Served("a", "b")], "latency": lambda engine: LATENCY}
-    engine = EngineOfPackage(type("Said", (Engine,), {**said, "window": 3})(stopped), PROXY)
+    engine = EngineOfPackage(type("Said", (Engine,), {**said, "window": 3})(stopped), PROXY, CAN)
     assert (engine.window, engine.latency(), engine.served()) == (3, LATENCY, [Served("a", "b")])
 
 
@@ -201,21 +209,30 @@ def test_what_it_does_to_requests_and_answers_stays_its_own() -> None:
         object.__setattr__(request, "id", "other")
         return [DONE]
 
-    [done] = EngineOfPackage(Engine(greedy), PROXY).complete([REQUEST])
+    [done] = EngineOfPackage(Engine(greedy), PROXY, CAN).complete([REQUEST])
     assert done == DONE
     assert done is not DONE
     assert (REQUEST.id, REQUEST.messages[0]["content"]) == (DONE.request_id, "?")
 
 
+def test_texts_and_numbers_of_other_kinds_become_pythons_own() -> None:
+    engine = Engine(
+        other(text=np.str_("{}"), seconds=np.float64(0.5), first_token_s=np.float64(0.1))
+    )
+    [done] = EngineOfPackage(engine, PROXY, CAN).complete([REQUEST])
+    assert msgspec.json.encode(done)
+    assert (type(done.text), type(done.seconds), done.seconds) == (str, float, 0.5)
+
+
 def test_an_error_without_a_reason_has_one() -> None:
     engine = Engine(other(error="", finish_reason="error"))
-    [done] = EngineOfPackage(engine, PROXY).complete([REQUEST])
+    [done] = EngineOfPackage(engine, PROXY, CAN).complete([REQUEST])
     assert done.error == SILENT
 
 
 def test_an_identity_that_is_none_is_one_line() -> None:
     with pytest.raises(UserError, match=r"engine proxy fails .*its identity is a list and no dict"):
-        EngineOfPackage(Engine(stopped), PROXY).identity()
+        EngineOfPackage(Engine(stopped), PROXY, CAN).identity()
 
 
 @pytest.mark.parametrize(
