@@ -17,6 +17,7 @@ import msgspec
 import pyarrow.parquet as pq
 import pytest
 from former import DATASET, NAME
+from packaged import register
 from starlette.testclient import TestClient
 from tiers import some
 
@@ -249,6 +250,30 @@ def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: 
     assert "has 1 finished part that nobody finished here with your key; their ep" in error
     assert len(folder.read(begun).episodes) == 40
     assert (begun / "answers.jsonl").read_bytes().startswith(answers)
+
+
+def test_a_begun_run_goes_on_with_the_packages_that_it_began_with(
+    kept: Callable[[str], Path],
+    harness: Typed,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Their rules, radios and scenarios made what it has."""
+    begun = kept("0103f23/begun")
+    register(
+        tmp_path / "site", "[swarmdrive.notes]\nmine = by_hand_notes:NOTES\n", by_hand_notes=""
+    )
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    assert versions()["by-hand"] == "1.0"
+    config = begun / ".work/config.json"
+    began_with = {**versions(), "by-hand": "0.9"}
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"versions": began_with}))
+    typed = (*BEGUN.split(), "--ask", "all", "--ties", "first", "--out", begun)
+    code, _, error = harness(*typed, "--scenario", NAME)
+    assert (code, error.count("\n")) == (2, 1)
+    assert (
+        "was begun with another version of package by-hand; repeat its settings (version" in error
+    )
 
 
 def test_a_begun_run_of_the_first_commit_is_refused(

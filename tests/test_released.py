@@ -13,6 +13,7 @@ from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.dataset import suites
 from harness.dataset.load import find, load
+from harness.dataset.schema import manifest_schema, record_schema, tree_schema
 from harness.dataset.verify import check
 from harness.prompts import versions as prompts
 
@@ -77,3 +78,19 @@ def test_a_released_dataset_that_an_installation_lacks_is_one_line(
     monkeypatch.setattr(resources, "root", lambda: tmp_path)
     with pytest.raises(UserError, match="dataset blind-merge-v1 is not in this installation"):
         find("blind-merge-v1")
+
+
+NEWEST = tomllib.loads((ROOT / "datasets/suites.toml").read_text())["v2v-safety-2"]["datasets"]
+
+
+@pytest.mark.parametrize("name", NEWEST)
+def test_the_newest_datasets_would_be_built_with_the_schemas_that_they_have(name: str) -> None:
+    """Descriptions are docstrings: rewording one changes what a rebuild has."""
+    dataset = load(ROOT / "datasets" / name, 1)
+    for file, schema in (
+        ("scene", record_schema(dataset.scenario)),
+        ("tree", tree_schema()),
+        ("manifest", manifest_schema()),
+    ):
+        released = json.loads((ROOT / "datasets" / name / f"{file}.schema.json").read_text())
+        assert json.loads(json.dumps(schema)) == released, file

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from evaluating import same_files
+from run_on_disk import configure
 from starlette.testclient import TestClient
 from tiers import some
 
@@ -447,6 +448,24 @@ def test_a_suite_that_lacks_a_dataset_of_its_name_is_named(evaluated: Harness) -
     code, out, _ = evaluated("run", "check", DONE)
     assert code == 1
     assert "suite.json has 2 of the 3 datasets of suite" in " ".join(out.split())
+
+
+@pytest.mark.parametrize("name", ["ties", "latency", "sampling_seed"])
+def test_runs_of_a_suite_have_the_same_settings(name: str, evaluated: Harness) -> None:
+    folder = DONE / "exits"
+    stated = json.loads((folder / "run.json").read_text())
+    changes: dict[str, dict[str, object]] = {
+        "ties": {"ties": "first", "settings": {**stated["settings"], "ties": "first"}},
+        "latency": {"latency": {**stated["latency"], "source": "declared", "ego_s": 0.001}},
+        "sampling_seed": {
+            "settings": {**stated["settings"], "sampling_seed": 1},
+            "sampling_seed": 1,
+        },
+    }
+    configure(folder, **changes[name])
+    code, out, error = evaluated("report", DONE)
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "has another model, other conditions, seeds or settings than" in error
 
 
 def test_a_suite_that_nobody_changed_is_equal(evaluated: Harness) -> None:

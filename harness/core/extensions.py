@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cache
 from keyword import iskeyword
-from math import isfinite
 from typing import Any, NamedTuple
 
 from harness.core import formats
@@ -457,9 +456,18 @@ def _is_setting(name: Any, setting: Any) -> bool:
         and (setting.kind is not tuple or not setting.default)
         and setting.only in ("", "frozen", "closed-loop")
         and isinstance(setting.place, str)
-        and (not isinstance(setting.default, float) or isfinite(setting.default))
+        and _can_be_kept(setting.default)
         and isinstance(setting.help, str)
     )
+
+
+def _can_be_kept(default: Any) -> bool:
+    """Return whether files can hold a setting's default, as they can what is typed."""
+    if isinstance(default, str):
+        return default == printable(default, len(default) + 1)
+    if isinstance(default, int | float):
+        return -(2**63) < default < 2**63  # NaN is not
+    return True
 
 
 @cache

@@ -109,6 +109,25 @@ def package_of(entry: Any) -> str:
     return printable(_name_of(getattr(entry, "dist", None)) or "of no name")
 
 
+def package_versions() -> dict[str, str]:
+    """Return the versions of other installed packages that add plug-ins, by the package's name.
+
+    A version is what the package states; one that states none is left out.
+    """
+    versions: dict[str, str] = {}
+    try:
+        groups = _all_entries(tuple(sys.path)).groups
+    except Exception:  # whatever the metadata of a package hold; `entries` says whose it is
+        return versions
+    for group in filter(lambda group: group.startswith("swarmdrive."), groups):
+        for entry in entries(group).values():
+            name = _name_of(getattr(entry, "dist", None))
+            version = getattr(getattr(entry, "dist", None), "version", None)
+            if name and name != OURS and isinstance(version, str):
+                versions[printable(name)] = printable(version)
+    return dict(sorted(versions.items()))
+
+
 @cache  # a distribution reads its metadata at each look
 def _name_of(distribution: Any) -> str:
     return str(getattr(distribution, "name", "") or "")

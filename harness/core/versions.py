@@ -8,6 +8,7 @@ from typing import Any
 
 from harness import __version__
 from harness.core.kept import code_sha256
+from harness.core.plugins import package_versions
 
 # Versions of what turns answers into decisions. tests/conformance/test_answer_versions.py pins
 # their results and asks for a new version when one moves. Work that was stopped under another
@@ -23,8 +24,9 @@ _version = cache(metadata.version)
 def versions(packages: Sequence[str] = PACKAGES) -> Any:
     """Return a dict of versions, as texts: of the harness, Python, the platform and packages.
 
-    `packages` are names of distributions; one that is not installed is left out. `parser`,
-    `decisions` and `figures` count changes of the harness's own results.
+    `packages` are names of distributions; one that is not installed is left out. Packages that add
+    plug-ins are always there. `parser`, `decisions` and `figures` count changes of the harness's
+    own results.
     """
     installed = {
         "harness": __version__,
@@ -39,6 +41,8 @@ def versions(packages: Sequence[str] = PACKAGES) -> Any:
             installed[name] = _version(name)
         except metadata.PackageNotFoundError:
             continue
+    for name, version in package_versions().items():
+        installed.setdefault(name, version)
     return installed
 
 

@@ -27,7 +27,7 @@ from harness.core.errors import UserError, in_range, printable
 from harness.core.files import canonical_json, opened, replacing, sha256_bytes, write_whole
 from harness.core.formats import WORK
 from harness.core.parallel import Workers, each
-from harness.core.plugins import Plugins
+from harness.core.plugins import Plugins, package_versions
 from harness.core.seals import is_sealed, say_unsealed, write_seal
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose, seeds_text
 from harness.core.shards import Shard
@@ -162,6 +162,8 @@ def _settings(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
     versions = {"harness": __version__}
     for package in ("highway-env", "numpy", "shapely"):
         versions[package] = version(package)
+    if not is_ours(scenario.layout):
+        versions |= package_versions()
     settings = {
         "scenario": scenario.name,
         "actions": list(scenario.actions),

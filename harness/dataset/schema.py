@@ -235,4 +235,18 @@ def manifest_schema() -> dict[str, Any]:
 
 def _published(kind: type[Closed], title: str) -> dict[str, Any]:
     dialect = "https://json-schema.org/draft/2020-12/schema"
-    return {"$schema": dialect, "title": title, **msgspec.json.schema(kind)}
+    schema = {"$schema": dialect, "title": title, **msgspec.json.schema(kind)}
+    unwrapped: dict[str, Any] = _unwrapped(schema)
+    return unwrapped
+
+
+def _unwrapped(value: Any) -> Any:
+    """Return a JSON Schema whose descriptions, which are docstrings, break no line behind a comma.
+
+    Published files have had them so, whatever width the code's lines have.
+    """
+    if isinstance(value, dict):
+        return {key: _unwrapped(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_unwrapped(each) for each in value]
+    return re.sub(r"([,;])\n +", r"\1 ", value) if isinstance(value, str) else value

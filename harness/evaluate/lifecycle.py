@@ -14,6 +14,7 @@ import msgspec
 from harness.backends.base import same_model
 from harness.core import work
 from harness.core.errors import UserError, printable
+from harness.core.plugins import package_versions
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
@@ -149,6 +150,11 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
         stored = {**_comparable(run_start.settings), "shard": run_start.shard}
         work.same(out, now, stored, partial(_options, spec, shlex.join(run_start.command)))
         work.same(out, rules(versions()), rules(run_start.versions))
+        stored_versions = run_start.versions
+        for name, version in package_versions().items():
+            if name in stored_versions:
+                package = f"version of package {name}"
+                work.same(out, {package: version}, {package: stored_versions[name]})
     return run_start
 
 

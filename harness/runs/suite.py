@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
 from harness.core.errors import UserError, printable
 from harness.core.files import text_of, write_whole
@@ -18,11 +19,13 @@ from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.listing import own_name
 from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant
+from harness.runs.settings import FrozenSettings, deciding
 from harness.runs.success import Plays, by_condition, is_gain
 from harness.runs.writer import csv_text
 
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means over families
+_MEASURED = "measured"  # source of a latency that each run measures for itself
 
 
 class Contents(msgspec.Struct, frozen=True, kw_only=True):
@@ -86,9 +89,11 @@ class SuiteRun:
 
         A family is the scenes of one scenario; each may have a prompt of its own.
         """
-        prompts = dict.fromkeys(run.manifest.variant.prompt for run in self.runs.values())
-        first = self.manifest.variant
-        return Variant(first.model, " and ".join(prompts), first.answer)
+        variants = [run.manifest.variant for run in self.runs.values()]
+        prompts = dict.fromkeys(variant.prompt for variant in variants)
+        helpers = dict.fromkeys(variant.helpers for variant in variants)
+        first = variants[0]
+        return Variant(first.model, " and ".join(prompts), first.answer, " and ".join(helpers))
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
@@ -186,15 +191,32 @@ def read(path: Path) -> SuiteRun:
     for run in rest:
         if _shared_settings(run) != _shared_settings(first):
             raise UserError(
-                f"{printable(run.path)} has another model, other conditions or seeds than "
-                f"{printable(first.path)}; make the runs of the suite again"
+                f"{printable(run.path)} has another model, other conditions, seeds or settings "
+                f"than {printable(first.path)}; make the runs of the suite again"
             )
     return SuiteRun(path, contents.name, contents.description, runs)
 
 
 def _shared_settings(run: Run) -> Any:
+    """Return what all runs of a suite have; scenes, prompts and measured times are each run's."""
     manifest = run.manifest
-    return manifest.model, manifest.answer, manifest.conditions, manifest.seeds
+    world = manifest.settings.world
+    if isinstance(world, FrozenSettings):
+        world = structs.replace(world, dataset="")
+    settings = structs.replace(deciding(manifest.settings), world=world, prompt="", latency=None)
+    times = structs.replace(manifest.latency, basis="", sample={})
+    agents = [{**agent, "prompt": {}} for agent in (manifest.agent(0), *manifest.helpers)]
+    return (
+        agents,
+        manifest.conditions,
+        manifest.seeds,
+        settings,
+        _MEASURED if times.source == _MEASURED else times,
+        {name: (each.model, each.parameters) for name, each in manifest.channels.items()},
+        manifest.networks,
+        manifest.schedules,
+        manifest.kept,
+    )
 
 
 def write(suite: SuiteRun) -> None:

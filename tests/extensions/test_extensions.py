@@ -188,6 +188,8 @@ ODD = {
     'Setting(float, float("nan"), "")})': "are no table of Setting",
     'Extension(name="odd", settings={"a": Setting(tuple, ("x",), "")})': "are no table of Setting",
     'Extension(name="odd", settings={"a": Setting(int, 1, "", only="b")})': "no table of Setting",
+    'Extension(name="odd", settings={"a": Setting(int, 10**30, "")})': "are no table of Setting",
+    'Extension(name="odd", settings={"a": Setting(str, "\\ud800", "")})': "are no table of Setting",
     'Extension(name="odd", settings={"A '
     'b": Setting(int, 1, "")})': "its settings are no table of Setting",
     "1 / 0": "plug-in 'odd' (swarmdrive.extensions): "
