@@ -14,6 +14,7 @@ from harness.core.arrays import Bools, Floats, Ints
 class Claims:
     """Hold the positions and speeds that H helpers claim, and what the ego can check them by.
 
+    Helpers claim them in their beacons. The conflict zone is where their paths and the ego's meet.
     Arrays are of decisions of any shape `(...)`. On an axis of length 1+H index 0 is the ego and
     1+h is helper h; on one of length H, index h is helper h.
     """
@@ -21,7 +22,7 @@ class Claims:
     # claimed place, m to the east and to the south of the centroid of the conflict zone, `(...,
     # 1+H, 2)`, the ego first; NaN for a helper that is absent
     xy_m: Floats
-    speed_mps: Floats  # each helper's claimed speed, `(..., H)`
+    speed_mps: Floats  # each helper's claimed speed, m/s, `(..., H)`
     time_s: Floats  # when the claims were made, seconds since the start of the episode, `(...)`
     # standard deviation on each axis, m, by which the beacons' declared noise moves a true place,
     # `(...)`

@@ -49,16 +49,19 @@ class Exchange:
     """Hold who was asked, what was sent and who was heard in each decision.
 
     Made by `exchange`. Times are seconds from the start of the decision. Arrays are of decisions of
-    any shape `(...)`, with H helpers, index h for helper h, and A actions. Another, such as an
-    antenna beside the road, may ask the helpers for the ego and fuse what they reply.
+    any shape `(...)`, with H helpers, index h for helper h, and A actions. An intent, or policy, is
+    the probabilities of the A actions. Another, such as an antenna beside the road, may ask the
+    helpers for the ego and fuse what they reply.
     """
 
     own: Floats  # the ego's intent after the fallback, `(..., A)`
-    # whether the ego's answer was unusable, so that `own` is the fallback, `(...)`
+    # whether the ego's answer was unusable, so that `own` is the fallback that the settings name,
+    # `(...)`
     own_failed: Bools
     entropy_nats: Floats  # entropy of `own`, `(...)`: how unsure the ego is
     # whether the ego asks at least one helper, `(...)`. By default it asks those in the radius if
-    # the entropy is above tau. Without a channel, or with nobody in the radius, it asks nobody
+    # the entropy is above the threshold tau. Without a channel, or with nobody in the radius, it
+    # asks nobody
     triggered: Bools
     asked: Bools  # which helpers are asked; each has a scheduled reply, `(..., H)`
     # which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or
@@ -102,7 +105,8 @@ class Exchange:
     def messages(self) -> Ints:
         """Return the number of scheduled replies of all rounds, `(...)`.
 
-        Like the paper, this counts no requests.
+        Each helper that is asked has one a round, whether or not it arrives. Like the paper, this
+        counts no requests.
         """
         return count_of(self.asked) + self.repeats
 
@@ -134,11 +138,15 @@ def exchange(
 ) -> Exchange:
     """Play whom the ego asks, and which replies arrive when, in decisions of any shape `(...)`.
 
-    Nothing is fused. `point` is the operating point: the settings of radio, asking and fusion. Its
-    schedule, the rule for whom to ask, chooses among up to H helpers, unless `asked_helpers`, a
-    mask `(..., H)`, is given: then the ego asks these, as far as they are in its radius. An unknown
-    inference time counts as 0 s. Raises UserError if the point needs what `intents` or `draws`
-    lack, or if a package's plug-in fails.
+    Nothing is fused. An unknown inference time counts as 0 s. Raises UserError if the point needs
+    what `intents` or `draws` lack, or if a package's plug-in fails.
+
+    Args:
+        point: the operating point: the settings of radio, asking and fusion.
+        intents: what the ego and its H helpers intend, how far they are and how long they infer.
+        draws: the channel's random numbers.
+        asked_helpers: mask of the helpers to ask, as far as they are in the ego's radius,
+            `(..., H)`; None leaves the choice to the point's schedule, the rule for whom to ask.
     """
     own_failed, inputs = _base_knowledge(point, intents)
     in_radius = inputs.may_ask
@@ -183,10 +191,12 @@ def exchange(
 def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
     """Return a mask of the helpers whose answers can change each decision's outcome, `(..., H)`.
 
-    For asking models lazily: once the models of all these have answered, the answers of others
-    change nothing. They are the helpers that are asked; all in the radius, if the channel's load or
-    the schedule depends on who would answer; and all present ones, if a part (such as an attack)
-    needs them. A helper whose model was not asked yet counts as one with a valid answer.
+    `point` has the settings, `intents` what vehicles intend as far as their models were asked, and
+    `draws` the channel's random numbers. It is for asking models lazily: once the models of all
+    these have answered, the answers of others change nothing. They are the helpers that are asked;
+    all in the radius, if the channel's load or the schedule depends on who would answer; and all
+    present ones, if a part (such as an attack) needs them. A helper whose model was not asked yet
+    counts as one with a valid answer.
     """
     nobody = np.zeros(intents.range_m.shape, dtype=bool)
     if not point.asks:
@@ -255,8 +265,9 @@ def worth_of(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     """Return what asking each helper is worth, by the operating point's schedule and in its unit.
 
     A schedule is the rule for whom to ask: helpers whose worth is above its threshold. The shape is
-    `(..., H)`, or `(..., 1)` if it is the same for all helpers of a decision. Raises UserError if a
-    package's schedule fails.
+    `(..., H)`, or `(..., 1)` if it is the same for all helpers of a decision. `intents` has what
+    the vehicles intend, and `draws` the channel's random numbers. Raises UserError if a package's
+    schedule fails.
     """
     return _worth(point, known_of(point, intents, draws))
 
@@ -276,8 +287,9 @@ def _worth(point: OperatingPoint, inputs: ScheduleInputs) -> Floats:
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleInputs:
     """Return what the ego knows before it asks anybody, the input of the point's schedule.
 
-    The schedule of the operating point `point` is the rule for whom to ask. Raises UserError if it
-    needs positions and the decisions have none, as in the paper's study.
+    The schedule of the operating point `point` is the rule for whom to ask. `intents` has what
+    vehicles intend, of which the ego knows its own, and `draws` the channel's random numbers.
+    Raises UserError if it needs positions and the decisions have none, as in the paper's study.
     """
     return _with_schedule_needs(point, _base_knowledge(point, intents)[1], intents, draws)
 
@@ -358,8 +370,10 @@ def _ask_directly(
 def inferred_s(point: OperatingPoint, intents: Intents, draws: Draws) -> Floats:
     """Return the seconds from a decision's start until each vehicle has its intent, `(..., 1+H)`.
 
-    The ego comes first; where its model runs in a cloud, its time has the network's round trip.
-    Raises UserError if that is to be drawn and `draws` are of no layouts (the paper's study).
+    Index 0 is the ego and 1+h is helper h. It is how long each one's model takes, by `intents`;
+    where `point`, the settings, puts the ego's into a cloud, it has the round trip. Raises
+    UserError if that is to be drawn and `draws` are of decisions without a scene, as in the paper's
+    study.
     """
     ego_s: Floats | float = intents.inference_s[..., 0]
     if point.cloud.round_trip_s is not None:

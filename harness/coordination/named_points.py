@@ -34,9 +34,10 @@ def named_point(text: str) -> OperatingPoint:
     An operating point is the settings of radio, asking and fusion, under which a run's decisions
     are played.
 
-    Before the colon is one of the paper's points, or a channel profile, which stands for a point
-    with that profile and the defaults. A setting may have its short name of `SHORT`, and may be one
-    of the channel's own. The whole text becomes the point's name.
+    Before the colon is the name of one of the paper's points, or of a channel profile, which stands
+    for a point with that profile and the defaults. Behind it are settings by name; one may have its
+    short name of `SHORT`, such as `tau`, and may be one of the channel's own. The whole text
+    becomes the point's name.
 
     Raises:
         UserError: there is no such point or setting, or a value is not allowed.
@@ -94,8 +95,9 @@ def named_point(text: str) -> OperatingPoint:
 def misnamed(settings: Mapping[str, Any]) -> list[str]:
     """Return the names of a condition's recorded settings that its own name does not stand for.
 
-    `settings` are flat, with the condition's `name`, such as `6g:window_s=0.4`. The list is empty
-    for a name that `named_point` cannot read, as of a point made in Python.
+    `settings` has the values by name, and among them the condition's own `name`, such as
+    `6g:window_s=0.4`: a text from which `named_point` would make other values of the settings
+    returned. The list is empty for a name that it cannot read, as of a point made in Python.
     """
     name = str(settings["name"])
     try:
@@ -115,7 +117,7 @@ SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("la
 def setting_of(key: str, text: str) -> object:
     """Return the value of an operating point's setting from its text, in the type of its default.
 
-    `key` is the setting's name. A text that cannot be converted is returned as it is, and refused
-    where the point is made.
+    `key` is the setting's name, such as `tau_nats`. A text that cannot be converted is returned as
+    it is, and refused where the point is made.
     """
     return value_of(POINTS["6g"].setting(key), text)

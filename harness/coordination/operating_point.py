@@ -80,10 +80,12 @@ class Rewrites(NamedTuple):
     """
 
     question: str = ""  # name of the question that helpers were asked; empty for the ordinary one
-    changes: Changes = Changes()  # what attacks and defences change of messages, by name
-    call: str = ""  # name of the content's second question (`contents.Call`); empty for none
+    changes: Changes = Changes()  # names of what attacks and defences change of messages
+    # name of the second question that the content, what messages carry, puts to the ego's model
+    # (`contents.Call`); empty if it has none
+    call: str = ""
     whole: bool = True  # whether the prompt shows all of each message
-    elsewhere: bool = False  # whether messages come from other scenes
+    elsewhere: bool = False  # whether messages come from other scenes, as in a control
 
 
 AS_SENT = Rewrites()
@@ -91,17 +93,22 @@ AS_SENT = Rewrites()
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Hold the settings of one condition: all that a decision depends on besides scene and model.
+    """Hold the settings under which a run plays its decisions; also called a condition.
 
-    Settings are grouped in parts: `radio`, `ask` (whom, and when), `fusion` and `cloud`, and those
-    of extensions. Each also has a flat name, without its part's, such as `tau_nats`, by which it
-    stands in records and conditions. Raises UserError if they contradict.
+    With scene and model they are all that a decision depends on. They are grouped in parts, those
+    below and those of extensions. Each setting also has a flat name, without its part's, such as
+    `tau_nats`, by which it stands in run files and in texts such as `6g:tau_nats=0.5`. Raises
+    UserError if settings contradict each other.
     """
 
     name: str  # its name in reports and records, such as `6g:window_s=0.4`
+    # the radio channel between vehicles
     radio: Radio = Radio()  # noqa: RUF009 (parts are frozen)
+    # whom the ego asks, when, and what messages carry
     ask: Ask = Ask()  # noqa: RUF009
+    # how the ego fuses what it hears with its own intent
     fusion: Fusion = Fusion()  # noqa: RUF009
+    # how far away the ego's model is, if not in the vehicle
     cloud: Cloud = Cloud()  # noqa: RUF009
     # extensions' parts that differ from their defaults, in the order of `more_parts`
     more: tuple[Part, ...] = ()
@@ -160,19 +167,20 @@ class OperatingPoint:
 
     @classmethod
     def of(cls, name: str, profile: str | None = None, **settings: Any) -> "OperatingPoint":
-        """Return the operating point `name` with some settings, by flat name; else with defaults.
+        """Return an operating point called `name`, with defaults where nothing else is stated.
 
-        `profile` is its channel profile; None gives it no radio. Raises UserError for an unknown
-        channel profile, or a value that is not allowed.
+        `profile` names its channel profile, a file of `channels/` such as `6g`; None gives it no
+        radio. `settings` are values by flat name, such as `tau_nats=0.5`. Raises UserError for an
+        unknown channel profile, or a value that is not allowed.
         """
         return cls(name).changed(profile=profile, **settings)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "OperatingPoint":
-        """Return the operating point of a TOML or JSON table of flat settings, with its `name`.
+        """Return the operating point that a TOML or JSON table states.
 
-        Without a `profile` it has no radio. Raises UserError for an unknown key, or for a value
-        that is not allowed.
+        `values` has its `name`, and settings by flat name, such as `tau_nats`. Without a `profile`
+        it has no radio. Raises UserError for an unknown key, or for a value that is not allowed.
         """
         allowed = ["name", *(RECORDED.get(key, key) for key in part_of_settings())]
         values = without_gone(values)
@@ -187,7 +195,10 @@ class OperatingPoint:
 
     @staticmethod
     def types() -> dict[str, Any]:
-        """Return the type of each key of the table that `record` returns."""
+        """Return the type of each value in the table that `record` returns, by key.
+
+        A type is an annotation, such as `float`.
+        """
         hints = {part: get_type_hints(kind) for part, kind in {**PARTS, **more_parts()}.items()}
         types: dict[str, Any] = {"name": str}
         for key, part in part_of_settings().items():
@@ -195,10 +206,11 @@ class OperatingPoint:
         return types
 
     def record(self) -> dict[str, Any]:
-        """Return the name and all flat settings, as run files keep them; `from_dict` reads them.
+        """Return a table for run files: `name`, and all settings by flat name.
 
-        Settings of an extension's part that has only its defaults are left out, so that runs
-        without that extension can be read where it is not installed.
+        `from_dict` makes an equal point of it. Settings of an extension's part that has only its
+        defaults are left out, so that runs without that extension can be read where it is not
+        installed.
         """
         active = {type(part) for part in self.more}
         idle = {name for name, kind in more_parts().items() if kind not in active}
@@ -209,7 +221,10 @@ class OperatingPoint:
         return record
 
     def setting(self, key: str) -> Any:
-        """Return the value of a setting by its flat name, such as `tau_nats`."""
+        """Return the value of a setting by its flat name, such as `tau_nats`.
+
+        Raises KeyError if there is no such setting.
+        """
         return getattr(self._part(part_of_settings()[key]), key)
 
     def _part(self, name: str) -> Part:
@@ -221,8 +236,9 @@ class OperatingPoint:
         return next((part for part in self.more if type(part) is kind), kind())
 
     def changed(self, **settings: Any) -> "OperatingPoint":
-        """Return a copy with some settings, or the `name`, changed; keywords are flat names.
+        """Return a copy with some settings, or the `name`, changed.
 
+        `settings` are the new values by flat name, such as `tau_nats=0.5`.
         Raises UserError for a value that is not allowed, or settings that contradict each other.
         """
         name = settings.pop("name", self.name)
@@ -243,8 +259,9 @@ class OperatingPoint:
 
     @cached_property
     def channel(self) -> Channel:
-        """Return the model of the radio channel: the profile's with this point's overrides.
+        """Return the model of the radio channel: its profile's with this point's overrides.
 
+        A channel decides which messages arrive, and when; its profile is a file of `channels/`.
         Without a profile it is one on which nothing is received. Made once, with the point. Raises
         UserError for an override of a setting that the profile does not have.
         """
@@ -307,9 +324,10 @@ class OperatingPoint:
         return network(self.cloud.round_trip) if self.cloud.round_trip else None
 
     def of_radio(self, settings: Mapping[str, str]) -> "OperatingPoint":
-        """Return a copy with some settings of its channel changed: texts by name.
+        """Return a copy with some settings of its radio channel changed.
 
-        Raises UserError for an unknown setting or a value that is not allowed.
+        `settings` has their new values as texts, by name, such as `{"jitter_s": "0.01"}`. Raises
+        UserError for an unknown setting or a value that is not allowed.
         """
         texts = {**pairs(self.radio.further), **settings}
         return self.changed(further=",".join(f"{key}={value}" for key, value in texts.items()))
@@ -317,8 +335,11 @@ class OperatingPoint:
     def idle(self, setting: str | None) -> str | None:
         """Return why changing one setting of this point cannot change a result; None if it may.
 
+        The reason is a part of a sentence, such as "it has no channel".
+
         Args:
-            setting: a setting of the point or of its channel; None for the number of vehicles.
+            setting: name of a setting of the point or of its channel; None for the number of
+                vehicles.
         """
         ask, consensus = self.ask, self.fusion.consensus
         if self.radio.profile is None and setting not in settings_alone():
@@ -358,8 +379,9 @@ class OperatingPoint:
     def prepared(self, intents: Intents) -> Intents:
         """Return what vehicles intend in n decisions after extensions' parts have corrected it.
 
-        A calibration is such a part. This is done first, before a fallback replaces a failed
-        answer, a helper is asked, or intents are fused.
+        An intent is the probabilities of the actions; a part is a group of settings, such as those
+        of a calibration. This is done
+        first, before a fallback replaces a failed answer, a helper is asked, or intents are fused.
         """
         for part in self.more:
             intents = prepared(part, intents)
@@ -380,8 +402,12 @@ class OperatingPoint:
     def needs(self, what: str) -> bool:
         """Return whether some part, schedule, rule or content needs an optional input `what`.
 
-        That is `in_time` (the probability of a reply in the window), `outlook` (what the ego sees
-        of its regions), `lot` (a random draw), `claims`, `objects` or `plans`.
+        A part is a group of settings, a schedule the rule for whom to ask, a rule what fuses, and
+        the content what messages hold. What no point needs is not computed. `what` is `in_time`
+        (the probability of a reply in the decision window), `outlook` (how much the ego sees of
+        where a danger may come from), `lot` (a random draw), `claims` (positions that helpers
+        state), `objects` (the lists of what they see) or `plans` (what vehicles state of their own
+        motion).
         """
         return what in self._needs
 
@@ -400,7 +426,10 @@ class OperatingPoint:
 
     @cached_property
     def needs_all(self) -> bool:
-        """Return whether some part, such as an attack, needs the intents of all helpers."""
+        """Return whether some group of settings, such as an attack's, needs all helpers' intents.
+
+        Otherwise those of the helpers that are asked are enough.
+        """
         needing = []
         for part in self.more:
             with worded_part(part):
@@ -414,7 +443,10 @@ class OperatingPoint:
 
     @property
     def request_bits(self) -> float:
-        """Return the size in bits of a request to helpers, by how messages are encoded."""
+        """Return the size in bits of the request that an ego sends to helpers.
+
+        It follows from how messages are encoded.
+        """
         if self.radio.encoding == JSON:
             return self.ask.request_bits
         return request_bits(self.radio.encoding, self.ask.max_helpers, self.physical is not None)
@@ -444,7 +476,8 @@ class OperatingPoint:
     def question(self) -> Question:
         """Return the question that helpers are asked: the ordinary one unless a part has another.
 
-        Raises UserError if a package's part returns a question that is not in its `questions`.
+        The ordinary one is what the ego should do, as the helper sees it. Raises UserError if a
+        package's part returns a question that is not in its `questions`.
         """
         if self.radio.profile is None:
             return PLAIN
@@ -459,7 +492,10 @@ class OperatingPoint:
 
     @cached_property
     def elsewhere(self) -> Part | None:
-        """Return the part by which the ego hears helpers of other scenes: a control, or None."""
+        """Return the part, a group of settings, by which the ego hears helpers of other scenes.
+
+        It is a control: such messages say nothing of the ego's own scene. None without one.
+        """
         for part in self.more:
             with worded_part(part):
                 elsewhere = bool(part.elsewhere)
@@ -515,7 +551,14 @@ class OperatingPoint:
     ) -> Consulted | None:
         """Return what comes of another asking the helpers for the ego; None if the ego asks itself.
 
-        A part may ask, such as an antenna beside the road; `Part.ask` explains the arguments.
+        A part may ask, such as an antenna beside the road.
+
+        Args:
+            links: the links of the ego and its H helpers, with those that it wants to ask.
+            draws: the channel's random numbers.
+            ready: returns when replies can leave, `(..., H)`, from when helpers have the request,
+                of the same shape or `(..., 1)`; both in s from the start of the ego's request.
+            left_s: seconds from the start of the ego's request until it waits no longer, `(...)`.
         """
         for part in self.more:
             if is_ours_part(part):
@@ -536,9 +579,13 @@ class OperatingPoint:
         as further rounds of messages do; without such a part both stay as they are.
 
         Args:
-            sent: what n decisions' vehicles have sent so far.
-            heard: the exchange of that.
-            decide: returns the decisions by an exchange and the intents known after it.
+            sent: what vehicles have sent so far in n decisions.
+            heard: who was asked and heard so far.
+            decide: returns the n decisions as they would be made with an exchange and the intents
+                known after it.
+
+        Returns:
+            Both `sent` and `heard`, with the further messages.
         """
         for part in self.more:
             if is_ours_part(part):
@@ -550,10 +597,11 @@ class OperatingPoint:
 
 
 def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
-    """Return what a run must store of what its operating points name, such as a calibration.
+    """Return what a run must store of the things that its operating points name.
 
-    The outer key is a folder of the run, the inner one a name in it. Raises UserError if a
-    package's part fails, or gives a name that is no plain file name.
+    Such a thing is the calibration of a model. The outer key is a folder of the run, the inner one
+    a name in it. Raises UserError if a package's part fails, or gives a name that is no plain file
+    name.
     """
     kept: dict[str, dict[str, Kept]] = {}
     for point in points:

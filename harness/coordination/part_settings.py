@@ -43,17 +43,18 @@ PARTS: dict[str, type[Part]] = {
 def more_parts() -> Mapping[str, type[Part]]:
     """Return the groups of settings that installed extensions add to operating points, by name.
 
-    Each is a subclass of `Part`. Imports the extensions' packages.
+    An operating point is all settings of radio, asking and fusion that a decision depends on. Each
+    is a subclass of `Part`. Imports the extensions' packages.
     """
     return added_parts([key for kind in PARTS.values() for key in kind.__struct_fields__])
 
 
 @cache
 def part_of_settings() -> Mapping[str, str]:
-    """Return by name of each setting of an operating point the part that it belongs to.
+    """Return the name of the part that each setting of an operating point belongs to.
 
-    A part is a group of settings, such as `radio` or `fusion`. The order is that of the flat
-    records in manifests and run files.
+    A part is a group of settings, such as `radio` or `fusion`. The keys are the settings' names, in
+    the order of the records in manifests and run files.
     """
     part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
     behind: dict[str, set[str]] = {}  # parts that stand behind the same setting, in their order
@@ -77,14 +78,14 @@ def typed_settings() -> tuple[str, ...]:
 
 @cache
 def settings_alone() -> Collection[str]:
-    """Return the names of the settings that still have an effect on an ego without a radio."""
+    """Return the names of an operating point's settings that act on an ego without a radio, too."""
     core = ("fallback", "round_trip", "round_trip_s", "window_s")
     of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_ego]
     return {*core, *chain(*of_extensions)}
 
 
 def settings_of_radio() -> tuple[str, ...]:
-    """Return the names of the settings that mean nothing at a point without a channel."""
+    """Return the names of the settings that mean nothing to an operating point without channel."""
     of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_radio]
     return (*OVERRIDES, *chain(*of_extensions))
 
@@ -106,7 +107,9 @@ def change_of(text: str) -> Change:
 def calls() -> Mapping[str, Call]:
     """Return the second questions that contents of messages ask the ego's model, by name.
 
-    A package's call is left out if some part already changes messages by that name.
+    A content is what messages hold, such as intents. It may have the ego's model asked again, with
+    what the ego has heard; such a question is a call. A package's call is left out if some part
+    already changes messages by that name.
     """
     by_name: dict[str, Call] = {}
     for content in CONTENTS.usable().values():
@@ -122,8 +125,9 @@ def _changes_messages(text: str) -> bool:
 
 @cache
 def questions() -> Mapping[str, Question]:
-    """Return the questions that helpers may be asked, by name.
+    """Return the questions that helpers may be asked by installed parts, by name.
 
+    A part is a group of settings, such as a control's.
     The ordinary one, what the ego should do as the helper sees it, has the name "".
     """
     others = chain(*(kind.questions for kind in more_parts().values()))
@@ -131,9 +135,11 @@ def questions() -> Mapping[str, Question]:
 
 
 def question_under(settings: Mapping[str, Any]) -> Question:
-    """Return the question that helpers were asked under a condition's recorded, flat settings.
+    """Return the question that helpers were asked under a condition, as a run has recorded it.
 
-    Settings that belong to no installed part are ignored.
+    A condition is all settings of radio, asking and fusion, in groups called parts. `settings` are
+    the values of the condition's settings by name, such as `tau_nats`. Settings that belong to no
+    installed part are ignored.
     """
     for kind in more_parts().values():
         part_settings = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
@@ -143,9 +149,10 @@ def question_under(settings: Mapping[str, Any]) -> Question:
 
 
 def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's flat settings without those of extensions that are not installed.
+    """Return a condition's settings without those of extensions that are not installed.
 
-    Raises UserError if such a setting has another value than the one that does nothing.
+    `settings` are values by name, such as `tau_nats`. Raises UserError if such a setting has
+    another value than the one that does nothing.
     """
     kept: dict[str, Any] = {}
     for key, value in settings.items():
@@ -158,10 +165,16 @@ def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def gone_setting(setting: str) -> OfExtension | None:
-    """Return the extension that a setting belongs to if that is not installed; else None."""
+    """Return the extension that a setting belongs to, if it is one that is not installed.
+
+    `setting` is the name of a condition's setting. None for every other one.
+    """
     return None if setting in part_of_settings() else setting_of_extension(setting)
 
 
 def lacking_setting(setting: str, value: object, gone: OfExtension) -> str:
-    """Return the message on a condition's setting and value whose extension is not installed."""
+    """Return one line for an error on a condition's setting whose extension is not installed.
+
+    `value` is what the condition has for `setting`; `gone` is the extension that it belongs to.
+    """
     return f"setting {setting}={printable(value)} of a condition is {part_of(gone.extension)}"

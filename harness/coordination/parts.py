@@ -47,7 +47,10 @@ Flag = Annotated[bool, Meta(description="true or false")]
 
 
 class Kept(NamedTuple):
-    """Hold what a run stores of one thing that a condition names, such as a calibration."""
+    """Hold what a run stores of one thing that its settings name.
+
+    Such a thing is the calibration of a model, by its name.
+    """
 
     record: Any  # its content, or the digest of its file, as values that JSON can hold
     file: Any = None  # its file, a `pathlib.Path`; None if it has none
@@ -57,16 +60,21 @@ class Kept(NamedTuple):
 class Question:
     """Describe the question that a helper's model is asked: what the ego should do, as it sees it.
 
-    Subclasses ask it with a changed scene graph, as a control that shows nothing does.
+    Subclasses ask it with a changed scene graph, what the helper knows of the scene, as a control
+    that shows nothing does.
     """
 
-    # ends the key of its answers, behind a `~`, and is their role; empty for the plain one
+    # its name; ends the key under which its answers are kept, behind a `~`, and is the role that
+    # they are listed under; empty for the ordinary question
     name: str = ""
-    words: str = "are asked"  # of helpers that are asked so, behind "that"
-    pictured: bool = True  # whether it shows what a camera sees
+    words: str = "are asked"  # in messages, behind "that": how helpers are asked
+    pictured: bool = True  # whether the prompt may have the picture of the helper's camera
 
     def shown(self, graph: "SceneGraph") -> "SceneGraph":
-        """Return the scene graph to put in the helper's prompt, given the helper's own."""
+        """Return the scene graph to put in the helper's prompt, given the helper's own.
+
+        A scene graph is what one vehicle knows of a scene.
+        """
         return graph
 
 
@@ -74,20 +82,28 @@ PLAIN = Question()
 
 
 class Change(Protocol):
-    """Describe a change of helpers' messages before a fusion call shows them, such as an attack."""
+    """Describe a change of helpers' messages before a fusion call shows them, such as an attack.
+
+    A fusion call is a second question to the ego's model, which shows it what it has heard.
+    """
 
     @property
     def adds(self) -> bool:
-        """Whether it adds text that no other change may touch, and so must be applied last."""
+        """Return whether this change adds text that no other may touch, and so is applied last."""
 
     def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return a helper's message, a record with its `intent`, as the prompt is to show it.
 
-        `actions` has the names of the actions, in order.
+        `message` has the names and values of what was sent; `actions` the names of the ego's
+        actions, in the order of the intent's probabilities.
         """
 
     def graph(self, graph: "SceneGraph", scenario: Any, scene: Any) -> "SceneGraph":
-        """Return the sender's scene graph of `scene` as changed; its objects are what is sent."""
+        """Return the sender's scene graph with this change; its objects are what is sent.
+
+        A scene graph is what one vehicle knows of a scene. `graph` is the true one; `scene`, of the
+        scenario `scenario`, is the decision point's scene, which has the state of all vehicles.
+        """
 
 
 class Changes(NamedTuple):
@@ -105,7 +121,8 @@ class Changes(NamedTuple):
 class ActsOn(NamedTuple):
     """Describe a setting that needs messages of certain kinds, such as intents or words.
 
-    It is refused where the operating point's messages hold nothing of these kinds.
+    It is refused where the operating point's messages hold nothing of these kinds. The content is
+    what messages hold.
     """
 
     setting: str  # name of the setting
@@ -118,7 +135,10 @@ class ActsOn(NamedTuple):
 
 
 class RunFacts(Protocol):
-    """Describe the run in which a condition is to be played, so that a part can refuse it."""
+    """Describe the run in which a condition is to be played, so that a part can refuse it.
+
+    A condition is all settings of radio, asking and fusion, and a part one group of them.
+    """
 
     @property
     def agents(self) -> Sequence[Any]:
@@ -154,7 +174,7 @@ class Part(Struct, frozen=True, kw_only=True):
     declared. Raises ValueError for a value that is not allowed.
     """
 
-    behind: ClassVar[str] = ""  # the setting behind which its own stand in records
+    behind: ClassVar[str] = ""  # name of the setting behind which its own stand in run files
     of_ego: ClassVar[bool] = False  # whether it matters to an ego that asks nobody
     of_radio: ClassVar[bool] = False  # whether its settings mean nothing without a channel
     # its settings that name something, and what returns the names that there are; empty names
@@ -184,37 +204,49 @@ class Part(Struct, frozen=True, kw_only=True):
             self.check()
 
     def check(self) -> None:
-        """Raise ValueError or UserError if this part's settings contradict each other."""
+        """Raise ValueError or UserError if settings of this group contradict each other."""
 
     @property
     def acts_on(self) -> Collection[ActsOn]:
-        """Return the settings, with their values now, that need messages of some kind."""
+        """Return the settings, with their values now, that need messages of some kind.
+
+        A kind is what messages hold, such as intents or words.
+        """
         return ()
 
     def check_with(self, point: "OperatingPoint") -> None:
-        """Raise ValueError if this part's settings contradict others of the operating point."""
+        """Raise ValueError if settings of this group contradict others of an operating point.
+
+        `point` is that point, all settings, of which this part is a group.
+        """
 
     def idle(self, setting: str) -> str | None:
         """Return why changing one of this part's settings cannot change a result; None if it may.
 
+        `setting` is its name; the reason is a part of a sentence, such as "it has no channel".
         Unlike other hooks it is also called for a part that has only its defaults.
         """
 
     def carried(self, point: "OperatingPoint", channel: Channel) -> Channel:
         """Return the channel that carries messages under `point`, given that without this part.
 
-        Only a part that ships may return another, such as one with a second path.
+        `channel` is the latter: the profile's, with the point's settings and what earlier parts
+        return. Only a part that ships may return another, such as one with a second path.
         """
         return channel
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
-        """Return why this part cannot be used under `point` in `run`; None if it can.
+        """Return why this group of settings cannot be used in `run`; None if it can.
 
-        The text also says what to do instead.
+        `point` is the operating point, all settings. The text also says what to do instead.
         """
 
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
-        """Return what a run must store of what this part's settings name, by folder and by name."""
+        """Return what a run must store of the things that this part's settings name.
+
+        Such a thing is the calibration of a model. The outer key is a folder of the run, the inner
+        one a name in it.
+        """
         return {}
 
     @property
@@ -222,28 +254,41 @@ class Part(Struct, frozen=True, kw_only=True):
         """Return the names of optional inputs that this part needs; no others are computed.
 
         `claims`: what helpers claim of themselves; `in_time`: the probability of a reply in the
-        window; `lot`: a random draw a decision; `outlook`: how much of its regions the ego sees.
+        decision window; `lot`: a random draw a decision; `outlook`: how much the ego sees of where
+        a danger may come from.
         """
         return ()
 
     @property
     def needs_all(self) -> bool:
-        """Return whether it needs the intents of all present helpers, not only of those asked."""
+        """Return whether this part needs the intents of all helpers present.
+
+        Otherwise those of the helpers that are asked are enough.
+        """
         return False
 
     @property
     def antennas(self) -> Collection[Antenna]:
-        """Return the antennas on no vehicle whose links a physical channel needs, if it ships."""
+        """Return the antennas on no vehicle whose links the channel needs, as one by the road.
+
+        Only those of a part that ships are used, and only where losses follow from positions.
+        """
         return ()
 
     @property
     def question(self) -> Question:
-        """Return the question that helpers' models are asked: one of `questions`, or `PLAIN`."""
+        """Return the question that helpers' models are asked: one of `questions`, or `PLAIN`.
+
+        The latter is the ordinary one: what the ego should do, as the helper sees it.
+        """
         return PLAIN
 
     @property
     def elsewhere(self) -> bool:
-        """Return whether the ego hears helpers of other scenes, by `sources`: a control."""
+        """Return whether the ego hears helpers of other scenes than its own, a control.
+
+        Then `sources` says of which.
+        """
         return False
 
     def speaker(self) -> "Speaker | None":
@@ -262,7 +307,10 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @classmethod
     def change(cls, text: str) -> Change | None:
-        """Return the change that one text of `changes` names; None if this part has none by it."""
+        """Return the change that a text, such as `liar:share=1/3`, names.
+
+        The text is one of the names that `changes` returned. None if this part has no such change.
+        """
 
     def after_call(self, fused: "Floats", intents: "Floats", heard: "Bools") -> "Floats":
         """Return the policies, `(..., A)`, to use in place of what a fusion call answered.
@@ -311,9 +359,13 @@ class Part(Struct, frozen=True, kw_only=True):
 
         Args:
             point: the condition.
-            sent: what n decisions' vehicles have sent so far.
-            heard: the exchange of that.
-            decide: returns the decisions by an exchange and the intents known after it.
+            sent: what vehicles have sent so far in n decisions.
+            heard: who was asked and heard so far.
+            decide: returns the n decisions as they would be made with an exchange and the intents
+                known after it.
+
+        Returns:
+            Both `sent` and `heard`, with the further messages.
         """
         return sent, heard
 
@@ -340,18 +392,27 @@ PACKAGES_PARTS: dict[type[Part], str] = {}
 
 
 def is_ours(part: Part) -> bool:
-    """Return whether a part of an operating point ships with the harness, not with a package."""
+    """Return whether a part of an operating point ships with the harness, not with a package.
+
+    A part is a group of settings; only one that ships is trusted unchecked.
+    """
     return type(part) not in PACKAGES_PARTS
 
 
 def worded_part(part: Part) -> AbstractContextManager[None]:
-    """Return a context in which what fails in a package's part becomes a one-line UserError."""
+    """Return a context in which what fails in a package's part becomes a one-line UserError.
+
+    It is to be entered around each call of a hook of `part`. For a part that ships, errors pass.
+    """
     return worded(PACKAGES_PARTS.get(type(part), ""), built_in=is_ours(part))
 
 
 @contextmanager
 def telling(part: Part) -> Iterator[None]:
-    """Enter a context as `worded_part`, but let a ValueError through: the part's own refusal."""
+    """Enter a context in which what fails in a package's part becomes a one-line UserError.
+
+    A ValueError passes as it is: by it a part refuses its settings.
+    """
     refused = None
     with worded_part(part):
         try:
@@ -363,7 +424,10 @@ def telling(part: Part) -> Iterator[None]:
 
 
 def wrong(key: str, value: object, allowed: str) -> ValueError:
-    """Return the ValueError that setting `key` has `value` and must be `allowed`."""
+    """Return, for the caller to raise, the ValueError on a setting's value that is not allowed.
+
+    It says that the setting `key` is `value` and must be what `allowed` says in words.
+    """
     return ValueError(f"{key} is {printable(repr(value))}; it must be {allowed}")
 
 
@@ -378,16 +442,17 @@ def _lacking(setting: str, name: str, plugins: Plugins[Any], *others: str) -> Us
 
 
 class Ask(Part, frozen=True, kw_only=True):
-    """Settings of whom the ego asks, when, and what helpers' messages hold."""
+    """Hold the settings of whom the ego asks, when, and what helpers' messages hold."""
 
     # The rule for whom and when: `entropy`, the paper's, or another of `SCHEDULES`.
     schedule: Text = PAPER
-    # The entropy above which the ego asks, under the paper's schedule.
+    # The entropy of the ego's intent, in nats, above which it asks, under the paper's schedule.
     tau_nats: Annotated[float, Meta(ge=0, description="a finite number of nats, 0 or more")] = 0.7
     # The worth above which another schedule asks, in its unit; None keeps the schedule's own.
     threshold: Annotated[float, Meta(ge=0, description="a finite number, 0 or more")] | None = None
     radius_m: Metres = 100.0  # the paper's R; helpers farther from the ego are not asked
-    # The cooperative neighbourhood; if there are more helpers, the nearest are asked.
+    # The most helpers that are asked in one decision. If more may be, those are that the schedule
+    # says are worth the most, and of equals the nearest.
     max_helpers: Annotated[
         int,
         Meta(
@@ -433,7 +498,10 @@ class Ask(Part, frozen=True, kw_only=True):
 
     @property
     def above(self) -> float:
-        """Return the worth above which the ego asks: nats under `entropy`, else schedule's unit."""
+        """Return the worth of asking above which the ego asks a helper.
+
+        It is nats under the schedule `entropy`, else in the unit of the schedule.
+        """
         if self.schedule == PAPER:
             return self.tau_nats
         default = SCHEDULES[self.schedule].threshold
@@ -441,9 +509,9 @@ class Ask(Part, frozen=True, kw_only=True):
 
 
 class Radio(Part, frozen=True, kw_only=True):
-    """Settings of the radio: a channel profile, and overrides of it."""
+    """Hold the settings of the radio: a channel profile, a file of `channels/`, and overrides."""
 
-    profile: Text | None = None  # channel profile; None disables V2V
+    profile: Text | None = None  # name of the channel profile, such as `6g`; None disables V2V
     # Probability that one transmission is lost; None keeps that of the profile or of the link.
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")] | None = None
     latency_s: Seconds | None = None  # nominal seconds of one exchange; None keeps the profile's
@@ -464,14 +532,19 @@ class Radio(Part, frozen=True, kw_only=True):
 
 
 class Fusion(Part, frozen=True, kw_only=True):
-    """Settings of how the ego fuses its own intent with those that it heard in time."""
+    """Hold the settings of how the ego fuses its own intent with those that it heard in time.
 
-    consensus: Text = "linear"  # consensus rule, or `ego-prompt`
+    An intent is the probabilities of the ego's actions.
+    """
+
+    # the rule that fuses intents, or `ego-prompt`: the ego's model is asked again with the messages
+    consensus: Text = "linear"
     # Decision window, from the start of the decision; a later reply is not fused.
     window_s: Annotated[
         float, Meta(gt=0, le=LONGEST_S, description="seconds above 0, at most 3600")
     ] = 0.2
-    min_distance_m: Metres = 1.0  # lower bound of d in the paper's Eq. 2
+    # Lower bound of d, a vehicle's distance that its weight falls with, in the paper's Eq. 2.
+    min_distance_m: Metres = 1.0
     # The ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone. The
     # paper's preset declares a proxy of 3.5 m (section IV-A).
     ego_distance_m: Metres | None = None
@@ -489,9 +562,13 @@ class Fusion(Part, frozen=True, kw_only=True):
 
 
 class Cloud(Part, frozen=True, kw_only=True):
-    """Settings of where the ego's model runs, if not in the vehicle; at most one may be set."""
+    """Hold the settings of a cloud that the ego's model runs in; at most one may be set.
 
-    # From the ego's question to the answer of a model in a cloud; replaces the ego's own inference.
+    With none set it runs in the vehicle.
+    """
+
+    # Seconds from the ego's question to the answer of a model in a cloud, in place of the ego's own
+    # inference.
     round_trip_s: Seconds | None = None
     # Network over which the ego asks its model in a cloud, a name of `harness.radio.networks`. Each
     # decision draws a round trip, which is added to the model's inference.

@@ -46,8 +46,9 @@ if TYPE_CHECKING:
 def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
     """Return why a part of an operating point cannot be used in a run, or None if it can.
 
-    The text is one line. `point` is the operating point; `run` has the run's agents, scenario and
-    world. Raises UserError if a package's part fails or returns no text.
+    The text is one line. `point` is the operating point, the settings of radio, asking and fusion;
+    `run` has the run's agents (models with their prompts), its scenario and its world. Raises
+    UserError if a package's part fails or returns no text.
     """
     if is_ours(part):
         return part.obstacle(point, run)
@@ -58,8 +59,9 @@ def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
 def prepared(part: Part, intents: Intents) -> Intents:
     """Return what vehicles intend in n decisions as a part's `before` corrects it.
 
-    A calibration is such a part. Raises UserError if a package's part fails, changes more than
-    `own` and `helpers`, or returns no distribution for an answer.
+    A part is a group of settings, as a calibration's. What is intended are probabilities of
+    actions; `before` is the part's hook that may correct them. Raises UserError if a package's part
+    fails, changes more than `own` and `helpers`, or returns no distribution for an answer.
     """
     if is_ours(part):
         return part.before(intents)
@@ -75,13 +77,13 @@ def prepared(part: Part, intents: Intents) -> Intents:
 
 @dataclass(frozen=True)
 class SpeakerOfPart:
-    """Check what a package's speaker sends in place of what vehicles intend.
+    """Wrap a package's speaker, which decides what helpers send, and check what it returns.
 
     Raises UserError if it changes the ego's own intent, place or time, or sends no distributions.
     """
 
-    part: Part  # whose it is
-    speaker: Speaker
+    part: Part  # the package's group of settings that the speaker is of
+    speaker: Speaker  # what is checked: it decides what helpers send
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         given = (read_only(truth), read_only(draws), read_only(episode), read_only(seed))
@@ -104,6 +106,7 @@ class SpeakerOfPart:
 def speaker_of(part: Part) -> Speaker | None:
     """Return what decides what helpers send under a part, its speaker; None if they send the truth.
 
+    A part is a group of settings, such as an attack's.
     Each walk through a run's episodes needs its own. Raises UserError if a package's part fails.
     """
     with worded_part(part):
@@ -116,6 +119,7 @@ def speaker_of(part: Part) -> Speaker | None:
 def sources(part: Part, episode: Ints, seed: Ints) -> Ints:
     """Return for each of n decisions the index of the decision whose helpers it hears, `(n,)`.
 
+    By `part`, the settings of a control, these may be the helpers of another decision among the n.
     `episode` and `seed`, `(n,)`, have each decision's episode number and seed of draws. Raises
     UserError if a package's part fails or returns no valid indices.
     """
@@ -147,13 +151,14 @@ def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floa
 
 @dataclass(frozen=True)
 class ChangeOfPart:
-    """Check how a package's part changes messages before a fusion call shows them.
+    """Wrap a package's change of helpers' messages, such as an attack's, and check what it returns.
 
+    Messages are changed before a fusion call, a second question to the ego's model, shows them.
     Raises UserError if it fails, or returns what is no such message or scene graph.
     """
 
-    what: str  # the part, in messages
-    change: Change
+    what: str  # what messages on errors call the part
+    change: Change  # what is checked
 
     @property
     def adds(self) -> bool:
@@ -184,9 +189,10 @@ class ChangeOfPart:
 
 
 def change_by(kind: type[Part], text: str) -> Change | None:
-    """Return the change of helpers' messages that `text` names, or None.
+    """Return the change of helpers' messages that a text, such as `liar:share=1/3`, names.
 
-    `kind` is the class of the part that may have it; None if it has no change by that name.
+    `kind` is the class of the part, a group of settings such as an attack's, that is asked for it.
+    None if it has no change by that name.
     """
     what = PACKAGES_PARTS.get(kind)
     if what is None:
@@ -199,7 +205,8 @@ def change_by(kind: type[Part], text: str) -> Change | None:
 def shown_graph(question: Question, graph: SceneGraph) -> SceneGraph:
     """Return the scene graph that a question puts into a helper's prompt, given the helper's own.
 
-    Raises UserError if a package's question fails or returns another vehicle's graph.
+    A scene graph is what one vehicle knows of a scene. Raises UserError if a package's question
+    fails or returns another vehicle's graph.
     """
     for kind, what in PACKAGES_PARTS.items():
         if question in kind.questions:

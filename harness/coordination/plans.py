@@ -16,13 +16,13 @@ STANDING_MPS = 1.0  # a slower vehicle stands, or is about to
 class Plans:
     """Hold what agents, vehicles that decide for themselves, say of their own motion.
 
-    Each decision, of shape `(...)`, is of one agent that hears H others. On an axis of length 1+H
-    index 0 is that agent and 1+h is the other h. Every value is stated by its sender, so all who
-    hear it compare the same numbers.
+    Arrays are of decisions of any shape `(...)`, each of one agent that hears H others. On an axis
+    of length 1+H index 0 is that agent and 1+h is the other h. Every value is stated by its sender,
+    so all who hear it compare the same numbers.
     """
 
-    # index of the decision that each other makes itself now, among the decisions made together,
-    # `(..., H)`; -1 where it makes none. H is 0 until it is known whom an agent hears
+    # index of the decision that each other agent makes itself now, among the decisions made
+    # together, `(..., H)`; -1 where it makes none. H is 0 until it is known whom an agent hears
     row: Ints
     # each agent's number among the vehicles of its world, `(..., 1+H)`; -1 for one without a plan
     vehicle: Ints

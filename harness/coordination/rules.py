@@ -26,9 +26,11 @@ EGO_PROMPT = "ego-prompt"
 
 
 def reads(name: str) -> frozenset[str]:
-    """Return the kinds of messages, of `contents.KINDS`, any one of which a consensus can use.
+    """Return the kinds of content, such as intents, any one of which a consensus can use.
 
-    `name` is a value of the setting `consensus`: the name of a rule, or `ego-prompt`.
+    The content is what messages hold; `contents.KINDS` lists its kinds. `name` is a value of the
+    setting `consensus`: the name of a rule that fuses, or `ego-prompt`, by which the ego's model is
+    asked again with the messages.
     """
     if name == EGO_PROMPT:
         return frozenset((WORDS, PLANS))
@@ -37,5 +39,8 @@ def reads(name: str) -> frozenset[str]:
 
 
 def names() -> tuple[str, ...]:
-    """Return the allowed values of the setting `consensus`: all rules, and `ego-prompt`."""
+    """Return the allowed values of the setting `consensus`: all rules, and `ego-prompt`.
+
+    A rule fuses intents by a formula; by `ego-prompt` the ego's model is asked again with them.
+    """
     return (*RULES, EGO_PROMPT)

@@ -25,7 +25,7 @@ def _is_threshold(value: Any) -> bool:
 class Schedules(FilesAndPlugins[Schedule]):
     """Hold all schedules, rules for whom the ego asks, by name.
 
-    They are built in, of installed packages, or in files.
+    They are built in, of installed packages, or in files of a folder `schedules/`.
     """
 
     folder = "schedules"
@@ -35,7 +35,7 @@ class Schedules(FilesAndPlugins[Schedule]):
     }
 
     def read(self, file: Any) -> Schedule:
-        """Return the schedule that a file describes.
+        """Return the schedule, a rule for whom the ego asks, that the file at a path describes.
 
         Raises UserError if the file is wrong, or the extension that reads such files is not
         installed.

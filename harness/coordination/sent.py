@@ -14,7 +14,7 @@ from harness.radio.channel import Draws
 class SentIntents:
     """Hold what the ego is sent in n decisions, by H voices: senders as the ego hears them.
 
-    A helper has one voice; an attacker may have several.
+    A helper has one voice; an attacker may have several, each with its own message.
     """
 
     intents: Intents  # the voices' intents and claims, in the place of the helpers'
@@ -28,22 +28,23 @@ class SentIntents:
 class Speaker(Protocol):
     """Describe who decides what helpers send during one walk: a run's episodes, step by step.
 
-    Each condition and walk has its own. The usual one sends the truth, one of attackers does not.
-    It may keep state from step to step of an episode.
+    What they send is an intent, the probabilities of the ego's actions, and claims of where they
+    are. Each condition and walk has its own. The usual one sends the truth, one of attackers does
+    not. It may keep state from step to step of an episode.
     """
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         """Return what the voices send in n decisions of one step, given the vehicles' true intents.
 
-        `truth` has the intents and `draws` the channel's random numbers; `episode` and `seed`,
-        `(n,)`, are each decision's episode number and seed of these draws. The number of voices may
-        differ from that of the helpers in `truth`.
+        `truth` has the intents and `draws` the channel's random numbers for the link to each
+        helper; `episode` and `seed`, `(n,)`, are each decision's episode number and seed of these
+        draws. The number of voices may differ from that of the helpers in `truth`.
         """
         ...
 
 
 class Honest:
-    """Send every helper's true intent, as a `Speaker` does where there are no attackers."""
+    """Send every helper's true intent in one message: the `Speaker` without attackers."""
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         return SentIntents(truth, draws, np.zeros(truth.valid.shape, dtype=bool))

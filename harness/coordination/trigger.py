@@ -23,8 +23,8 @@ def normalised_entropy(p: Floats) -> Floats:
 
 
 def triggered(p: Floats, tau_nats: float) -> Bools:
-    """Return whether intents are unsure enough to ask: entropy above `tau_nats`, `(...)` (Eq. 3).
+    """Return whether intents are unsure enough to ask helpers: entropy above `tau_nats`, `(...)`.
 
-    `p` are intents, probabilities of A actions, `(..., A)`.
+    It is the paper's Eq. 3. `p` are intents, probabilities of A actions, `(..., A)`.
     """
     return entropy_nats(p) > tau_nats
