@@ -21,11 +21,14 @@ CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 
 class Antenna(NamedTuple):
-    """Hold where an antenna stands that is on no vehicle, such as one beside the road, m."""
+    """Hold where an antenna stands that is on no vehicle, such as one beside the road, m.
+
+    The conflict zone is the area where other vehicles' paths meet the ego's.
+    """
 
     x_m: float  # position, m to the east of the centroid of the conflict zone
     y_m: float  # position, m to the south of it
-    height_m: float  # above the ground
+    height_m: float  # above the ground, m
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Site:
     # positions, `(..., 1+H, 2)`, the ego's first: m to the east and to the south of the road's
     # origin; NaN for an absent helper
     xy_m: Floats
-    # what stands between the ego and each helper, `(..., H)`: CLEAR, VEHICLE or BUILDING
+    # what stands between the ego and each helper, `(..., H)`: one of the codes CLEAR (nothing),
+    # VEHICLE or BUILDING
     sight: Ints
     # height of the tallest vehicle between them, m, `(..., H)`; 0 without one
     blocker_m: Floats
@@ -62,7 +66,9 @@ class Site:
     def between(self) -> tuple[Ints, Floats, Floats, float | None]:
         """Return the arguments of `Propagation.path_loss_db` that follow the distance.
 
-        They are obstacle, blocker's height, distances to the corner and the first antenna's height.
+        That method returns by how many dB a link weakens power. They are the obstacle, the
+        blocker's height, the distances to the streets' crossing and the first antenna's height: the
+        fields `sight`, `blocker_m`, `corner_m` and `first_m`.
         """
         return self.sight, self.blocker_m, self.corner_m, self.first_m
 
@@ -79,7 +85,7 @@ class Site:
         )
 
     def select(self, links: slice) -> "Site":
-        """Return the site of the links in a slice of the H, `(..., h)`; without antennas."""
+        """Return the site with only the helpers in a slice of the H, and without antennas."""
         xy_m = np.concatenate(
             [self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2
         )
@@ -112,7 +118,8 @@ class Draws:
     """
 
     # for channels of one loss: draws of the request to each helper and of its reply,
-    # `(..., H, 2)`; equal for all steps of an episode under block fading
+    # `(..., H, 2)`; equal for all steps of an episode under block fading, where a link that is lost
+    # stays lost
     link: Floats
     jitter: Floats  # for such channels: a draw of each reply's delay, `(..., H)`
     # for physical channels, whose loss depends on positions: the keys from which all further draws
@@ -155,12 +162,17 @@ class Draws:
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
         """Return the shadowing of each helper's link, `(..., H)`, standard normal.
 
-        `xy_m` are positions of the ego and its helpers, `(..., 1+H, 2)`; see `fading.Trips.shadow`.
+        Shadowing is the slow change of received power by what stands around. `xy_m` are positions
+        of the ego and its helpers, m, `(..., 1+H, 2)`; the correlation is 1/e when both ends of a
+        link have moved `decorrelation_m`.
         """
         return self._trips.shadow(xy_m, decorrelation_m)
 
     def of(self, links: str) -> "Draws":
-        """Return independent draws for other links, such as an antenna's, by their name."""
+        """Return independent draws for other links, such as an antenna's.
+
+        `links` is their name, any text: the same name gives the same draws.
+        """
         return replace(self, trips=replace(self._trips, links=links), given=None)
 
     @cached_property
@@ -218,18 +230,19 @@ class Links:
     ready_s: Floats
     # each helper's distance to the ego, m, `(..., H)`, as the ego knows it, with a beacon's error
     range_m: Floats
-    payload_bits: Floats  # size of each helper's reply, `(..., H)`
+    payload_bits: Floats  # size of each helper's reply, bits, `(..., H)`
     # which helpers are present and near enough to be asked, asked or not, `(..., H)`
     in_radius: Bools
-    # which of these are unsure and ask others themselves, which loads the channel, `(..., H)`
+    # which of these are unsure themselves and open a round of asking of their own, which loads the
+    # channel, `(..., H)`
     rounds: Bools
-    request_bits: float = 0.0  # size of the request
+    request_bits: float = 0.0  # size of the request, bits
     # positions; None if the channel is not `Physical`, or the world has no positions
     site: Site | None = None
 
     @property
     def where(self) -> Site:
-        """Return the positions. Raises UserError in a world without positions."""
+        """Return the site, which has positions. Raises UserError in a world without positions."""
         if self.site is None:
             raise UserError(NO_SITE)
         return self.site
@@ -255,7 +268,10 @@ REPLY: Way = 1
 
 
 class Broadcast(NamedTuple):
-    """Hold when a broadcast request is received and how long it is on air."""
+    """Hold when a broadcast request is received and how long it is on air.
+
+    It is one message to all helpers, in each of the decisions `(...)`.
+    """
 
     # seconds from the decision to ask until the helpers have the request, `(...)` or one number;
     # NaN if it depends on the link (`ByLink`)
@@ -284,21 +300,25 @@ class Delivery(NamedTuple):
 
 @runtime_checkable
 class Channel(Protocol):
-    """Describe a channel model: a frozen dataclass, whose fields operating points override."""
+    """Describe a channel model: who receives a message over the radio, and when.
+
+    It is a frozen dataclass; its fields are settings that a condition of a run may override.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """Return when helpers have received a broadcast request, and how long it is on air.
 
-        `bits` is the request's size in each decision, `(...)`, or in all, one number; the times
-        have the same shape. `draws` are the channel's random numbers.
+        `bits` is the request's size in bits, in each decision, `(...)`, or in all, one number; the
+        times have the same shape. `draws` are the channel's random numbers.
         """
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Return whether, and when, the request to each helper and its reply are received.
 
-        `links` has who was asked and what is sent; `draws` are the channel's random numbers.
+        `links` has who was asked, how far each is, when its reply is ready, and the sizes of
+        messages; `draws` are the channel's random numbers.
         """
 
 
@@ -312,7 +332,10 @@ class Physical(Channel, Protocol):
 
     @property
     def decorrelation_m(self) -> float:
-        """Return the distance at which shadowing's correlation is 1/e, m; inf without shadowing."""
+        """Return the distance at which shadowing's correlation is 1/e, m; inf without shadowing.
+
+        Shadowing is the slow change of received power by what stands around.
+        """
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the share of background packets that are received at distances, m, `(n,)`.
@@ -328,13 +351,14 @@ class Physical(Channel, Protocol):
 
         `site` has the positions. `shadow` is each link's shadowing, `(..., H)`, a standard normal
         number: the slow change of received power by what stands around. `bits` is the message's
-        size, one for all or `(..., H)`.
+        size in bits, one for all or `(..., H)`.
         """
 
     def busy_ratio(self) -> float:
-        """Return the share of time that the channel is busy with others' background packets.
+        """Return the share of time, 0 to 1, that the channel is busy with others' packets.
 
-        NaN if the model does not know it.
+        These are background packets, such as beacons, not the messages of a decision. NaN if the
+        model does not know it.
         """
 
 
@@ -345,8 +369,9 @@ class ByLink(Physical, Protocol):
     def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
         """Return the seconds from the wish to send until reception on each of H links, `(..., H)`.
 
-        `site` has the positions. `way` is `REQUEST` or `REPLY`: the index on the last axis of
-        `draws.latency` of the random numbers that the latency may depend on.
+        `site` has the positions and `draws` the channel's random numbers. `way` is `REQUEST` or
+        `REPLY`: the index on the last axis of `draws.latency` of the random numbers that the
+        latency may depend on.
         """
 
 

@@ -46,14 +46,14 @@ class Radio:
     roadside_edge: bool = False
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when helpers have a request: after its bits divided by the bandwidth.
+        """Return when helpers have a request of `bits`: after these divided by the bandwidth.
 
         The rest of its time is in the nominal latency.
         """
         return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 
     def deliver(self, links: Links, draws: Draws) -> Delivery:
-        """Return whether, and when, each helper's reply is received.
+        """Return whether, and when, the reply of each helper asked, by `links`, is received.
 
         A serial medium serves the helper first that is ready first, so a slow one delays no other.
         """
@@ -81,7 +81,7 @@ def density_coupled_loss(n_active: Ints) -> Floats:
 
 
 def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bools:
-    """Return for which of H helpers request and reply are both received, `(..., H)`.
+    """Return a mask of the helpers, of H, whose request and reply are both received, `(..., H)`.
 
     The probability is (1 - loss)^2. `uniforms` are draws in [0, 1) of each helper's request and
     reply, `(..., H, 2)`; `loss` is the probability that one transmission is lost, `(..., H)` or

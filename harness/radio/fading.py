@@ -41,9 +41,10 @@ class Trips:
         return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
 
     def uniforms(self, helpers: int) -> Floats:
-        """Return uniform draws for each decision's packets, `(..., 1 + 2H)`.
+        """Return uniform draws in [0, 1) for each decision's packets, `(..., 1 + 2H)`.
 
-        The first is for the request's wait, then a pair (request, reply) for each of H helpers.
+        `helpers` is H. The first is for the request's wait for a free medium, then follow a pair
+        (request, reply) for each helper.
         """
         pairs_draws, place = self._once_a_pair(_packets, self.steps, helpers)
         return pairs_draws[place, self.step]

@@ -8,7 +8,8 @@ from typing import Any
 def outside(settings: Mapping[str, Any], limits: Mapping[str, Sequence[float]]) -> list[str]:
     """Return a sentence for each setting outside the range for which a channel model was validated.
 
-    `limits` has the least and largest value by the setting's name.
+    `settings` has the channel's settings by name; `limits` has for some of them the least and
+    largest value, in the setting's unit. A value that is no number counts as outside.
     """
     return [
         f"{name} = {_number(settings.get(name)):g} is outside what its model was held against, "

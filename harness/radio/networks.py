@@ -19,7 +19,8 @@ Milliseconds = Annotated[float, between(0, 1000 * LONGEST_S)]
 class Network:
     """Hold how long round trips from a car to a cloud take, without the time of the answer there.
 
-    A round trip is drawn from the distribution that `quantiles_ms` states.
+    It is the content of a file of `networks/`. A round trip is drawn from the distribution that
+    `quantiles_ms` states.
     """
 
     description: str  # one sentence for lists
@@ -36,12 +37,18 @@ class Network:
 
 
 def names() -> list[str]:
-    """Return the names of all networks, a project's own included."""
+    """Return the names of all networks between cars and a cloud, a project's own included.
+
+    A network is a file of a folder `networks/` that states how long round trips take.
+    """
     return resources.names("networks")
 
 
 def network(name: str) -> Network:
-    """Return a network by name. Raises UserError if it is unknown or its file is wrong."""
+    """Return the network with a name that `names` lists, from its file.
+
+    Raises UserError if it is unknown or its file is wrong.
+    """
     if name not in names():
         raise unknown("round_trip", name, names())
     return _read(resources.find("networks", f"{name}.toml"))

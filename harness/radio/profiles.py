@@ -33,24 +33,31 @@ MODELS = Shipped[Any]("swarmdrive.channel_models", object, {"constant": Radio})
 class Profile:
     """Hold the content of a channel profile, a file of `channels/`: model, parameters, source."""
 
-    model: str  # one of `MODELS`
+    model: str  # name of the channel model, one of `MODELS`
     description: str  # one sentence for lists
     source: str  # source of the model and its parameters
-    # their kind: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`
+    # the source's kind: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`
     status: Literal["measured", "cited", "modelled", "assumed"]
-    parameters: dict[str, Any] = field(default_factory=dict)  # parameters of the model
+    parameters: dict[str, Any] = field(default_factory=dict)  # the model's parameters, by name
     # for some parameters, the least and largest value for which the source validated the model
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 class Profiles(FilesAndPlugins[Channel]):
-    """Hold the channels of all profiles by name, from files and from packages."""
+    """Hold the channels of all profiles by name, from files and from packages.
+
+    A channel decides which messages over the radio arrive, and when. A profile states its model and
+    parameters.
+    """
 
     folder = "channels"
 
     def check(self, name: str, plugin: Channel) -> None:
-        """Raise an error unless a package's channel of the harness's own model, which acts
-        unchecked, has parameters that a file may have.
+        """Raise ValueError or UserError if a package's channel, `plugin`, may not be used.
+
+        `name` is what it is called. Results of a package's own model are checked at each call, but
+        those of the harness's models are not: a channel of one must have parameters that a
+        profile's file could have.
         """
         if strangers.is_ours(plugin):
             if isinstance(plugin, Wrapped):
@@ -90,7 +97,7 @@ class Profiles(FilesAndPlugins[Channel]):
         """Return whether the channel `name` still does what a run recorded of it.
 
         `recorded` is what `record` returned then: model and parameters are compared. A parameter
-        that the record does not have had its default.
+        that it lacks, as it is newer than the run, counts as recorded with its default.
         """
         if name not in self:
             return False
@@ -100,7 +107,10 @@ class Profiles(FilesAndPlugins[Channel]):
         return bool((now["model"], now["parameters"]) == (then["model"], before))
 
     def record(self, name: str) -> dict[str, Any]:
-        """Return a channel's profile with all parameters as plain values, for a run's manifest."""
+        """Return the profile of the channel `name` as plain values, for a run's manifest.
+
+        The keys are the fields of `Profile`; `parameters` has all of the model's, defaults too.
+        """
         parameters = asdict(self[name])
         plain = {**asdict(self.profile(name)), "parameters": parameters}
         with worded(f"channel profile {printable(name)}", built_in=is_ours(self[name])):

@@ -49,12 +49,18 @@ class Wrapped:
 
 
 def innermost(channel: Channel) -> Channel:
-    """Return the channel without its wrappers."""
+    """Return the channel within all wrappers of `channel`, or itself if nothing wraps it.
+
+    A wrapper is a `Wrapped`, which changes part of what another channel does.
+    """
     return innermost(channel.channel) if isinstance(channel, Wrapped) else channel
 
 
 def is_ours(channel: Channel) -> bool:
-    """Return whether a channel's model, and what wraps it, are the harness's own."""
+    """Return whether a channel's model, and what wraps it, are the harness's own code.
+
+    If not, they are a package's, and what they return must be checked.
+    """
     if not strangers.is_ours(channel):
         return False
     return not isinstance(channel, Wrapped) or is_ours(channel.channel)
@@ -63,9 +69,9 @@ def is_ours(channel: Channel) -> bool:
 def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
     """Return which replies are received on a channel, and when, as `Channel.deliver` does.
 
-    The model of another package gets arrays that it cannot write to, and its results are checked.
-    Raises ValueError if one has a wrong shape or type, or an impossible value for a helper that was
-    asked.
+    `links` has who was asked and what is sent; `draws` are the channel's random numbers. The model
+    of another package gets arrays that it cannot write to, and its results are checked. Raises
+    ValueError if one has a wrong shape or type, or an impossible value for a helper that was asked.
     """
     if is_ours(channel):
         return channel.deliver(links, draws)
@@ -95,6 +101,7 @@ def delivered(channel: Channel, links: Links, draws: Draws) -> Delivery:
 def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast:
     """Return when a request of so many bits is received on a channel, as `Channel.request` does.
 
+    `bits` is one number for all decisions or `(...)`; `draws` are the channel's random numbers.
     Times of another package's model are checked. Raises ValueError for one that is negative or
     infinite; NaN is one that is unknown.
     """
@@ -125,7 +132,10 @@ def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) ->
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """Wrap a physical channel so that its loss is the same everywhere, whatever the positions."""
+    """Wrap a physical channel so that its loss is the same everywhere, whatever the positions.
+
+    A physical channel is one whose losses follow from positions; its times stay as they are.
+    """
 
     probability: float  # probability that one transmission is lost
 
