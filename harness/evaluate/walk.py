@@ -41,9 +41,14 @@ AskedPoint = TypeVar("AskedPoint", contravariant=True)
 
 @dataclass(frozen=True)
 class Due:
-    """Hold the n decisions to be made now under one condition, in all episodes and seeds."""
+    """Hold the n decisions to be made now under one condition, in all episodes and seeds.
 
-    # index of each decision's point among the decision points that the world shows now, (n,)
+    A condition is the settings of radio, asking and fusion; each episode is played under it once
+    for each seed of the channel's random draws.
+    """
+
+    # index of each decision's point, such as its scene, among those that `World.observe` returned
+    # last, (n,)
     at: Ints
     episode: Ints  # number of each decision's episode, (n,)
     seed: Ints  # seed of the channel's draws for each, (n,)
@@ -54,9 +59,9 @@ class Due:
 
     @property
     def episodes(self) -> list[tuple[int, int]]:
-        """Return the episode's number and the channel's seed of each decision.
+        """Return of each decision the number of its episode and the seed of the channel's draws.
 
-        Together they name a walk: one episode under the condition.
+        Together they name one course of an episode under the condition.
         """
         return list(zip(self.episode.tolist(), self.seed.tolist(), strict=True))
 
@@ -69,7 +74,8 @@ class Decided(Generic[DecisionPoint]):
     """
 
     point: OperatingPoint  # the condition
-    # the decision points, scenes as a rule, that the world showed; `due.at` has indices in them
+    # the decision points, scenes as a rule, that `World.observe` returned; `due.at` has indices in
+    # them
     decision_points: Sequence[DecisionPoint]
     due: Due  # the decisions that were due
     result: Coordination  # what was decided, (n, ...)
@@ -79,25 +85,29 @@ class Decided(Generic[DecisionPoint]):
 class World(Protocol[DecisionPoint]):
     """Describe where decision points come from and where actions lead, as `walk` needs it.
 
-    Worlds are recorded scenes, a simulation, and points that are drawn at random.
+    A decision point is where an ego must decide, such as a scene. Worlds are recorded scenes, a
+    simulation, and points that are drawn at random.
     """
 
     def observe(self) -> Sequence[DecisionPoint]:
         """Return each distinct decision point, such as a scene, at which decisions are due now.
 
-        There is none once all episodes have ended.
+        The list is empty once all episodes have ended.
         """
         ...
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return the decisions due under a condition in the points that `observe` returned last."""
+        """Return the decisions due at the points that `observe` returned last, under one condition.
+
+        `point` is the condition: the settings of radio, asking and fusion.
+        """
         ...
 
     def site(self, antennas: Collection[Antenna]) -> Site | None:
         """Return the true positions of vehicles at the n points last observed, `(n, ...)`.
 
-        `antennas` are those on no vehicle whose links are wanted, too. None
-        in a world without positions.
+        `antennas` are those on no vehicle, such as beside the road, whose links are wanted, too.
+        None in a world without positions.
         """
         ...
 
@@ -109,33 +119,41 @@ class World(Protocol[DecisionPoint]):
         ...
 
     def claims(self) -> Claims | None:
-        """Return what helpers claim of themselves at the last observed points, `(n, ...)`.
+        """Return the positions and speeds that helpers claim at the n last observed points.
 
-        None in a world without positions.
+        Arrays are `(n, ...)`. None in a world without positions.
         """
         ...
 
     def plans(self) -> Plans | None:
-        """Return what agents say of their motion at the last observed points, `(n, 1)`.
+        """Return what agents say of their motion at the n last observed points, `(n, 1)`.
 
-        None in a world where only one ego decides.
+        An agent is a vehicle that decides for itself; each point is the decision of one. None in a
+        world where only one ego decides.
         """
         ...
 
     def listed(self) -> tuple[Floats, Floats] | None:
-        """Return how many objects each helper lists, and their size in bits, both `(n, H)`.
+        """Return how many objects each of H helpers lists, and their size in bits, both `(n, H)`.
 
-        They are of the n last observed points. None in a world without positions.
+        Objects are the vehicles that a helper sees, to be sent to the ego. They are of the n last
+        observed points. None in a world without positions.
         """
         ...
 
     def step(self, decided: Sequence[Decided[DecisionPoint]]) -> None:
-        """Act on the decisions, one `Decided` a condition, and go on to the next points."""
+        """Act on the decisions, one `Decided` a condition, and go on to the next points.
+
+        `observe` returns these then.
+        """
         ...
 
 
 class SceneWorld:
-    """Describe a world whose decision points are scenes of a scenario; a base class."""
+    """Describe a world, as `World` does, whose decision points are scenes of a scenario.
+
+    It is a base class: it computes from the scenes what vehicles see and claim.
+    """
 
     scenario: Scenario  # the scenario of the scenes
     scenes: Sequence[Scene]  # the scenes that `observe` returned last
@@ -154,26 +172,38 @@ class SceneWorld:
         return None
 
     def listed(self) -> tuple[Floats, Floats]:
-        """Return how many objects each helper lists, and their size in bits, both `(n, H)`."""
+        """Return how many objects each of H helpers lists, and their size in bits, both `(n, H)`.
+
+        Objects are the vehicles that a helper sees, in each of the n scenes observed last.
+        """
         return listed(self.scenes)
 
 
 class Fuses(Protocol):
-    """Describe the ego's answers to the sets of messages heard at some decision points."""
+    """Describe the ego's answers when its model is asked again with the messages that it heard.
+
+    It has the answers at some decision points to each set of messages that was stated beforehand
+    (`Ask.fusion_call`); a call picks those of n decisions.
+    """
 
     def __call__(self, decision_points: Ints, attackers: Bools | None = None, /) -> FusionCall:
-        """Return the fusion call of n decisions, by the decision point of each, `(n,)`.
+        """Return the fusion call of n decisions: a function of who was heard, `(n, H)`.
 
-        `attackers`, `(n, H)`, is needed where messages show who attacks.
+        It returns the ego's answers, `(n, A)`, and their seconds, `(n,)`. `decision_points`,
+        `(n,)`, has the number of each decision's point (`places_of`); `attackers`, `(n, H)`, says
+        which senders attack, and is needed where what is shown of their messages is changed.
         """
         ...
 
 
 class Ask(Protocol[AskedPoint]):
-    """Describe the source of intents in a walk: it asks the models, or has their answers."""
+    """Describe the source of intents when a run is played: it asks the models, or has answers.
+
+    An intent is the probabilities of the ego's actions that one vehicle's model answers.
+    """
 
     def __call__(self, points: Sequence[AskedPoint], /) -> Intents:
-        """Return what every vehicle intends at n decision points, `(n, ...)`.
+        """Return what every vehicle intends at the n decision points `points`, `(n, ...)`.
 
         Helpers may be `unasked`: their models are asked once a condition needs them.
         """
@@ -182,7 +212,7 @@ class Ask(Protocol[AskedPoint]):
     def others(self, points: Sequence[AskedPoint], /, question: Question, at: Ints) -> Intents:
         """Return the intents at n points, `(n, ...)`, where helpers are asked another question.
 
-        Only the points at the indices `at` need values.
+        Only the points at the indices `at` need values; `question` is not the ordinary one.
         """
         ...
 
@@ -191,7 +221,8 @@ class Ask(Protocol[AskedPoint]):
     ) -> Intents:
         """Ask some helpers, those marked in `wanted`, `(n, H)`, at n points with H helpers.
 
-        Returns the intents at the points in which a helper is marked, in their order.
+        Returns the intents at the m points in which a helper is marked, `(m, ...)`, in their order.
+        `question` is what the helpers are asked.
         """
         ...
 
@@ -200,8 +231,8 @@ class Ask(Protocol[AskedPoint]):
     ) -> Fuses:
         """Return what egos answer if they are asked once more, with each of K sets of messages.
 
-        `codes`, `(K,)`, has for each set an integer that says at which point who was heard
-        (`codes_of`); `rewrites` says how the messages are shown.
+        `codes`, `(K,)`, has for each set an integer that says at which of `points` who was heard
+        (`harness.evaluate.fusion.codes_of`); `rewrites` says how the messages are shown.
         """
         ...
 
@@ -210,8 +241,9 @@ class Ask(Protocol[AskedPoint]):
     ) -> FusionCall:
         """Return the function that asks n agents once more, with the plans that each has heard.
 
-        An agent is a vehicle that decides for itself. `at`, `(n,)`, has the index of each one's
-        point, and `intents`, `(n, ...)`, the plans.
+        An agent is a vehicle that decides for itself. `at`, `(n,)`, has the index in `points` of
+        each one's own; `intents`, `(n, ...)`, has the plans, what vehicles state of their motion.
+        The function takes who was heard, `(n, H)`.
         """
         ...
 
@@ -224,9 +256,15 @@ def walk(
 ) -> Iterator[Sequence[Decided[DecisionPoint]]]:
     """Play a world: yield the decisions of each step until every episode has ended.
 
-    `points` are the conditions, under each of which every episode is played; `ask` gives what
-    vehicles intend. Of actions that are equally likely, `ties` takes the `first`, or one that is
-    `drawn`.
+    Each item has one `Decided` for each condition under which decisions were due; a step is one
+    round of decisions in all episodes.
+
+    Args:
+        world: gives the decision points, and is told the decisions.
+        points: the conditions: settings of radio, asking and fusion. Every episode is played under
+            each.
+        ask: gives what vehicles intend, by asking their models.
+        ties: which of equally likely actions is taken: the `first`, or one that is `drawn`.
     """
     steps = _steps(world, points, ask, ties)
     while True:
@@ -370,10 +408,10 @@ def _answers_of_helpers(
 def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) -> Intents:
     """Return what vehicles intend in n decisions that are due, as the ego may hear it.
 
-    `point` is the condition and `answers` has the intents at all decision points, by question.
-    Helpers' may be answers to another question, or come from another decision's scene, as in a
-    control; who has no other to hear from hears nobody. Distances and inference times stay the
-    decision's own.
+    `point` is the condition, the settings; `due` has the decisions, and `answers` the intents at
+    all decision points observed, by the question that helpers were asked. Helpers' may be answers
+    to another question, or come from another decision's scene, as in a control; who has no other to
+    hear from hears nobody. Distances and inference times stay the decision's own.
     """
     intents = _able(point, answers[PLAIN], due)
     if point.question != PLAIN:
@@ -401,9 +439,10 @@ def _able(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:
-    """Return intents with the sizes of replies by what messages hold and how they are encoded.
+    """Return intents with the sizes of replies, in bits, that messages have under a condition.
 
-    Both are settings of the operating point `point`.
+    They follow from what messages hold and how they are encoded. Both are settings of the operating
+    point `point`.
     """
     sizes = bits(point, intents)
     return intents if sizes is intents.payload_bits else replace(intents, payload_bits=sizes)
@@ -421,18 +460,22 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
 class Memory:
     """Keep the memory of a condition's consensus rule between the decisions of each episode.
 
-    Each episode and channel seed has its own.
+    The rule fuses intents; its memory is numbers of its own, such as its trust in each helper. Each
+    episode and seed of the channel's draws has its own.
     """
 
     def __init__(self) -> None:
         self._state: dict[tuple[int, int], Floats] = {}
 
     def recall(self, due: Due) -> Floats | None:
-        """Return the rule's memory for n decisions, K numbers each, `(n, K)`; None at the first."""
+        """Return the rule's memory for n decisions, K numbers each, `(n, K)`; None at the first.
+
+        `due` has the decisions, each with its episode and seed.
+        """
         return np.array([self._state[place] for place in due.episodes]) if self._state else None
 
     def keep(self, due: Due, state: Floats) -> None:
-        """Store the rule's memory after n decisions, `(n, K)`; nothing if K is 0."""
+        """Store the rule's memory after n decisions, `state`, `(n, K)`; nothing if K is 0."""
         if state.shape[-1]:
             self._state |= dict(zip(due.episodes, state, strict=True))
 
@@ -468,8 +511,9 @@ def heard_codes(
     """Return all K sets of messages that some ego hears, each as an integer (`codes_of`), `(K,)`.
 
     They are sorted and distinct. Only conditions count whose egos are asked once more with what
-    they heard. The mappings have by condition the decisions due, what was sent, and who was heard;
-    `n` is the number of decision points.
+    they heard. An operating point is a condition, the settings. The mappings have by condition the
+    decisions due (`due`), what vehicles sent (`broadcasts`), and who was heard (`sent`); `n` is the
+    number of decision points.
     """
     codes = [np.empty(0, dtype=int)]
     for point, due_here in due.items():
@@ -485,9 +529,10 @@ def heard_codes(
 def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
     """Return for each decision the number of its decision point that stands in codes, `(m,)`.
 
-    There are m decisions due under the condition `point`, and `n` decision points. The number is
-    the point's index, or where messages come from another point, as in a control, `n` times that
-    plus the other's index.
+    A code is an integer that says where a decision is made and who was heard (`codes_of`). There
+    are m decisions due under the condition `point`, and `n` decision points. The number is the
+    point's index, or where messages come from another point, as in a control, `n` times that plus
+    the other's index.
     """
     return due.at * n + due.at[_sources(point, due)] if point.rewrites.elsewhere else due.at
 
@@ -495,6 +540,7 @@ def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
 def shown_attackers(point: OperatingPoint, broadcast: SentIntents) -> Bools | None:
     """Return a mask of the senders that attack, `(n, H)`; None if no prompt depends on it.
 
-    A prompt that shows messages depends on it if attacks change these.
+    A prompt that shows messages depends on it if attacks change these. `point` is the condition,
+    and `broadcast` has what was sent in n decisions.
     """
     return broadcast.attackers if point.rewrites.changes.of_attackers else None
