@@ -24,7 +24,11 @@ Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -1
 
 
 class Roadside(Part, frozen=True, kw_only=True):
-    """Hold what a roadside unit does, where it stands and how fast it is."""
+    """Hold the settings of a roadside unit: what it does, where it stands and how fast it is.
+
+    A roadside unit is an antenna beside the road. The settings are a part of an operating point,
+    the settings under which a run's decisions are played.
+    """
 
     behind: ClassVar[str] = "helper_rounds"
     of_radio: ClassVar[bool] = True
@@ -33,13 +37,14 @@ class Roadside(Part, frozen=True, kw_only=True):
     # fuses (`harness.extensions.roadside.unit`). With the constant model a relay has no place
     # (`harness.radio.constant.Radio`).
     edge: Text = NONE
-    # From the end of what the unit receives to the start of what it sends: processing and backhaul.
-    # The default is declared: a unit that has nothing to wait for.
+    # Seconds from the end of what the unit receives to the start of what it sends: processing and
+    # backhaul. The default is declared: a unit that has nothing to wait for.
     edge_delay_s: Seconds = 0.0
-    # to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
+    # m to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
     edge_x_m: Place = 0.0
-    edge_y_m: Place = 0.0  # to the south
-    # Height of the unit's antenna; by default that of TR 37.885, table 6.1.4-1, a roadside unit.
+    edge_y_m: Place = 0.0  # m to the south of it
+    # Height of the unit's antenna above the ground, m; by default that of TR 37.885, table 6.1.4-1,
+    # a roadside unit.
     edge_antenna_m: Annotated[float, Meta(ge=1, le=100, description="metres from 1 to 100")] = 5.0
 
     def check(self) -> None:

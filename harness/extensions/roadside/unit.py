@@ -39,7 +39,8 @@ class Relay(Wrapped):
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Return which replies arrive, directly or by the unit, and when the first of both does.
 
-        A lost reply keeps its slot on the medium, and that of its repetition if there is one.
+        `links` has who was asked and what is sent; `draws` are the channel's random numbers. A
+        lost reply keeps its slot on the medium, and that of its repetition if there is one.
         """
         up, delay_s, loss, airtime_s = delivered(self.channel, links, draws)
         has_request = draws.packet[..., 0] >= link_loss(
@@ -84,9 +85,10 @@ def by_unit(
 ) -> Consulted:
     """Play a roadside unit, an antenna beside the road, that asks for the ego and fuses for it.
 
-    The unit sends when the last reply's slot has ended, but not so late that its own wait and time
-    on air take the policy out of the window: it knows the slot that it has taken, or a table's
-    latency, and until when the ego waits. An ego without a policy by then acts alone.
+    It sends the ego a policy, the probabilities of the ego's actions. It does so when the last
+    reply's slot has ended, but not so late that its own wait and time on air take the policy out of
+    the window: it knows the slot that it has taken, or a table's latency, and until when the ego
+    waits. An ego without a policy by then acts alone.
 
     Args:
         channel: the channel between vehicles.
