@@ -45,7 +45,7 @@ def command(
             for whole in Path(draft).iterdir():
                 whole.rename(place / whole.name)
     except OSError as error:
-        reason = printable(error.strerror)
+        reason = printable(error.strerror or error)
         raise UserError(
             f"{printable(folder)} cannot be made ({reason}); give another folder"
         ) from None

@@ -203,7 +203,7 @@ def value_of(usual: object, text: str) -> object:
     """
     if isinstance(usual, bool):
         return {"true": True, "false": False}.get(text, text)
-    if isinstance(usual, str):
+    if isinstance(usual, str) or not text.isascii():
         return text
     try:
         return int(text) if isinstance(usual, int) else float(text)

@@ -14,6 +14,7 @@ from harness.core.files import text_of, write_whole
 from harness.core.formats import SUITE
 from harness.core.statistics import mean_of
 from harness.runs import folder
+from harness.runs.alike import setup
 from harness.runs.folder import Run
 from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.listing import own_name
@@ -25,7 +26,6 @@ from harness.runs.writer import csv_text
 
 FORMAT = "swarmdrive-suite/1"
 SUMMARY = "summary.csv"  # the means over families
-_MEASURED = "measured"  # source of a latency that each run measures for itself
 
 
 class Contents(msgspec.Struct, frozen=True, kw_only=True):
@@ -204,15 +204,11 @@ def _shared_settings(run: Run) -> Any:
     if isinstance(world, FrozenSettings):
         world = structs.replace(world, dataset="")
     settings = structs.replace(deciding(manifest.settings), world=world, prompt="", latency=None)
-    times = structs.replace(manifest.latency, basis="", sample={})
-    agents = [{**agent, "prompt": {}} for agent in (manifest.agent(0), *manifest.helpers)]
     return (
-        agents,
+        {**setup(run), "prompt": ""},
         manifest.conditions,
         manifest.seeds,
         settings,
-        _MEASURED if times.source == _MEASURED else times,
-        {name: (each.model, each.parameters) for name, each in manifest.channels.items()},
         manifest.networks,
         manifest.schedules,
         manifest.kept,

@@ -29,6 +29,7 @@ from harness.extensions.schedules.choices import COSTS, Choices, choices
 from harness.extensions.schedules.learning import layouts
 from harness.report.document import Table
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
+from harness.runs.alike import different, setup
 from harness.runs.headline import BALANCED
 from harness.runs.success import Success
 from harness.studies.replayed_run import ReplayedRun, counted
@@ -469,6 +470,8 @@ def run_schedules(
     every = [*runs, *tune]
     for run in tune:
         layouts(run, "tune", runs)
+    for run, tune_run in zip(runs, tune, strict=False):
+        _refuse_unlike(run, tune_run)
     manifest = {
         "sources": [run.manifest() for run in every],
         "condition": condition,
@@ -488,6 +491,17 @@ def run_schedules(
     for run in every:
         run.settle()
     return compared
+
+
+def _refuse_unlike(run: ReplayedRun, tune: ReplayedRun) -> None:
+    """Raise UserError if settings would be chosen by answers of another model or scenario."""
+    unlike = different(setup(run.run, run.dataset.scenario), setup(tune.run, tune.dataset.scenario))
+    if unlike:
+        one, other = printable(run.run.path), printable(tune.run.path)
+        raise UserError(
+            f"--tune {other} differs from {one} in {unlike}; give a run that differs in its "
+            "layouts alone, in the order of the runs"
+        )
 
 
 def in_order(names: Collection[str]) -> list[str]:

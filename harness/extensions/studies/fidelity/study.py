@@ -13,12 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec.structs import asdict
 
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.core.versions import versions
 from harness.report.document import Table
+from harness.runs.alike import different, setup
 from harness.runs.contradictions import sound
+from harness.runs.folder import Run
 from harness.runs.metric import World
 from harness.runs.records import Variant
+from harness.runs.run_dataset import dataset_of
 from harness.studies.both_worlds import COMPARED, compared
 
 if TYPE_CHECKING:
@@ -67,14 +70,15 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
 
     Raises:
         UserError: a folder is no run, a kind of run is missing, two runs have the same episodes, or
-            no episode is in runs of both kinds.
+            no episode is in runs of both kinds; or two that are paired differ in their scenario, or
+            in what they ask and time.
     """
     import pandas as pd
 
     by_world: dict[World, list[pd.DataFrame]] = {"frozen": [], "closed-loop": []}
-    for run in runs:
-        world, episodes = _episodes(run)
-        by_world[world].append(episodes)
+    read = [sound(path) for path in runs]
+    for number, run in enumerate(read):
+        by_world[run.world].append(_episodes(run).assign(run=number))
     sources = {
         "frozen": "frozen scenes (harness eval)",
         "closed-loop": "live episodes (harness drive)",
@@ -97,6 +101,10 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
             "the runs have no episode in common; give runs of the same model, prompt and answer "
             "mode, with the same conditions, seeds and layouts (harness drive --first-seed)"
         )
+    pairs = both[["run_frozen", "run_closed"]].drop_duplicates()
+    for one, other in pairs.itertuples(index=False):
+        _refuse_unlike(read[one], read[other])
+    both = both.drop(columns=["run_frozen", "run_closed"])
     rows = pd.DataFrame(_rows(both))
     return Fidelity(rows, both, *_rank(rows))
 
@@ -114,15 +122,26 @@ def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
     return float(spearmanr(distinct.frozen, distinct.closed).statistic), len(distinct)
 
 
-def _episodes(path: Path) -> "tuple[World, pd.DataFrame]":
-    """Return the world of a run, and the result of each of its episodes."""
+def _refuse_unlike(frozen: Run, driven: Run) -> None:
+    """Raise UserError if two runs differ in more than their worlds."""
+    unlike = different(
+        setup(frozen, dataset_of(frozen).scenario), setup(driven, driven.manifest.scenario)
+    )
+    if unlike:
+        one, other = printable(frozen.path), printable(driven.path)
+        raise UserError(
+            f"{one} and {other} differ in {unlike}; give runs that differ in their world alone"
+        )
+
+
+def _episodes(run: Run) -> "pd.DataFrame":
+    """Return the result of each of a run's episodes."""
     import pandas as pd
 
-    run = sound(path)
     columns = ("condition", "seed", "layout_seed", "success", "failure")
     rows = [attrgetter(*columns)(episode) for episode in run.episodes]
     table = pd.DataFrame(rows, columns=list(columns))
-    return run.world, table.assign(**asdict(run.manifest.variant))
+    return table.assign(**asdict(run.manifest.variant))
 
 
 def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
