@@ -81,11 +81,8 @@ class Tally:
 
 
 def tally(run: Run) -> Tally:
-    """Return how many requests of a finished run got an answer, and how many an error.
-
-    Nothing is counted, and no answer read, if the run's manifest states no errors.
-    """
-    return Tally(run.answers if run.manifest.engine_errors else ())
+    """Return how many requests of a finished run got an answer, and how many an error."""
+    return Tally(run.answers)
 
 
 def lacking(run: Run) -> Iterator[Answer]:

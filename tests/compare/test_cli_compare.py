@@ -224,6 +224,20 @@ def test_six_metrics_come_first_and_all_print_the_rest(
     assert [name for name, d in metrics.items() if d["primary"]] == primary
 
 
+def test_radios_networks_and_what_extensions_opened_are_told_where_both_runs_have_them(
+    runs: tuple[Path, Path], harness: Harness
+) -> None:
+    """A name, such as that of a file of one's own, may have come to mean another."""
+    stated = json.loads((runs[1] / "run.json").read_text())
+    radio = stated["channels"]["6g"]
+    faster = {**radio, "parameters": {**radio["parameters"], "latency_s": 0.001}}
+    configure(runs[1], channels={**stated["channels"], "6g": faster}, schedules={"mine": "0" * 64})
+    out = " ".join(harness("compare", *runs)[1].split())
+    assert "differ in channels" in out
+    assert "channels.6g.latency_s: 0.005 → 0.001" in out
+    assert "mine" not in out
+
+
 def test_prefill_and_decode_of_each_run_are_said(
     runs: tuple[Path, Path], harness: Harness, tmp_path: Path
 ) -> None:

@@ -14,7 +14,7 @@ from harness.core.errors import printable
 from harness.core.multiplicity import holm, p_of_bootstrap, p_value
 from harness.core.statistics import LEVEL, Estimate, known_mean
 from harness.prompts.difference import PromptChange, change, of_swarm
-from harness.report.compare.pair import Pair, Side
+from harness.report.compare.pair import OPENED, Pair, Side
 from harness.runs import percentiles, reliability
 from harness.runs.estimates import difference
 from harness.runs.folder import Run
@@ -282,8 +282,10 @@ def _settings(pair: Pair) -> Iterator[tuple[str, str | None, str | None]]:
     for side in (pair.a, pair.b):
         alone = [name for name in side.run.conditions if name not in pair.conditions]
         prefixes += [f"condition.{name}." for name in alone]
+    opened = tuple(f"{kind}." for kind in OPENED)
     for name in {**a, **b}:
-        if a.get(name) != b.get(name) and not name.startswith(tuple(prefixes)):
+        in_one = name.startswith(opened) and (name not in a or name not in b)
+        if a.get(name) != b.get(name) and not in_one and not name.startswith(tuple(prefixes)):
             yield name, a.get(name), b.get(name)
 
 

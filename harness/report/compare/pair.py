@@ -45,6 +45,8 @@ ORDER = (
 )
 NAMES = {**COMPARED, "helpers": None}  # settings, and the helpers' agents
 SETTINGS = (*sorted(NAMES, key=lambda name: (*ORDER, name).index(name)), "identity", "versions")
+# What conditions open, by the name of what each opens; of runs without a condition it is not there.
+OPENED = ("channels", "networks", "schedules", "kept")
 
 
 def where(run: Run) -> str:
@@ -208,6 +210,12 @@ def _side(run: Run) -> Side:
     if run.world == "closed-loop":
         parameters = manifest["world"]["scenario"]["parameters"]
         record["scenario"] = {key: parameters[key] for key in DIALS if key in parameters}
+    opened = run.manifest
+    radios = {
+        name: {"model": radio.model, **radio.parameters} for name, radio in opened.channels.items()
+    }
+    record |= zip(OPENED, (radios, opened.networks, opened.schedules, opened.kept), strict=True)
+    record = {**opened.beside, **record}
     # Through the class, which gives a setting that the run does not know the value it had then.
     points = [OperatingPoint.from_dict(condition).record() for condition in manifest["conditions"]]
     record["condition"] = {point["name"]: point for point in points}
