@@ -455,9 +455,8 @@ def test_a_driven_run_has_its_tables_held_against_each_other_and_the_simulator(
     code, out, _ = harness("run", "check", drive)
     words = " ".join(out.split())
     assert code == 0, words
-    assert "equal where it can be checked: " in words
-    assert "held against each other, since it was driven, and 3 episodes driven again" in words
-    assert "Whether its answers make its decisions is not checked." in words
+    assert ": equal: " in words
+    assert words.endswith("driven again with its answers")
     damage(drive, decision=faster)
     assert harness("run", "check", drive)[0] == 1
 
@@ -471,11 +470,8 @@ def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
     code, out, _ = harness("run", "check", drive)
     assert code == 1
     words = " ".join(out.split())
-    for number, name in enumerate(OTHERWISE):
-        found = (
-            f"another {name} of episode {number} in single-local, seed 0, than its actions lead to"
-        )
-        assert f"episodes.csv has {found}" in words
+    for name in OTHERWISE:
+        assert f"episodes.csv has another {name} in 1 row than its answers make" in words
     assert "summary.csv" not in words
     assert harness("report", drive)[0] == 0
 
@@ -557,8 +553,8 @@ def test_a_driven_run_that_cannot_be_driven_again_says_so(
     code, out, _ = harness("run", "check", drive)
     words = " ".join(out.split())
     assert code == 0
-    assert "No episode was driven again: to drive again needs highway-env" in words
-    assert "driven again with" not in words
+    assert "It was not driven again: to drive again needs highway-env" in words
+    assert "with its answers" not in words
 
 
 def test_what_is_no_number_or_none_of_its_scenes_is_a_line_and_no_traceback(

@@ -19,8 +19,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.formats import SOURCES
 from harness.evaluate.agent import Agent, ImageMode
-from harness.evaluate.frozen_world import FrozenSource
-from harness.evaluate.spec import Spec
+from harness.evaluate.spec import Source, Spec
 from harness.prompts import versions
 from harness.radio.networks import network
 from harness.radio.profiles import CHANNELS
@@ -32,8 +31,8 @@ from harness.runs.sources import PROMPTS, prompt_of
 DRIVER = "driver"  # the engine of what has no model and no prompt
 
 
-def spec_of(run: Run, source: FrozenSource) -> Spec:
-    """Return the evaluation by which a finished run's recorded scenes were answered.
+def spec_of(run: Run, source: Source) -> Spec:
+    """Return the evaluation by which a finished run's scenes were answered.
 
     It has the run's models, prompts and settings, and no conditions; `source` has the scenes.
     Raises UserError if a prompt of it is not installed here.

@@ -20,10 +20,9 @@ from harness.core.config import convert
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.extensions import part_of
 from harness.core.figures import amount
-from harness.core.files import sha256_file
 from harness.dataset import select
 from harness.dataset.load import Dataset
-from harness.dataset.select import Choice, spot_check
+from harness.dataset.select import Choice
 from harness.evaluate import latency as latencies
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import (
@@ -36,39 +35,15 @@ from harness.evaluate.of_run import (
     spec_of,
 )
 from harness.evaluate.run import evaluate
-from harness.evaluate.spec import Spec
+from harness.evaluate.spec import Source, Spec
 from harness.evaluate.texts import OF_TEXTS, others, same
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
 from harness.runs.stopping import looked_otherwise
 from harness.runs.unanswered import Tally
+from harness.world import scenarios
 
-AGAIN = 3  # episodes of a driven run that are driven again
-OF_ENDS = (  # what an episode's row says of how it ended
-    "layout_seed",
-    "danger",
-    "success",
-    "failure",
-    "outcome",
-    "delay_s",
-    "time_s",
-    "partner",
-    "striker",
-    "fault",
-    "least_gap_m",
-    "hard_brakings",
-    "other_crashes",
-    "witnesses",
-    "danger_radio",
-    "agents",
-    "arrived",
-    "met",
-    "agents_lost_s",
-    "most_lost_s",
-    "gave_way",
-    "journeys",
-)
 RULES = (DRIVER, "proxy")  # engines that are no models
 REPLAY = "replay"  # the engine of stored answers
 
@@ -123,28 +98,23 @@ def computed(run: Run, spec: Spec, out: Path, progress: Callable[[int], None]) -
 
 
 def differences(
-    run: Run, dataset: Dataset, out: Path, progress: Callable[[int], None]
+    run: Run, dataset: Dataset | None, out: Path, progress: Callable[[int], None]
 ) -> tuple[list[str], list[str]]:
-    """Compute a run of recorded scenes again, in an empty folder, and compare.
+    """Compute a run again, in an empty folder, and compare; a driven one is driven again.
 
     Returns two lists of sentences: what the run's tables say otherwise than the new ones, and which
-    columns it lacks, as a run of an earlier version may.
+    columns it lacks, as a run by older rules may.
 
     Args:
         run: the run, which is not changed.
-        dataset: the dataset that the run is of.
+        dataset: the dataset that the run is of; None for a driven run.
         out: the folder, which is written.
         progress: called with the number of answers that were read again.
 
     Raises UserError if a prompt, a channel or the like is not here as it was.
     """
-    world = run.manifest.world
-    assert isinstance(world, FrozenScenes)
-    choice = _choice(run, world.selection, dataset)
-    numbers = choice.numbers if choice else dataset.episodes
-    part = dataset.of_episodes(frozenset(numbers[: world.limit]))
-    source = FrozenSource(part, world.limit, choice)
-    if source.dataset.episodes != run.grid.episodes:
+    source = _source(run, dataset)
+    if tuple(source.numbers) != run.grid.episodes:
         return ["episodes.csv has other episodes than run.json says that were selected"], []
     stored_spec, manifest = spec_of(run, source), run.manifest
     check_prompts(run, stored_spec)
@@ -155,16 +125,17 @@ def differences(
     settings = structs.replace(stored_spec.settings, ask=stored_settings.ask, latency=latency)
     points = tuple(points_of(run).values())
     spec = replace(stored_spec, ego=ego, points=points, timer=timer, settings=settings)
+    alone = [*contradictions(run), *_of_manifest(run, stored_spec.ego.card)]
     try:
         ours, otherwise = computed(run, spec, out, progress)
     except Unanswered:
-        return [*contradictions(run), _unanswered(run)], []
+        return [*alone, _unanswered(run)], []
     except LacksAnswer as lack:
         lacks = f"answers.jsonl has no answer to {lack.question}, asked by what run.json states"
-        return [*contradictions(run), *_of_rule(lack.otherwise), lacks], []
+        return [*alone, *_of_rule(lack.otherwise), lacks], []
     wrong = [
-        *contradictions(run),
-        *_of_manifest(run, ours, stored_spec.ego.card),
+        *alone,
+        *_of_scenes(run, ours),
         *_of_episodes(run, ours),
         *_of_decisions(run, ours),
         *_of_answers(run, ours),
@@ -172,11 +143,31 @@ def differences(
     if list(map(astuple, run.layouts)) != list(map(astuple, ours.layouts)) and run.layouts:
         wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
     wrong += _of_rule(otherwise)
-    return wrong, [*_lacking(run, ours), *_unchecked_choice(world.selection)]
+    return wrong, [*_lacking(run, ours), *_unchecked_choice(manifest.world.selection)]
 
 
-def _choice(run: Run, record: Mapping[str, Any], dataset: Dataset) -> Choice | None:
-    """Return what chose a run's episodes, by what it states; None for all.
+def _source(run: Run, dataset: Dataset | None) -> Source:
+    """Return the scenes of a run: those of `dataset`, or for None those of layouts to drive."""
+    world = run.manifest.world
+    if isinstance(world, FrozenScenes):
+        assert dataset is not None
+        choice = _choice(run, world.selection, dataset.episodes, dataset)
+        numbers = choice.numbers if choice else dataset.episodes
+        part = dataset.of_episodes(frozenset(numbers[: world.limit]))
+        return FrozenSource(part, world.limit, choice)
+    from harness.evaluate.live_world import LiveSource  # a base install has no simulator
+
+    most = int(world.selection.get("of", world.episodes))
+    choice = _choice(run, world.selection, range(most), None)
+    if choice:
+        choice = replace(choice, numbers=choice.numbers[: world.episodes])
+    return LiveSource(world.first_seed, most, scenarios.argument(run.manifest.scenario), choice)
+
+
+def _choice(
+    run: Run, record: Mapping[str, Any], numbers: Sequence[int], dataset: Dataset | None
+) -> Choice | None:
+    """Return what chose a run's episodes, by what it states, out of all; None for all.
 
     Where the extension that chooses is gone, the episodes are those that the run has.
     """
@@ -184,7 +175,7 @@ def _choice(run: Run, record: Mapping[str, Any], dataset: Dataset) -> Choice | N
         pool = tuple(layout.episode for layout in run.layouts) or run.grid.episodes
         return Choice(run.grid.episodes, pool, record)
     selection = select.recorded(record)
-    return selection.choice(dataset.episodes, dataset) if selection else None
+    return selection.choice(numbers, dataset) if selection else None
 
 
 def _unchecked_choice(record: Mapping[str, Any]) -> Iterator[str]:
@@ -196,29 +187,27 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
     """Raise UserError if a finished run's tables are not what its answers make, computed again.
 
     For a run that work goes on from, and that anybody may have written. `spec` is its evaluation.
-    No model is asked; of a run in the simulator a few episodes are driven again.
+    No model is asked; a driven run is driven again.
     """
     looks = run.manifest.interim_looks
-    if not isinstance(spec.source, FrozenSource):
-        wrong = [*_of_card(run, spec.ego.card), *driven_otherwise(run)]
-    else:
-        evaluated = spec.stopped(looks) if looks else spec
-        stays = replace(evaluated, stopping_rule=None, guards=())
-        with TemporaryDirectory(prefix="harness-") as folder:
-            try:
-                ours, otherwise = computed(run, stays, Path(folder) / "run", lambda done: None)
-            except LacksAnswer as lack:
-                wrong = [f"answers.jsonl has no answer to {lack.question}"]
-            except Unanswered:
-                wrong = [_unanswered(run)]
-            else:
-                wrong = [
-                    *_of_manifest(run, ours, spec.ego.card, ("path", "interim_looks")),
-                    *_of_episodes(run, ours),
-                    *_of_decisions(run, ours),
-                    *_of_answers(run, ours),
-                    *_of_rule(otherwise),
-                ]
+    evaluated = spec.stopped(looks) if looks else spec
+    stays = replace(evaluated, stopping_rule=None, guards=())
+    with TemporaryDirectory(prefix="harness-") as folder:
+        try:
+            ours, otherwise = computed(run, stays, Path(folder) / "run", lambda done: None)
+        except LacksAnswer as lack:
+            wrong = [f"answers.jsonl has no answer to {lack.question}"]
+        except Unanswered:
+            wrong = [_unanswered(run)]
+        else:
+            wrong = [
+                *_of_manifest(run, spec.ego.card),
+                *_of_scenes(run, ours, ("path", "interim_looks")),
+                *_of_episodes(run, ours),
+                *_of_decisions(run, ours),
+                *_of_answers(run, ours),
+                *_of_rule(otherwise),
+            ]
     if spec.stopping_rule and looks:
         wrong += looked_otherwise(spec.stopping_rule, looks, run.grid, run.episodes)
     if wrong:
@@ -274,48 +263,24 @@ def texts_otherwise(run: Run) -> Iterator[str]:
         yield f"answers.jsonl has another {field} in {amount(wrong, 'answer')} than its texts say"
 
 
-def driven_otherwise(run: Run) -> Iterator[str]:
-    """Yield sentences on what a closed-loop run's latency and `episodes.csv` get wrong.
-
-    A few episodes are simulated again with the recorded actions. Raises UserError if the scenario
-    is not here as it was.
-    """
-    from harness.evaluate.replay import driven_again, played
-
-    yield from _of_latency(run)
-    yield from _of_agents(run)
-    yield from records_otherwise(run)
-    world = run.manifest.world
-    selected = None if select.lacking(world.selection) else select.recorded(world.selection)
-    if selected:
-        numbers = selected.choice(range(int(world.selection["of"])), None).numbers
-        if tuple(numbers) != run.grid.episodes:
-            yield "episodes.csv has other episodes than run.json says that were selected"
-    for row in spot_check(run.episodes, sha256_file(run.path / "episodes.csv"), AGAIN):
-        here = driven_again(played(run, row.episode, row.condition, row.seed))
-        for name, _ in differing([row], [here]):
-            if name in OF_ENDS and (current(run) or getattr(row, name) is not None):
-                yield (
-                    f"episodes.csv has another {name} of episode {row.episode} in "
-                    f"{printable(row.condition)}, seed {row.seed}, than its actions lead to"
-                )
-
-
-def _of_manifest(
-    run: Run, ours: Run, card: Card, besides: Collection[str] = ("path",)
-) -> Iterator[str]:
-    """Yield what run.json, with this card, says otherwise of scenes, conditions, latency and model.
-
-    `besides` are fields of its scenes that are not compared.
-    """
-    world, here = (to_builtins(each.manifest.world) for each in (run, ours))
-    for name in here.keys() - {*besides}:
-        if world.get(name) != here[name]:
-            yield f"run.json has another {name} of its scenes than the dataset"
+def _of_manifest(run: Run, card: Card) -> Iterator[str]:
+    """Yield what run.json, with this card of the ego's model, states otherwise than is here."""
     yield from _of_card(run, card)
     yield from _of_latency(run)
     yield from _of_agents(run)
     yield from records_otherwise(run)
+
+
+def _of_scenes(run: Run, ours: Run, besides: Collection[str] = ("path",)) -> Iterator[str]:
+    """Yield what run.json states of its scenes otherwise than they are.
+
+    `besides` are fields that are not compared.
+    """
+    what = "the dataset" if run.world == "frozen" else "the simulator"
+    world, here = (to_builtins(each.manifest.world) for each in (run, ours))
+    for name in here.keys() - {*besides}:
+        if world.get(name) != here[name]:
+            yield f"run.json has another {name} of its scenes than {what}"
 
 
 def _of_agents(run: Run) -> Iterator[str]:

@@ -8,17 +8,13 @@ from functools import cached_property
 from itertools import zip_longest
 
 import numpy as np
-from msgspec.structs import replace
 
 from harness.backends.registry import registration
-from harness.coordination.named_points import POINTS
 from harness.core.errors import printable
 from harness.dataset.load import Scene
-from harness.evaluate.branches import Course, Trajectory
-from harness.evaluate.live_world import ended, looks
+from harness.evaluate.live_world import looks
 from harness.runs.folder import Run
-from harness.runs.metric_names import BASELINE
-from harness.runs.records import ClosedLoop, Decision, Episode, Manifest
+from harness.runs.records import ClosedLoop, Decision, Manifest
 from harness.world import lockstep
 from harness.world.parameters import Parameters
 from harness.world.scenario import Scenario
@@ -146,20 +142,3 @@ def act(world: World, decisions: Sequence[Decision]) -> None:
 def _place(world: World, agent: str | None) -> int:
     """Return an agent's place among the vehicles; the ego's for None."""
     return [vehicle.spawn.id for vehicle in world.vehicles].index(agent) if agent else 0
-
-
-def driven_again(played: ReplayedEpisode) -> Episode:
-    """Simulate an episode with the recorded actions to its end, and return how it ended.
-
-    The record lacks what follows from decisions alone, such as numbers of messages.
-    """
-    world = World.start(played.scenario, played.layout_seed)
-    for frame, acting in actions_by_frame(played).items():
-        world.advance(frame)
-        if not world.ended:
-            act(world, acting)
-    p = played.scenario.parameters
-    world.advance(p.due_frame(p.decisions))
-    course = Course(POINTS[BASELINE], played.seed)
-    [episode] = ended(played.scenario, [Trajectory(played.episode, world, [course])])
-    return replace(episode, condition=played.condition)

@@ -106,8 +106,8 @@ def evaluate(
             or served models answer; each worker opens its own backend. Other models answer frozen
             scenes in this process. The workers together have as many requests at once at a server
             as one would.
-        opens: replaces `open_backend` for frozen scenes;
-            it may return a backend that is open already.
+        opens: replaces `open_backend`; it may return a backend that is open already. All is then
+            walked in this process.
         given: answers by request id that need not be asked for; frozen scenes only.
 
     Raises UserError if the folder holds another run or something else, or the model is not
@@ -124,10 +124,8 @@ def evaluate(
     run_start = unfinished(spec, out)
     if not run_start and spec.settings.latency == latencies.MEASURED:
         timing.refuse_busy()
-    if isinstance(spec.source, FrozenSource):
-        return _frozen(
-            spec, spec.source, out, run_start, progress, cache, more, opens, given, workers
-        )
+    if opens or isinstance(spec.source, FrozenSource):
+        return _walk_here(spec, out, run_start, progress, cache, more, opens, given, workers)
     return _driven(spec, out, run_start, progress, cache, workers)
 
 
@@ -257,9 +255,8 @@ def _walk(
     return {**files, servers.FILE: servers.lines(served)} if served else files
 
 
-def _frozen(
+def _walk_here(
     spec: Spec,
-    source: FrozenSource,
     out: Path,
     run_start: RunStart | None,
     progress: Callable[[int], None],
@@ -269,7 +266,11 @@ def _frozen(
     given: Mapping[str, Answer],
     workers: Workers,
 ) -> Evaluated:
-    made_of, chunks = sources(spec), _split(source.dataset.episodes, TREES_AT_ONCE)
+    source, made_of = spec.source, sources(spec)
+    if isinstance(source, FrozenSource):
+        chunks = _split(source.dataset.episodes, TREES_AT_ONCE)
+    else:
+        chunks = _chunks_of(spec.record())
     here = opens or given or spec.stopping_rule or len(chunks) == 1
     spread_over = 1 if here else spreadable(spec, workers)
     if in_workers := spread_over != 1:
@@ -322,7 +323,8 @@ def _frozen(
                 spec.cards, costs.metered(spec.cards, models, place, spec.guards), cache
             )
         seen, looked = _walked(spec, chunks, place, walk_all)
-        layouts = source.layouts(sum(map(len, seen)))
+        count = sum(map(len, seen))
+        layouts = source.layouts(count) if isinstance(source, FrozenSource) else ()
         return _gather(
             out, as_finished(spec, run_start, looked), seen, place, made_of, layouts=layouts
         )
