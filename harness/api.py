@@ -167,9 +167,10 @@ class Comparison:
 
     @cached_property
     def answers(self) -> "pd.DataFrame":
-        """Return a row for each answer to the same question that changed.
+        """Return a row for each answer to the same question that changed from run A to run B.
 
-        Its columns have both texts, and what the parser made of them.
+        Its columns are `request` (the question's id) and `role` (who was asked), both texts
+        (`raw_a`, `raw_b`) and what the parser made of them (`verdict_a`, `verdict_b`).
         """
         import pandas as pd
 
