@@ -127,9 +127,11 @@ class Card:
 
     An engine is the program that runs the model: transformers, llama.cpp, a server, or a rule.
     `weights` is where the model is: a directory, a GGUF file or a hub id, of which `file`,
-    `revision` and `sha256` say more; a run's folder for the engine `replay`, the model's name at a
-    server. `dtype` is the number format of its weights, `context_tokens` the most tokens of prompt
-    and answer together, `max_new_tokens` the most of an answer.
+    `revision` and `sha256` say more, and `gated` that its licence must be accepted there; a run's
+    folder for the engine `replay`, the model's name at a server. `dtype` is the number format of
+    its weights, `quantisation` that of a GGUF file, for people, and `licence` names theirs;
+    `context_tokens` is the most tokens of prompt and answer together, `max_new_tokens` the most of
+    an answer.
 
     `latency` is the declared time of an answer, and `privileged` says that the model sees behind
     the occlusion, as an upper reference. `thinking` says whether its template can open a thought,

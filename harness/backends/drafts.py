@@ -38,7 +38,7 @@ class Drafts:
     def after(self, kind: Hashable, tokens: Sequence[int], most: int) -> list[int]:
         """Return up to `most` guessed token ids after the answer so far, `tokens`; none if unknown.
 
-        `kind` tells answers of different forms apart, as in `learn`.
+        `kind` tells answers of different forms apart, such as that of the ego and of helpers.
         """
         guess: list[int] = []
         while len(guess) < min(most, MOST):

@@ -227,8 +227,10 @@ def open_backend(
 def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
     """Return the backend of the model that a card describes, opened only once in each process.
 
-    The arguments and errors are those of `open_backend`: the device, the number format and the most
-    requests computed together.
+    `card` is the model card, the content of a model's TOML file. `device` says where the model
+    runs, such as `cpu` or `cuda`, and `dtype` is the number format of its weights; None lets the
+    engine or the card choose. `batch_size` is the most requests computed together. Raises UserError
+    if the model cannot be opened, or an option is not allowed.
     """
     return _opened_in(os.getpid(), card, device, dtype, batch_size)
 

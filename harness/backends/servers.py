@@ -69,8 +69,11 @@ class Fields:
     """Say how a server is sent request fields that some servers refuse or call by other names.
 
     Each is true (sent as it is), false (left out), or the name under which it is sent, as in
-    `max_tokens = "max_completion_tokens"`. No other field can be changed. Raises ValueError for a
-    name that another field has.
+    `max_tokens = "max_completion_tokens"`. These are the most tokens of an answer, and how its
+    tokens are drawn: `temperature`, the `seed` of the answer among several to one question, and
+    `top_p`, `top_k`, `min_p`, `repetition_penalty` and `repeat_penalty`, which are sent with the
+    values that change nothing. No other field can be changed. Raises ValueError for a name that
+    another field has.
     """
 
     max_tokens: _Sent = True  # most tokens of the answer

@@ -42,7 +42,8 @@ class ServerKind:
         """Return a model's chat template, empty if unknown, and how the model thinks.
 
         That is `switch` if a request can turn it on and off, `none` else or if unknown. `model` is
-        the model's name there; `ask` requests a path of the server, as in `states`.
+        the model's name there. `ask` requests a path of the server, given the path beside `/v1` and
+        JSON to post (None for a GET), and returns its reply.
         """
         return "", "none"
 

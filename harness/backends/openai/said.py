@@ -58,7 +58,7 @@ def _text(part: Mapping[str, Any], kind: str) -> str:
 def thought(message: Mapping[str, Any]) -> str | None:
     """Return the thought that a server took out of an answer; None if it has no such field.
 
-    `message` is the message of its reply, as `in_texts` returns it.
+    `message` is the chat message of its reply, a dict whose `content` is one text (`in_texts`).
     """
     values = [message.get(name) for name in THOUGHTS]
     texts = [value for value in values if isinstance(value, str)]
@@ -69,7 +69,8 @@ def thought(message: Mapping[str, Any]) -> str | None:
 def refusal(message: Mapping[str, Any]) -> str | None:
     """Return the words in which a model refuses to answer; None if it does not.
 
-    `message` is the message of the server's reply, as `in_texts` returns it.
+    `message` is the chat message of the server's reply, a dict whose `content` is one text
+    (`in_texts`).
     """
     words = message.get(REFUSAL)
     return words if isinstance(words, str) and words.strip() else None
