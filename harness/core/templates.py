@@ -338,7 +338,8 @@ class _Namespace(Namespace):
 class Code(CodeGenerator):
     """Generate Python code of a Jinja template which counts the steps that it takes.
 
-    What it reads, joins and repeats is charged to the rendering's budget of steps.
+    What it reads, joins and repeats is charged to the rendering's budget of steps. `environment` is
+    the sandbox that the template is compiled in, which Jinja sets.
     """
 
     environment: "Sandbox"  # the environment that compiles the template
