@@ -28,8 +28,10 @@ from harness.runs.stopping import STOPPING_RULES, InterimLooks
 class RunStart(work.WorkStart, frozen=True, kw_only=True):
     """Hold what a run begins with, kept in its working folder so that it resumes alike.
 
-    `identity` is all that decides the models' answers, `latency` how long these take, `versions`
-    those of packages and code, and `command` the words of the command that repeats the run.
+    `created` is when it began, UTC in ISO 8601; `command` has the words of the command that repeats
+    it, and `tags` the user's words by which to find it. `identity` is all that decides the models'
+    answers, as plain values by name; `latency` says how long these take, and `versions` has those
+    of packages and code by name.
     """
 
     created: str  # when the run began, UTC, ISO 8601
@@ -61,7 +63,11 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Hold a finished run: its folder, its manifest and its scores."""
+    """Hold a finished run: its folder `out`, its manifest and its scores.
+
+    `manifest` is the content of its `run.json`: settings and origin. `scores` are the lines of its
+    `summary.csv`, one for each metric and condition (named set of settings that is scored).
+    """
 
     out: Path  # the run's folder
     manifest: Manifest  # its settings and origin, the content of `run.json`

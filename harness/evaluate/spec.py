@@ -119,9 +119,10 @@ class Spec:
     It holds opened what `settings`, those typed, name: `ego` and `helpers` are models with their
     prompts, the latter empty if the ego's answers for helpers, `source` has the scenes, and
     `points` are the conditions, each a named set of settings of channel, asking and fusion. `seeds`
-    are of the channel's random numbers. `timer` and `stopping_rule` time answers and end the run
-    early, None without; `guards` may refuse to ask. Raises UserError for what is not allowed, or
-    does not go together.
+    are of the channel's random numbers. `timer` times each answer by itself, and `stopping_rule`
+    may end the run early, None without; `interim_looks` says when a run that it ended was looked
+    at. `guards` may refuse to ask. Raises UserError for what is not allowed, or does not go
+    together.
     """
 
     ego: Agent  # the agent that answers for the ego: a model, its prompt and how it is asked

@@ -44,7 +44,11 @@ class Due:
     """Hold the n decisions to be made now under one condition, in all episodes and seeds.
 
     A condition is the settings of radio, asking and fusion; each episode is played under it once
-    for each seed of the channel's random draws.
+    for each seed of the channel's random draws. Of each decision, `at` (n,) is the index of its
+    point, such as a scene, among those that `World.observe` returned last; `episode` (n,) is its
+    episode's number and `seed` (n,) that of the channel. `draws` has the channel's random numbers
+    for its H helpers. `senders` (n, H) is the index among these n of the decision that a helper,
+    which here decides for itself, makes now, -1 for none; it is None where messages hold no plans.
     """
 
     # index of each decision's point, such as its scene, among those that `World.observe` returned
@@ -70,7 +74,11 @@ class Due:
 class Decided(Generic[DecisionPoint]):
     """Hold the n decisions that were made at one step under one condition.
 
-    A step is one round of decisions in all episodes.
+    A step is one round of decisions in all episodes, and a condition, `point`, the settings of
+    radio, asking and fusion. `decision_points` are the situations to decide in, scenes as a rule.
+    `due` says which decision is about which of them, in which episode and with which seed; `result`
+    has what was decided, such as the index of each action, (n,), and `said` the probabilities of
+    actions that vehicles sent over the channel, attackers' lies included.
     """
 
     point: OperatingPoint  # the condition
@@ -182,8 +190,9 @@ class SceneWorld:
 class Fuses(Protocol):
     """Describe the ego's answers when its model is asked again with the messages that it heard.
 
-    It has the answers at some decision points to each set of messages that was stated beforehand
-    (`Ask.fusion_call`); a call picks those of n decisions.
+    It is a function that has the answers at some decision points to each set of messages that was
+    stated beforehand (`Ask.fusion_call`). It takes the indices of n decisions' points, (n,), and
+    who attacks, and returns a function of who was heard, (n, H).
     """
 
     def __call__(self, decision_points: Ints, attackers: Bools | None = None, /) -> FusionCall:
@@ -229,10 +238,13 @@ class Ask(Protocol[AskedPoint]):
     def fusion_call(
         self, points: Sequence[AskedPoint], /, codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return what egos answer if they are asked once more, with each of K sets of messages.
+        """Return the ego's answers to being asked once more with K sets of messages, as a function.
 
         `codes`, `(K,)`, has for each set an integer that says at which of `points` who was heard
-        (`harness.evaluate.fusion.codes_of`); `rewrites` says how the messages are shown.
+        (`harness.evaluate.fusion.codes_of`); `rewrites` says how the messages are shown. The
+        function takes the indices of n decisions' points, `(n,)`, and who attacks, `(n, H)` or
+        None, and returns one of who of H helpers was heard, `(n, H)`. This returns the ego's
+        probabilities of A actions, `(n, A)`, and the seconds of each answer, `(n,)`.
         """
         ...
 
@@ -243,7 +255,9 @@ class Ask(Protocol[AskedPoint]):
 
         An agent is a vehicle that decides for itself. `at`, `(n,)`, has the index in `points` of
         each one's own; `intents`, `(n, ...)`, has the plans, what vehicles state of their motion.
-        The function takes who was heard, `(n, H)`.
+        The function takes who of H others was heard, `(n, H)`, and returns each agent's
+        probabilities of A actions, `(n, A)`, and the seconds of each answer, `(n,)`, NaN for who
+        heard nobody.
         """
         ...
 
