@@ -51,13 +51,15 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Describe an edition: a release of the benchmark that never changes.
 
-    It has all that a score depends on, beside the model: `datasets` and `prompts` by name with
-    their hex SHA-256; `condition`, the names of the operating points that are scored (settings of
-    the radio, of whom the ego asks and so on), one of them `ranked_by`; `seeds` of the channel's
-    draws, `latency` and `ties` as the options of `harness eval` of these names take them; and
-    `metrics`, the names of the figures that a file of results states. `gains` is how intervals of
-    gains are made: of all layouts together (`paired episodes`), or of those with a danger and
-    without apart. `golden` is None in a project's own edition that pins no figures.
+    It has all that a score depends on, beside the model. `name` is that of its file, `digest` the
+    hex SHA-256 of what the file states, and `description` its purpose. `datasets` and `prompts` are
+    by name with their hex SHA-256; `condition` has the names of the operating points that are
+    scored (settings of the radio, of whom the ego asks and so on), one of them `ranked_by`. `seeds`
+    of the channel's draws, `latency` of an answer and `ties` of actions are as the options of
+    `harness eval` of these names take them. `metrics` are the names of the figures that a file of
+    results states. `gains` is how intervals of gains are made: of all layouts (start situations)
+    together (`paired episodes`), or of those with a danger and without apart. `golden` is None in a
+    project's own edition that pins no figures. `sealed` is read by nothing.
     """
 
     name: str  # name of its file, without .toml
