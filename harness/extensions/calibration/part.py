@@ -20,7 +20,9 @@ class Calibrated(Part, frozen=True, kw_only=True):
 
     It is the name of a file of `calibrations/`, fitted for the run's model, prompt and scenario;
     empty corrects nothing. Methods are the hooks of `Part`, a group of settings of an operating
-    point, which is all that a decision depends on besides scene and model.
+    point, which is all that a decision depends on besides scene and model. `behind` is the setting
+    after which it stands in records, `of_ego` says that it matters to an ego that asks nobody, and
+    `named` has what returns the names that there are.
     """
 
     behind: ClassVar[str] = "content"
