@@ -32,10 +32,11 @@ class Answers(Struct, frozen=True):
 
     The role is the ego or a helper. Of `n` questions, `readable` answers say what to do, `strict`
     ones need no repair, and `distinct` ones differ in their text. `action` is the commonest
-    likeliest action, None without a readable answer, in `action_count` of them. Then come numbers
-    of answers with a fault: copies of an example or a placeholder of the prompt, numbers that do
-    not sum to 1, an end at the limit of tokens. `faults` counts, by the parser's status, why
-    answers cannot be read. `sample` is the commonest text.
+    likeliest action, None without a readable answer, in `action_count` of them. `example_copies`
+    and `placeholder_copies` count answers that copy an example or a placeholder of the prompt,
+    `bad_sums` those whose numbers do not sum to 1, and `at_limit` those that end at the limit of
+    tokens. `faults` counts, by the parser's status, why answers cannot be read. `sample` is the
+    commonest text.
     """
 
     role: Role  # the role
