@@ -246,10 +246,13 @@ class Result:
         return dict(zip(places, corrected(p_values), strict=True))
 
     def p(self, setting: Setting, content: str) -> float | None:
-        """Return the p-value of no difference in success between a content of messages and intents.
+        """Return the p-value of the success with a content of messages being that with intents.
 
-        `setting` is the grid point, and `content` what messages hold, such as `objects`. It is
-        corrected by Holm's method over all contents and grid points of the model; None for intents.
+        `setting` is the grid point, an operating point with a number of vehicles, and `content`
+        what messages hold there, such as `objects`. Both successes are at this point, over the same
+        episodes. The p-value is corrected by Holm's method over all contents and grid points of the
+        model; it is None for intents themselves (a vehicle's probabilities of actions), and where
+        no interval is known.
         """
         return self._p.get(place(setting, content))
 
