@@ -52,7 +52,9 @@ class Controlled(Part, frozen=True, kw_only=True):
     An operating point is the settings of radio, asking and fusion. `own` takes those of its
     helpers. `shuffled`, messages of helpers in another start situation, and `blind`, those of
     helpers that are shown nothing, are controls: a gain that remains under them does not come from
-    what helpers see. Methods are the hooks of `Part`, a group of such settings.
+    what helpers see. Methods are the hooks of `Part`, a group of such settings. `behind` is the
+    setting after which it stands in records, `questions` has what helpers may be asked by it, and
+    `controls` says by the value what the ego hears.
     """
 
     behind: ClassVar[str] = "on_demand"
