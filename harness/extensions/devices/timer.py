@@ -44,7 +44,9 @@ class Computer(Timer):
     It is the timer that the option `--device-profile` chooses. `device` states how many tokens a
     second the computer reads and writes with a model, and how many joules a token takes; it is None
     where none is chosen. `model` names the one whose speed holds for all answers; if empty, that of
-    the model which gave the answer does.
+    the model which gave the answer does. `adds` has the columns of energy that it adds to the table
+    of decisions, each with the one behind which it stands; `how` says in words where times come
+    from.
     """
 
     option: ClassVar[str] = "--device-profile"
