@@ -58,7 +58,8 @@ class Until(StoppingRule):
     That is a 95 % interval no wider than `width`, a share, or a difference to the success of the
     run `against`, in `folder`, whose interval excludes 0; one of both is None. Layouts (start
     situations with one episode each) come in a fixed order, and the intervals are valid though one
-    looks at them several times. Methods are those of `StoppingRule`.
+    looks at them several times. It is a `StoppingRule`: `chosen_by` names the settings that choose
+    it, and `interval` says what its intervals are.
     """
 
     chosen_by: ClassVar[tuple[str, ...]] = (WIDTH, DECIDED)
