@@ -31,7 +31,8 @@ class Parameters(Common):
     """Hold the parameters of an environment of highway-env as a scenario.
 
     Raises UserError if `decisions` (of an episode) or `helpers` (the vehicles that the ego can ask)
-    is not from 1 to 9.
+    is not from 1 to 9. `braking_mps2` and `acceleration_mps2` are the hardest that the ego can do,
+    m/s^2, as far as the harness assumes.
     """
 
     braking_mps2: float = 20.0  # hardest braking, m/s^2; highway-env's own controller has no limit
