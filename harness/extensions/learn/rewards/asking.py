@@ -194,8 +194,12 @@ def expected_advantage(
 
     The advantage is the mean probability of success under the distribution, less that of one action
     that is always taken. It differs between answers with the same likeliest action, so that few
-    samples teach more; but an answer that is unsure and right earns less than one that is sure. The
-    arguments are those of `advantage`: texts, and columns of `rows`.
+    samples teach more; but an answer that is unsure and right earns less than one that is sure.
+
+    `completions` are the model's answers, as texts or chats; one that cannot be parsed states
+    success 0. Of each row, `values` has the probability of success after every action, (A,), and
+    `constant` the index of the action that is always taken; these and `columns` are columns of
+    `rows`. `prompts` are not read.
     """
     return _rewards(expected_success, completions, values, constant, columns)
 

@@ -28,10 +28,11 @@ class Question:
     """Hold one prompt for one viewer of a scene, and the answer (soft label) that it should get.
 
     A viewer is the vehicle that is asked: the ego, or a helper. `key` identifies the question (see
-    `key`), `graph` is what the viewer knows, `messages` the chat, and `label` (A,) the
-    probabilities that the answer should give to A actions. `weight` is relative to other
-    questions'. `heard` has helpers' messages that the prompt shows, `image` its picture, and
-    `excerpt` the part of the graph that it shows, if not all.
+    `key`), `scenario` and `prompt` are the scene's scenario and the prompt version, `graph` is what
+    the viewer knows, `messages` the chat, and `label` (A,) the probabilities that the answer should
+    give to A actions. `weight` is relative to other questions'. `heard` has helpers' messages that
+    the prompt shows, `image` its picture, and `excerpt` the part of the graph that it shows, if not
+    all.
     """
 
     # scenario, scene, viewer and prompt version, and `+m` where helpers' messages are in it

@@ -400,6 +400,9 @@ def _padded(rows: Sequence[NDArray[np.int32]]) -> Any:
 
 
 def save(state: Mapping[str, Any], path: Path) -> None:
-    """Write a training checkpoint to a file, whole or not at all."""
+    """Write a training checkpoint to the file `path`, whole or not at all.
+
+    `state` is what a resumed training needs, by name: anything that PyTorch's `save` can write.
+    """
     with replacing(path) as part:
         torch.save(state, part)
