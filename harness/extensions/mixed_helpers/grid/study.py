@@ -106,8 +106,8 @@ class Cell:
     def estimate(self, metric: str, condition: str) -> Estimate:
         """Return a metric's mean under a condition, with its 95 % interval over episodes.
 
-        `metric` is its name as in `values`, and `condition` the name of an operating point of the
-        run.
+        `metric` names success, latency (ms) or tokens, a key of `values`, and `condition` is the
+        name of an operating point of the run.
         """
         return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
 
