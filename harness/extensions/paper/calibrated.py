@@ -51,11 +51,14 @@ TIES = "first"  # no two actions that these intents lead to are alike
 class Parameters:
     """Hold the parameters of the calibrated proxy, which draws intents in place of a model.
 
-    An intent is a vehicle's probabilities of the ego's actions. `..._share` is the share of
-    episodes whose danger the first or second helper sees; `guess_right` and `know_right` are shares
-    of episodes in which an ego that does not see the danger, or does, intends rightly; `..._nats`
-    are entropies of intents, and `inference_s` is the seconds of one inference. All are computed by
-    `fit.py` from numbers of the paper; none depends on what the paper's study varies.
+    An intent is a vehicle's probabilities of the ego's actions. `left_share` and `right_share` are
+    the shares of episodes whose danger the first or second helper sees, the rest the third;
+    `guess_right` and `know_right` are shares of episodes in which an ego that does not see the
+    danger, or does, intends rightly. Entropies of intents, in nats, have a mean and a standard
+    deviation: `ego_nats` and `ego_sd_nats` of the ego, `others_nats` and `others_sd_nats` of
+    helpers that see no danger; `witness_nats` is that of the helper that sees it. `inference_s` is
+    the seconds of one inference. All are computed by `fit.py` from numbers of the paper; none
+    depends on what the paper's study varies.
     """
 
     # share of episodes whose danger comes from the approach that the nearest helper watches
@@ -176,9 +179,10 @@ class CalibratedWorld:
         return replace(self._now.intents, own=ego_intents)
 
     def others(self, *_: Any, **__: Any) -> Any:
-        """Raise NotImplementedError: all intents are drawn, so no model can be asked.
+        """Raise NotImplementedError, as no model can be asked here: all intents are drawn.
 
-        An intent is a vehicle's probabilities of actions.
+        It stands in for the methods of a world by which models would be asked, whatever their
+        arguments. An intent is a vehicle's probabilities of actions.
         """
         raise NotImplementedError
 
@@ -192,7 +196,11 @@ class CalibratedWorld:
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
     def outlook(self, *_: Any) -> None:
-        """Return None: vehicles of this study have no positions, see nothing and claim nothing."""
+        """Return None: vehicles of this study have no positions, see nothing and claim nothing.
+
+        It stands in for the methods of a world by which positions and sights are asked for,
+        whatever their arguments.
+        """
 
     site = claims = plans = listed = outlook
 
