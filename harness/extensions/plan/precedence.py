@@ -26,6 +26,7 @@ class Precedence:
     helpers, `(..., 1+H)`, from their plans. Two are near if they reach the conflict (where paths
     meet) less than `apart_s` seconds apart. An agent that itself plans action 0, stands, or has
     passed the conflict makes nobody wait. Equal ranks go by the vehicles' numbers in the world.
+    `needs` says that it reads plans, `by_distance` that distances weigh nothing.
     """
 
     # returns the rank of the agent and of its H helpers, `(..., 1+H)`; the lowest goes first
