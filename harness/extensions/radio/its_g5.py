@@ -75,11 +75,14 @@ class Hazards(NamedTuple):
 class ItsG5(Transceiver):
     """Model 802.11p (ITS-G5) under background traffic of packets of one size and rate.
 
-    Background traffic is other vehicles' packets. Vehicles listen before they send, and wait a
-    random number of slots (the back-off, up to `contention_window`) once the medium has been idle
-    for `aifs_slots`. It is the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022). Fields
-    are its settings, with those of `Transceiver` and `Propagation`: `sensing_dbm` is the least
-    power at which a packet is sensed, and `curve` names the loss of frames by their SINR
+    Background traffic is the packets of other vehicles, `density_per_km` on a kilometre of road, of
+    `packet_bytes` each; layers below add `header_bytes` to a packet, and all are sent at
+    `data_rate_mbps` (Mb/s). Vehicles listen before they send, and wait a random number of slots
+    (the back-off, up to `contention_window`) once the medium has been idle for `aifs_slots`. It is
+    the analytical model of Sepulcre et al. (IEEE TVT 71(1), 2022). Fields are its settings, with
+    those of `Transceiver` and `Propagation`: `frequency_ghz` is the carrier's, `antenna_m` every
+    antenna's height, less `environment_height_m` for its effect; `sensing_dbm` is the least power
+    at which a packet is sensed, and `curve` names the loss of frames by their signal-to-noise ratio
     (`block_error`).
     """
 

@@ -46,9 +46,11 @@ class NrMode2(Sidelink):
 
     A resource is one or more sub-channels, each `subchannel_blocks` resource blocks (of frequency)
     wide, in one slot: what one packet takes. Fields are settings, with those of `Sidelink`,
-    `Transceiver` and `Propagation`. A packet may be sent from slot `t1_slots` to `t2_slots` after
-    it is ready; `numerology` 0, 1 or 2 has slots of 1, 0.5 or 0.25 ms, `mcs` is the modulation and
-    coding, and `efficiency` the share of Shannon's bound that codings without a curve reach.
+    `Transceiver` and `Propagation`: `environment` names the law of path loss, and the channel has
+    `bandwidth_mhz` around the carrier `frequency_ghz`. Other vehicles' packets have `packet_bytes`.
+    A packet may be sent from slot `t1_slots` to `t2_slots` after it is ready; `numerology` 0, 1 or
+    2 has slots of 1, 0.5 or 0.25 ms, `mcs` is the modulation and coding, and `efficiency` the share
+    of Shannon's bound that codings without a curve reach.
     """
 
     # law of links without a building between; see `Propagation`

@@ -29,9 +29,10 @@ class Propagation:
 
     Blockage is the further loss behind a vehicle, and shadowing the slow change of power by what
     stands around. Fields are settings of a radio: `environment` names the laws of path loss,
-    `antenna_m` is the height of every antenna, `environment_height_m` what is taken off it, and
-    `blocker_m` the height of a blocking vehicle. Round a corner, `street_m` is the width of the
-    receiver's street, `wall_m` the sender's distance from its wall, and `suburban` a further loss.
+    `frequency_ghz` is the carrier's, `antenna_m` the height of every antenna,
+    `environment_height_m` what is taken off it, and `blocker_m` the height of a blocking vehicle.
+    Round a corner, `street_m` is the width of the receiver's street, `wall_m` the sender's distance
+    from its wall, and `suburban` a further loss.
     """
 
     # law of links without a building between, with its LOS probabilities and decorrelation

@@ -42,10 +42,10 @@ class Sidelink(Transceiver):
 
     Vehicles divide the channel into slots of time and sub-channels of frequency. A resource is what
     one packet takes, a block is what is sent in it, and each vehicle chooses its resources itself.
-    Fields, and those of `Transceiver`, are settings of both: `keep` is the probability that a
-    vehicle keeps its resource, `transmissions` how often it sends each block, and `t1_slots` to
-    `t2_slots` the slots after a message is ready in which it may be sent. `ranks` says that free
-    resources are ranked by received power.
+    Fields, and those of `Transceiver`, are settings of both: other vehicles send `rate_hz` packets
+    a second each, `keep` is the probability that a vehicle keeps its resource, `transmissions` how
+    often it sends each block, and `t1_slots` to `t2_slots` the slots after a message is ready in
+    which it may be sent. `ranks` says that free resources are ranked by received power.
     """
 
     rate_hz: Annotated[float, between(0.1, 1000)] = 10.0  # packets that each vehicle sends a second

@@ -23,9 +23,10 @@ class Transceiver(Propagation, Physical):
     """Model the radio of all vehicles under background traffic of one packet size and rate.
 
     Background traffic is other vehicles' packets, which compete for the channel with the messages
-    of the ego and its helpers: `density_per_km` vehicles send `rate_hz` packets a second each.
-    Fields, and those of `Propagation`, are settings of a radio; `sensing_dbm` is the least power at
-    which a packet is received or sensed.
+    of the ego and its helpers: `density_per_km` vehicles on a kilometre of road send `rate_hz`
+    packets a second each. Fields, and those of `Propagation`, are settings of a radio: every
+    vehicle sends with `power_dbm`, an antenna has the gain `gain_dbi`, and receivers
+    `noise_figure_db`; `sensing_dbm` is the least power at which a packet is received or sensed.
     """
 
     # background vehicles on one kilometre of road, all lanes and both directions together
