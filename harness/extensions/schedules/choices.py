@@ -111,8 +111,9 @@ class Choices:
         """Return success, (S, E), and costs, (S, E, C), of every episode under the rule `choose`.
 
         The axes are S channel seeds, E episodes and C costs (`COSTS`). Success is 1 or 0. `choose`
-        is called for each step, the last first, as in `backwards`, and returns the index of the set
-        of helpers to ask in each decision.
+        is called for each step, the last first, with its N decision points, and the success, (S, N,
+        K), and costs, (S, N, K, C), to which each of K sets of helpers leads; it returns the index
+        of the set to ask, (S, N).
         """
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
@@ -147,11 +148,14 @@ class Choices:
         return places
 
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
-        """Return the rule that asks the helpers whom an operating point's schedule asks.
+        """Return the rule by which an operating point's schedule chooses whom to ask, a function.
 
         A schedule says what asking each helper is worth, and the operating point above which worth,
         and how many at most, the ego asks. `worths` is what the method `worths` returned for the
-        point; without it the worth is computed. The rule is a function as `backwards` takes it.
+        point; without it the worth is computed. The function takes a level (the decision points of
+        one step), and the success, (S, N, K), and costs, (S, N, K, C), to which each of K sets of
+        helpers leads, by S channel seeds, N decision points and C costs; it returns the index of
+        the set to ask, (S, N).
         """
         lookup = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 

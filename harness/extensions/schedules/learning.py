@@ -64,8 +64,9 @@ def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats,
     A gain is success if one helper alone is asked, less success if nobody is, -1 to 1, averaged
     over the seeds of the channel. Each of the n rows is a helper that may be asked at a decision
     point of `tree`, with the F inputs of a learnt schedule (`learnt.INPUTS`), under the operating
-    point `point`. `choose` is the rule for whom the ego asks in the rest of the episode, a function
-    as `Choices.backwards` takes it.
+    point `point`. `choose` is the rule for whom the ego asks in the rest of the episode: a function
+    that takes the decision points of a step, and the success and costs to which each set of helpers
+    leads, and returns the index of the set to ask in each.
     """
     alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
@@ -144,9 +145,10 @@ def learn(
 def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
     """Return the rule that asks the helpers whose predicted gain in success is above `threshold`.
 
-    It is for the decision points of `tree`, a function as `Choices.backwards` takes it, which
-    returns the index of the asked set in each decision. It asks as many helpers as the operating
-    point allows.
+    It is for the decision points of `tree`, and asks as many helpers as the operating point `point`
+    allows; `network` predicts the gain of each helper alone. The rule is a function that takes the
+    N decision points of a step, and what each of K sets of helpers leads to, which it does not
+    read, and returns the index of the set to ask, (S, N), for S channel seeds.
     """
     schedule = Learnt(network, threshold)
     worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in tree.levels]

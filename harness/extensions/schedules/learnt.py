@@ -63,7 +63,9 @@ class Learnt:
     """Decide whom the ego asks by the gain in success that a network expects of each helper alone.
 
     A helper is asked if its gain is above `threshold`, or above the threshold of the condition (the
-    operating point), if that has one. It is a schedule, a rule for whom to ask.
+    operating point), if that has one. It is a schedule, a rule for whom to ask. `needs` names what
+    it reads beside intents and positions: `outlook`, what each vehicle sees of where a danger may
+    come from.
     """
 
     network: Network  # from `inputs` to the gain in success probability

@@ -191,11 +191,12 @@ class Chosen:
 class Compared:
     """Hold all schedules that were compared on one run, with the outcome of every setting.
 
-    A schedule is a rule for whom to ask. All played the same episodes with the same draws of the
-    channel, at the operating point `point`. `plays` has the outcomes by schedule, and `tune` the
-    same on tune layouts, start situations on which settings are chosen; `oracle` is the outcome of
-    an ego that knows how each episode ends. `budget` is the share of the messages of the paper's
-    schedule that a chosen setting may take.
+    A schedule is a rule for whom to ask. `name` says which model, prompt and answer mode, and
+    `names` are the schedules'. All played the same episodes with the same draws of the channel, at
+    the operating point `point`. `plays` has the outcomes by schedule, one for each setting, and
+    `tune` the same on tune layouts, start situations on which settings are chosen; `oracle` is the
+    outcome of an ego that knows how each episode ends. `budget` is the share of the messages of the
+    paper's schedule that a chosen setting may take.
     """
 
     name: str  # the run's model, prompt and answer mode
