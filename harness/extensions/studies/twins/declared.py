@@ -335,7 +335,7 @@ def paraphrased(spec: Spec, request: Request) -> Request:
 
 @cache
 def paraphrases() -> dict[str, str]:
-    """Return the paraphrase of each sentence in `paraphrases.toml`."""
+    """Return the paraphrases in `paraphrases.toml`: a sentence of equal meaning, by sentence."""
     text = text_of(Path(__file__).parent / "paraphrases.toml", "settings")
     return {str(sentence): str(paraphrase) for sentence, paraphrase in tomllib.loads(text).items()}
 

@@ -158,9 +158,11 @@ def mapping(
 ) -> dict[str, Any]:
     """Return the result of a study of twins as plain values, with null for unknown numbers.
 
-    The arguments are those of `twins_study`, and a twin is a question put another way. Its `rows`
+    A twin is a question put another way. `questions` says what was asked, `rows` have the results
+    by twin and role (who was asked), `verdicts` those of the gates that the user set with
+    `--fail-if`, and `unanswered` says in words which questions got no answer. In the dict `rows`
     have each twin and role with the three metrics, `left_out` the twins that no question has, and
-    `gates` the verdicts on what the user typed with `--fail-if`.
+    `gates` the verdicts.
     """
     table, gates = list[dict[str, Any]](), list[dict[str, Any]]()
     for row in rows:
