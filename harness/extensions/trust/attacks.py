@@ -425,7 +425,10 @@ class Ghost(_OfObjects):
     adds: ClassVar[bool] = True
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the scene graph, what the attacker knows, with the `invented` car added."""
+        """Return the scene graph with the `invented` car, which does not exist, among its objects.
+
+        `graph` is what the attacker knows of the scene. The car is in the attacker's frame.
+        """
         return structs.replace(graph, nodes=(*graph.nodes, invented))
 
 
@@ -437,7 +440,11 @@ class Hide(_OfObjects):
     """
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the scene graph, what the attacker knows, without objects and all in sight."""
+        """Return a scene graph without objects, in which every sector is in sight.
+
+        `graph` is what the attacker knows of the scene, which else stays; a sector is a region from
+        which a danger may come. `invented`, a car that does not exist, is not used.
+        """
         return structs.replace(graph, nodes=(), sectors=graph.all_in_sight)
 
 
@@ -451,7 +458,11 @@ class Shift(_OfObjects):
     offset_m: Annotated[float, Meta(ge=-1000, le=1000)] = 6.0  # distance to the left, m
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
-        """Return the scene graph, what the attacker knows, with every object moved to the left."""
+        """Return the scene graph with every object moved to the left by `offset_m` metres.
+
+        `graph` is what the attacker knows of the scene. `invented`, a car that does not exist, is
+        not used.
+        """
         moved = tuple(
             structs.replace(n, left_m=round(n.left_m + self.offset_m, 1)) for n in graph.nodes
         )

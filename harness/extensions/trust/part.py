@@ -62,7 +62,9 @@ class Guard(Part, frozen=True, kw_only=True):
     A condition is an operating point, of which this is a part. `attack` names helpers' lies and
     failures, such as `liar:share=1/3+spoof`. `defence` names defences of a fusion call, in which
     the ego's model reads the helpers' messages, joined by `+`: `quoted`, `schema` or `majority`.
-    Empty is none. `behind` is the setting after which both stand in records.
+    Empty is none. `behind` is the setting after which both stand in records, `named` has what
+    returns the names that there are, and `usual` the values that a sweep takes if none are given,
+    joined by commas.
     """
 
     behind: ClassVar[str] = "fallback"

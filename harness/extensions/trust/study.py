@@ -224,11 +224,12 @@ def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
 class Bench:
     """Hold a study of trust: a cell for every consensus rule, attack and share of attackers.
 
-    A consensus rule is how the ego fuses messages. The linear pool, the weighted mean of intents
-    (probabilities of actions), is the paper's rule, with which others are compared. `name` and
-    `source` are those of the run that is played again and of its dataset, `condition` is the
-    operating point that is attacked, and `alone` (S, E) is success, 1 or 0, of an ego that never
-    asks, for S channel seeds and E episodes. `success_rule` says how success is averaged, and
+    A consensus rule is how the ego fuses messages; `cells` has the result by rule, attack and
+    share. The linear pool, the weighted mean of intents (probabilities of actions), is the paper's
+    rule, with which others are compared. `name` and `source` are those of the run that is played
+    again and of its dataset, `condition` is the operating point that is attacked, `seeds` are the S
+    channel seeds, and `alone` (S, E) is success, 1 or 0, of an ego that never asks, for E episodes.
+    `success_rule` says how success is averaged, `caveats` what a reader must know first, and
     `unfused` why rules change nothing, if so.
     """
 
