@@ -164,9 +164,11 @@ def flipped(run: Run) -> Iterator[str]:
 
 
 def lost_messages(run: Run) -> Iterator[str]:
-    """Yield the engine's errors if helpers' answers are missing but count as lost messages.
+    """Yield a sentence with the engine's errors, if they left helpers without an answer.
 
-    The engine is what runs the model.
+    The engine is what runs the model. Such a helper counts as one whose message was lost on the
+    radio, so the run stays valid; it yields nothing where so many answers are missing that it is
+    not.
     """
     if (tallied := tally(run)).words and not tallied.missing:
         yield f"{tallied}: each counts as a lost message."

@@ -139,10 +139,12 @@ def prompts_of(run: Run) -> Sent | None:
 class Details:
     """Collect what the page shows of single scenes: the world, answers, decisions and outcomes.
 
-    A scene is one decision point. `replayed` has closed-loop scenes by id that could be simulated
-    again, `framed` the ids of scenes shown with camera pictures. `prompts` takes a run and returns
-    a function that renders its prompts again, `full` adds those that a rule did not read.
-    `left_out` has for each run how answers change without one object or message.
+    A scene is one decision point, and `runs` are those that the page shows. `replayed` has
+    closed-loop scenes by id that could be simulated again, `framed` the ids of scenes shown with
+    camera pictures. `prompts` takes a run and returns a function that makes its prompts again: of a
+    scene, a viewer's id and the messages heard it returns the chat messages; it is None where they
+    are unknown. `full` adds prompts that a rule did not read. `left_out` has for each run, by
+    scene, how answers change without one object or message.
     """
 
     runs: Runs  # the runs

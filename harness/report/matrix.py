@@ -86,9 +86,9 @@ class Line:
 class Grid:
     """Hold success under one condition as a table, prompts across and models down.
 
-    A condition is a named set of settings of channel, asking and fusion. `prompts` are the heads of
-    the columns. A row is a model's name and, for each prompt, the results of the runs with both:
-    several if it was run again.
+    `condition` is the condition's name, a named set of settings of channel, asking and fusion.
+    `prompts` are the heads of the columns. Each of `rows` is a model's name and, for each prompt,
+    the results of the runs with both: several if it was run again.
     """
 
     condition: str  # the condition's name

@@ -257,9 +257,10 @@ def reliability(run: Run) -> Table:
     """Return a reliability diagram's rows: for each condition and bin of the policy's confidence.
 
     The policy is the distribution over actions from which the ego acts, its confidence the greatest
-    probability. A row says how often the likeliest action was the only optimal one. Conditions with
-    fewer than `LEAST` decisions that have exactly one optimal action are left out. A condition is a
-    named set of settings of channel, asking and fusion.
+    probability. A row says how often the likeliest action was the only optimal one: `condition`,
+    `certainty` (the bin's mean confidence), `share`, its interval's ends `low` and `high`, and `n`.
+    Conditions with fewer than `LEAST` decisions that have exactly one optimal action are left out.
+    A condition is a named set of settings of channel, asking and fusion.
     """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
@@ -287,8 +288,9 @@ def errors(run: Run) -> Table:
     """Return the share of unsafe decisions by condition and bin of the ego's entropy, in nats.
 
     The entropy says how unsure the ego's own answer is. After an unsafe decision success is no
-    longer possible, though it was. Keys are `condition`, `entropy_nats`, `share`, its interval's
-    ends and `n`. A condition is a named set of settings of channel, asking and fusion.
+    longer possible, though it was. Keys of a row are `condition`, `entropy_nats` (the bin's mean),
+    `share`, its interval's ends `low` and `high`, and `n`. A condition is a named set of settings
+    of channel, asking and fusion.
     """
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
@@ -321,7 +323,8 @@ def _shares(
 def entropies(run: Run) -> Table:
     """Return a histogram of the entropy of the ego's own answers, in nats; empty if none parsed.
 
-    The entropy says how unsure an answer is: 0 is sure. A row is a bin, with its start and `count`.
+    The entropy says how unsure an answer is: 0 is sure. A row is a bin, with its start
+    `entropy_nats`, the `count` of answers and their `share` of all.
     """
     intents = [answer.intent for answer in run.answers if answer.role == "ego" and answer.intent]
     if not intents:
@@ -334,7 +337,9 @@ def entropies(run: Run) -> Table:
 def tokens(run: Run) -> Table:
     """Return a histogram of prompt lengths in tokens for each role whose engine counts them.
 
-    A role is who was asked: `ego`, `helper` or `fusion`. A row has the least length of its bin.
+    A role is who was asked: `ego`, `helper` or `fusion` (the ego again, with messages). A row is a
+    bin, with `role`, the least length `tokens`, the `count` of prompts and their `share` of the
+    role's.
     """
     by_role: dict[str, list[float]] = {}
     for answer in run.answers:
@@ -349,8 +354,9 @@ def tokens(run: Run) -> Table:
 def replies(run: Run) -> Table:
     """Return the counts and shares of requested replies by condition: on time, late, lost.
 
-    On time is within the decision window. A row has one of the three for one condition. A condition
-    is a named set of settings of channel, asking and fusion.
+    On time is within the decision window. A row has a `condition`, a `reply` (one of the three),
+    its `count`, its `share` of the condition's `n` replies, and `n`. A condition is a named set of
+    settings of channel, asking and fusion.
     """
     d = run.decisions
     delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
@@ -375,8 +381,9 @@ def replies(run: Run) -> Table:
 def arrivals(run: Run) -> Table:
     """Return for each condition a histogram of replies' arrival, in ms from the decision's start.
 
-    A row is a bin, with `condition`, its start and `count`. Lost replies are not in it. A condition
-    is a named set of settings of channel, asking and fusion.
+    A row is a bin, with `condition`, its start `arrival_ms`, the `count` of replies and their
+    `share` of those that arrived. Lost ones are not in it. A condition is a named set of settings
+    of channel, asking and fusion.
     """
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)

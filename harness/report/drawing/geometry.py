@@ -47,7 +47,11 @@ def conflict_points(state: WorldState, graph: SceneGraph) -> tuple[list[Conflict
 
 
 def ground_of(scenario: Scenario) -> Ground:
-    """Return the road surface to draw, up to `BEYOND_M` outside the largest view."""
+    """Return the outlines of a scenario's road to draw, with its centre and stop lines.
+
+    They reach up to `BEYOND_M` metres beyond the largest picture of a scene. Points are m to the
+    east and to the north of the scenario's origin.
+    """
     return scenario.road().ground_within(VIEW_M + BEYOND_M)
 
 
