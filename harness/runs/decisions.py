@@ -168,8 +168,9 @@ class Decisions:
     A decision point is one situation in which a decision is due. A condition is a named set of
     settings of channel, asking and fusion under which it is decided, and the seed is that of the
     channel's random numbers. `actions` are the names of the A meta-actions, in the order of every
-    distribution, and `helpers` is the greatest number of messages in a decision. Columns are read
-    by name as arrays (n,), or (n, A).
+    distribution, and `helpers` is the greatest number of messages in a decision. Columns of `table`
+    are read by name as arrays (n,), or (n, A), which `_arrays` keeps, and its rows as dicts, of
+    which `_rows` keeps some.
     """
 
     table: pa.Table  # its columns, (n,) each, are those of `schema`
@@ -406,7 +407,11 @@ class Decisions:
 
 @dataclass(frozen=True)
 class DecisionFiles:
-    """Hold decisions as Parquet files in order, which need not all fit into memory."""
+    """Hold decisions as Parquet files in order, which need not all fit into memory.
+
+    `files` are the paths of tables of decisions, and `actions` the names of the actions that all of
+    them have, in the order of every distribution.
+    """
 
     files: Sequence[Path]  # what `Decisions.write` wrote
     actions: tuple[str, ...]  # the meta-actions of all of them

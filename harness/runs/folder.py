@@ -52,9 +52,10 @@ _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_
 
 @dataclass(frozen=True)
 class Run:
-    """Hold a finished run's folder and manifest, and read its tables on first use.
+    """Hold a finished run's folder, `path`, and manifest, and read its tables on first use.
 
-    A table that is missing or broken raises UserError.
+    The manifest is the content of `run.json`, all settings and origin. A table that is missing or
+    broken raises UserError.
     """
 
     path: Path  # the run's folder

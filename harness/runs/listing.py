@@ -33,11 +33,14 @@ _BROKEN = (*BROKEN, AttributeError, csv.Error)  # in what no type was given to
 class Listed:
     """Describe one run or study (several runs) in a list; None where a value is unknown.
 
-    `condition` is the condition (named set of settings of channel, asking and fusion) with the
-    highest success that no warning is about, `success` that success, 0 to 1, by the metric
-    `metric`, and `low` and `high` the ends of its 95 % interval. `unread` is the share of the ego's
-    answers that could not be parsed. `why` says how an unfinished run goes on, or what is wrong
-    with a broken one. `date` is when it began, or a study was last written.
+    `name` is its folder, `kind` what made it (`eval`, `drive`, `suite`, or a study's word), and
+    `tags` words by which to find it; `model`, `prompt` and `answer` name the model, prompt version
+    and answer mode. `condition` is the condition (named set of settings of channel, asking and
+    fusion) with the highest success that no warning is about, `success` that success, 0 to 1, by
+    the metric `metric`, and `low` and `high` the ends of its 95 % interval. `unread` is the share
+    of the ego's answers that could not be parsed. `state` says whether it is finished or broken,
+    and `why` how an unfinished run goes on, or what is wrong with a broken one. `date` is when it
+    began, or a study was last written.
     """
 
     name: str  # its folder, relative to the folder that is listed

@@ -28,8 +28,20 @@ class Columns(Protocol):
 class Metric:
     """Define one metric, with values of 0 or more, by its name, meaning, unit and function.
 
-    The function is one of `decisions`, `episodes`, `answers` and `pooled`, by what it takes; a
-    metric without any is computed where `summary.csv` is made.
+    The function is one of these: `decisions` takes a table of n decisions and returns a value each,
+    (n,), whose mean (sum, if `total`) is the episode's; `episodes` takes an episode's record and
+    returns its value; `answers` takes the n answers of a `role` and returns a value each; `pooled`
+    names a figure of all decisions together. `percentile` is that of their latencies, and `halves`
+    names two metrics, with a danger and without, whose mean it is. One without any is computed
+    where `summary.csv` is made.
+
+    `better` says which change is better (`higher`, `lower`, or none), `interval` whether it is a
+    share (`rate`) or a mean, and `most` is the greatest value. `primary` ones are those that
+    comparisons of runs are judged by. `world` names the only kind of run that has it; an `optional`
+    one has no row where it is unknown, `half` says that it is of a part of the episodes, and a
+    `superseded` one is left out of pages. `corrects` names the metric that it corrects for the
+    difficulty of start situations, and `behind` the one whose rows its own follow. `label` is the
+    name for people.
     """
 
     name: str  # its name in tables, with the unit at the end
@@ -90,10 +102,14 @@ class Metric:
 def decision_share(
     name: str, meaning: str, column: str, better: Better = "lower", **more: Any
 ) -> Metric:
-    """Build the metric of a share of decisions, one column of their table."""
+    """Build the metric of a share of decisions, one column of their table.
+
+    `name`, `meaning`, `better` and `more` are fields of `Metric`; `column` names the column, which
+    is 1 or 0 (true or false) for each decision, NaN where unknown.
+    """
     return Metric(name, meaning, PERCENT, better, "rate", 1.0, decisions=of_column(column), **more)
 
 
 def of_column(name: str) -> Callable[[Columns], Floats]:
-    """Build the function of one column of decisions."""
+    """Return the function that takes a table of n decisions and returns its column `name`, (n,)."""
     return lambda d: d[name]

@@ -89,11 +89,21 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
 class Answer(Struct, frozen=True, kw_only=True):
     """Hold one answer of a model, a line of `answers.jsonl`.
 
-    `viewer` is the vehicle that answered in the decision point `scene`, `raw` its text, and
-    `intent` the probability of each action, None if the text could not be parsed; `status` and
-    `verdict` say how it could, `repairs` what was corrected before. Tokens and seconds include
-    those of a repair turn, a second question after the failed answer `first`; they are None where
-    unknown. `label_mass` and the like are of read-outs: answers by one letter per action.
+    The vehicle `viewer` was asked as `role` (ego, helper, or ego after it `heard` helpers) in the
+    decision point `scene`, by a chat and a picture of the digests `prompt_sha256` and
+    `image_sha256`. `raw` is its text, `finish_reason` why it ends, and `error` why there is none.
+    `status` and `verdict` say how parsing went, `faults` all that is wrong, `detail` a sentence on
+    it, and `repairs` what was corrected before. `intent` has each action's probability, None if it
+    failed, and `mass` their sum as written; `message` and `extension` are what else was said.
+
+    `seconds` is its time if it was asked alone, `first_token_s` and `token_s` those to the first
+    token and of each further one; `slow_s` are declared further seconds. Tokens and seconds include
+    those of a repair turn, a second question after the failed answer `first`; None is unknown.
+    `batch_size` counts requests computed together, `retries` failed attempts before; `cached` says
+    that it was stored earlier. In a read-out, an answer by one letter per action, `label_mass` is
+    the letters' total probability; `letter_share` (0 to 1) and `follows_letter` say how far it goes
+    by the letter, and `flipped` whether the list reversed changes it. `agent` is the index of the
+    helpers' model that answered.
     """
 
     scene: str  # id of the decision point
@@ -196,9 +206,15 @@ class Answer(Struct, frozen=True, kw_only=True):
 class AnswerFacts(Struct, frozen=True):
     """Hold the fields of `Answer` that a run's figures are computed from, with the same meaning.
 
-    Texts are left out, so that all answers of a run fit into memory: `scene` is the id of the
-    decision point, `role` who answered, `verdict` and `repairs` how its text was parsed, and times
-    are in s, None where unknown.
+    Texts are left out, so that all answers of a run fit into memory. `scene` is the id of the
+    decision point, `role` who answered, `verdict` and `repairs` how its text was parsed, and
+    `error` why there is none. `prompt_tokens` and `completion_tokens` are counts, and `seconds`,
+    `first_token_s` and `token_s` times of the answer, of its first token and of each further one;
+    None where unknown. `retries` counts failed attempts, `cached` says that it was stored earlier,
+    and `first` is the failed answer before a second question. Of an answer by one letter per
+    action, `label_mass` is the letters' total probability; `letter_share` (0 to 1) and
+    `follows_letter` say how far it goes by the letter, and `flipped` whether the list reversed
+    changes it.
     """
 
     scene: str
@@ -231,9 +247,10 @@ class AnswerFacts(Struct, frozen=True):
 class Times(Struct, frozen=True, omit_defaults=True):
     """Hold how long n answers took that were asked one at a time: percentiles, s.
 
-    The 95 % intervals of the median and of the 95th percentile, `_ci_`, are over episodes, None if
-    these cannot bound them. `first_token` has the times to the first token, and `token` those of
-    each further one; None if the engine does not report them.
+    `median_s`, `p5_s` and `p95_s` are the 50th, 5th and 95th percentile. `median_ci_s` and
+    `p95_ci_s` are the ends of their 95 % intervals over episodes, None if these cannot bound them.
+    `first_token` has the times to the first token, and `token` those of each further one; None if
+    the engine does not report them.
     """
 
     n: int  # number of answers
@@ -250,11 +267,12 @@ class Times(Struct, frozen=True, omit_defaults=True):
 class Latency(Struct, frozen=True, omit_defaults=True):
     """Hold the seconds of inference by role, fixed before a run, or token rates to compute them.
 
-    They decide which messages arrive within the decision window. `source` says where they come
-    from, and `sample` has the times of the answers that were measured, by role. `ego_s`, `helper_s`
-    and `fusion_s` are of one answer of the ego, a helper, and the ego after it heard messages.
-    Where a timer times each answer by itself, they are None and `speeds` has each agent's speed (a
-    record of the timer's own), the ego's first. An agent is a model with its prompt.
+    They decide which messages arrive within the decision window. `source` names where they come
+    from, `basis` says so in words, and `sample` has the times of the answers that were measured, by
+    role. `ego_s`, `helper_s` and `fusion_s` are of one answer of the ego, a helper, and the ego
+    after it heard messages; `helpers_s` of each of several models that helpers take in turn. Where
+    a timer times each answer by itself, they are None and `speeds` has each agent's speed (a record
+    of the timer's own), the ego's first. An agent is a model with its prompt.
     """
 
     # one of `SOURCES`, or what times each answer by itself, of `timers.TIMERS`
@@ -315,11 +333,11 @@ class Latency(Struct, frozen=True, omit_defaults=True):
 class Message(Struct, frozen=True, rename={"sender": "from"}):
     """Hold a helper's reply to the ego: whether and when it arrived, and its weight in fusion.
 
-    `sender` is the helper's id. `arrival_ms` counts from the start of the decision, None if the
-    reply was lost; `on_time` says whether that was within the decision window. `weight` is None if
-    a fusion call made the decision, `trust` (0 to 1) if the consensus rule rates none; `attacker`
-    says whether the sender attacks. A fusion call asks the ego's model again, with the messages
-    that it heard.
+    `sender` is the helper's id. `delivered` says whether the reply arrived at all, `arrival_ms`
+    when, from the start of the decision, None if it was lost, and `on_time` whether that was within
+    the decision window. `weight` (0 to 1) is None if a fusion call made the decision, `trust` (0 to
+    1) if the consensus rule rates none; `attacker` says whether the sender attacks. A fusion call
+    asks the ego's model again, with the messages that it heard.
     """
 
     sender: str  # the helper
@@ -336,10 +354,20 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
 class Decision(Struct, frozen=True, kw_only=True):
     """Hold one decision, a row of `decisions.parquet`, for reports; None where unknown.
 
-    It is about the decision point `scene`, under one condition (named set of settings of channel,
-    asking and fusion) and channel seed. `fused` is the policy after fusion: a probability for each
-    action; `value` is whether success was still possible before the action, `safe` whether it is
-    after it, and `regret` whether the action gave it away.
+    It is about the decision point `scene`, number `step` of `episode`, under one condition (named
+    set of settings of channel, asking and fusion) and channel seed; `agent` is the id of who
+    decided. `danger` is the side that a hidden vehicle comes from. `entropy_nats` is that of the
+    ego's own answer, `own_failed` whether it could not be parsed, `triggered` whether the ego asked
+    helpers, and `messages` their replies. `fused` is the policy after fusion: a probability for
+    each action; the ego's own answer has the weight `own_weight` in it. `action` is the name of the
+    one taken.
+
+    `latency_ms` is from seeing to acting, of which `fusion_ms` is fusion's; `deadline_missed` says
+    that it took longer than the decision window. `value` is whether success was still possible
+    before the action, `safe` whether it is after it, `regret` whether the action gave it away, and
+    `delay_s` how long it puts off success. `off_lag` says that the decision took another time than
+    the recorded scenes allow; `acts_at_s` and `acted` when and whether it took effect in a
+    simulator.
     """
 
     scene: str  # id of the decision point
@@ -373,9 +401,24 @@ class Episode(Struct, frozen=True, kw_only=True):
     """Hold the outcome of one layout under one condition and seed, a line of `episodes.csv`.
 
     A layout is one start situation, which `layout_seed` draws; a condition is a named set of
-    settings of channel, asking and fusion. `outcome` says how it ended, `failure` how it failed,
-    and `time_s` when that was decided. Times are in s, `latency_ms` apart. A field is None where
-    its kind of run does not know it; such as what only frozen or closed-loop runs have.
+    settings of channel, asking and fusion. `danger` is the side that a hidden vehicle comes from,
+    which `witnesses` helpers see at first, and `danger_radio` whether it has a radio. `success`
+    says whether it succeeded, `outcome` how it ended, `failure` how it failed, and `time_s` when
+    that was decided. A field is None where its kind of run, on recorded scenes or simulated, does
+    not know it. Times are in s, but for `latency_ms`, the mean of its decisions.
+
+    `messages` counts replies, `deadline_misses` decisions that took too long, `skipped` those not
+    begun since one was open, and `never_acted` those not ready at the end; `trigger_rate` is the
+    share that asked. `delay_s` is needless delay, `time_lost_s` how much later the ego cleared than
+    it could; `miss` says that a decision made harm inevitable, `false_alarm` that one only gave
+    success away. Of a collision, `partner`, `striker` and `fault` are the ids of the other, who
+    hit, and who should have given way. `least_gap_m`, `least_ttc_s` and `least_pet_s` are the least
+    distance, time to collision and post-encroachment time, `short_ttc` and `short_pet` whether
+    these were below 1.5 s; `hard_brakings` and `other_crashes` are counts.
+
+    Where several vehicles decide, `agents` is how many, of whom `arrived` reached their goal and
+    `met` hit each other; `agents_lost_s` is how much later in sum than alone, `most_lost_s` that of
+    the one who lost most, `gave_way`. `journeys` has how each ended, as JSON.
     """
 
     condition: str  # name of the operating point
@@ -502,10 +545,12 @@ class FrozenScenes(
 ):
     """Record the dataset of a frozen run (on recorded scenes), and which of its episodes were used.
 
-    `episodes` and `nodes` are the numbers of episodes and decision points that were used; these are
-    all of the dataset without `limit` and `selection`. `decision_lag_s` is the time from a decision
-    to its action that the dataset was made with, and `interim_looks` what a rule that may stop the
-    run states.
+    `name` and `path` are the dataset's and its folder's, `sha256` its digest. `episodes` and
+    `nodes` are the numbers of episodes and decision points that were used; these are all of the
+    dataset without `limit` (the first so many) and `selection` (options by name).
+    `delay_allowance_s` is the needless delay with which an episode still succeeds, and
+    `decision_lag_s` the time from a decision to its action that the dataset was made with.
+    `interim_looks` is what a rule that may stop the run states.
     """
 
     name: str  # the dataset's name
@@ -533,10 +578,11 @@ class ClosedLoop(
 ):
     """Record the scenario of a closed-loop run (in a simulator), and which layouts were driven.
 
-    Episode e has layout seed `first_seed` + e, which fixes who stands where; `episodes` is how many
-    were driven. If they were sampled, `selection` has the number sampled from, `of`, and the seed
-    of the draw. `late_against` says in words whose time lateness is measured against. A layout is
-    one start situation of a scenario.
+    `scenario` has its `name` and `parameters`. A layout is one start situation of a scenario;
+    episode e has layout seed `first_seed` + e, which fixes who stands where, and `episodes` is how
+    many were driven. If they were sampled, `selection` has the number sampled from, `of`, and the
+    seed of the draw. `late_against` says in words whose time lateness is measured against;
+    `interim_looks` is what a rule that may stop the run states.
     """
 
     scenario: dict[str, Any]  # its `name` and `parameters`, values by name
@@ -640,10 +686,15 @@ def _is_name(name: str) -> bool:
 class Manifest(Struct, frozen=True, kw_only=True):
     """Hold a run's settings and origin: the content of `run.json`.
 
-    Whole records of models (`model`, `helpers`), radios (`channels`) and conditions (named sets of
-    settings of channel, asking and fusion) are in it, with digests and versions, so that the run
-    can be made again and checked. `seeds` are of the channel's random numbers, `settings` all
-    settings as typed. docs/files.md has more on each name.
+    Whole records of models (`model`, `helpers`), radios (`channels`), networks to a cloud
+    (`networks`) and conditions (named sets of settings of channel, asking and fusion) are in it,
+    with digests and versions, so that the run can be made again and checked; so are those of what
+    conditions (`kept`) and settings of extensions (`beside`) name. `world` says where scenes come
+    from, `actions` are the names of what the ego can do, `seeds` are of the channel's random
+    numbers, and `latency` has the seconds of answers. `identity` tells the model that answered
+    apart, and `cost` says by model what it cost. `settings` has all settings as typed; fields of
+    the same names, such as `answer` and `ties`, are what these came to. docs/files.md has more on
+    each name.
     """
 
     format: str  # the format of the run's files, such as `swarmdrive-run/2`

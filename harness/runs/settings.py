@@ -287,10 +287,11 @@ class Settings(Struct, frozen=True, kw_only=True):
 class Option(NamedTuple):
     """Describe a command-line option, made from a field of the settings.
 
-    `path` is its place in `run.toml`, `name` that of the parameter, `kind` its Python type, and
-    `panel` the heading of its help. `listed` says whether it may be typed several times, `same`
-    what of it must be equal when a stopped run resumes, and `compared` whether a comparison of two
-    runs reports it.
+    `path` is its place in `run.toml`, `name` that of the parameter, `kind` its Python type,
+    `default` its value if it is not typed, and `panel` the heading of its `help`. `listed` says
+    whether it may be typed several times, `same` what of it must be equal when a stopped run
+    resumes, and `compared` whether a comparison of two runs reports it. `models` says that it names
+    models, `is_added` that an extension adds it.
     """
 
     path: tuple[str, ...]  # the names of the table and the key in `run.toml`

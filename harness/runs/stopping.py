@@ -40,9 +40,10 @@ class StoppingRule(ABC):
     """Say when a run has enough layouts, so that it may stop; a base class.
 
     A layout is one start situation of a scenario, with one episode; layouts come in a fixed order.
-    At an interim look, after some of them, the rule says whether these are enough. Objects do not
-    change. The one that is registered has opened no files: it makes those that have (`opened`), and
-    reads what runs state.
+    At an interim look, after some of them, the rule says whether these are enough. `chosen_by`
+    names the settings that choose it, and `interval` says in words what the intervals of its
+    differences are. Objects do not change. The one that is registered has opened no files: it makes
+    those that have (`opened`), and reads what runs state.
     """
 
     chosen_by: ClassVar[tuple[str, ...]]  # the settings of its extension that choose it

@@ -24,11 +24,12 @@ class Timer(ABC):
     """Time each answer of a run by itself, as from a device's tokens a second; a base class.
 
     Without a timer all answers of a role take one time, which `--latency` states. A timer also says
-    how many joules decisions take. `chosen_by` names the settings that choose it, and `adds` the
-    columns that it adds to the table of decisions. Objects do not change. The one that is
-    registered has opened no files: it makes those that have (`opened`, `recorded`), and reads
-    speeds. A speed is how fast an agent, a model with its prompt, answers: an object of the timer's
-    own.
+    how many joules decisions take. `option` is what is typed to choose it, `chosen_by` names the
+    settings that do, and `how` says in words where times come from. `adds` has the columns that it
+    adds to the table of decisions, each with the one behind which it stands. Objects do not change.
+    The one that is registered has opened no files: it makes those that have (`opened`, `recorded`),
+    and reads speeds. A speed is how fast an agent, a model with its prompt, answers: an object of
+    the timer's own.
     """
 
     option: ClassVar[str]  # what is typed to choose it, such as the name of an option
