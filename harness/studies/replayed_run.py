@@ -336,7 +336,7 @@ class ReplayedRun:
         return self._asker.laid_out(scenes)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
-        """Return the vehicles' intents in n scenes if helpers are asked `question`.
+        """Return the intents of all vehicles in n scenes if helpers are asked `question`, (n, ...).
 
         An intent is a vehicle's probabilities of the ego's actions. The question stands in place of
         the plain one, such as in a control that shows helpers nothing. Missing answers are NaN,
@@ -349,12 +349,16 @@ class ReplayedRun:
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
-        """Return a function that gives the ego's answers after hearing messages in these scenes.
+        """Return the ego's answers after it heard messages in these scenes, as an object to call.
 
         In a fusion call the ego's model answers with the helpers' messages in its prompt. `codes`,
         (K,), are whole numbers that encode the K sets of messages that are asked about
         (`fusion.codes_of`), and `rewrites` says how attacks and defences change the messages that
-        are shown. The model is asked what is not stored. Raises UserError if it may not be.
+        are shown. It is called with the indices of n decisions' scenes, (n,), and, where attackers'
+        messages are changed, who attacks, (n, H). It returns a function of who of H helpers was
+        heard, (n, H), which returns the ego's probabilities of A actions, (n, A), and the seconds
+        of these answers, (n,). The model is asked what is not stored. Raises UserError if it may
+        not be.
         """
         if not self._asks:
             raise UserError(
@@ -365,11 +369,13 @@ class ReplayedRun:
             return self._asker.fusion_call(scenes, codes, rewrites)
 
     def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
-        """Return a function that asks agents again, with the plans that they heard.
+        """Return a function that asks n agents again, with the plans that they heard.
 
         An agent is a vehicle that decides for itself; runs in which only the ego decides do not use
-        the function. `at` has the indices of the scenes in which agents decide, and `intents` their
-        plans, probabilities of actions.
+        the function. `at` (n,) has the indices in `scenes` of those in which the agents decide, and
+        `intents` (n, ...) their plans, probabilities of actions. The function takes who of H others
+        was heard, (n, H), and returns each agent's probabilities of A actions, (n, A), and the
+        seconds of each answer, (n,), NaN for who heard nobody.
         """
         return self._asker.call_of_agents(scenes, at, intents)
 

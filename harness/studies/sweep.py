@@ -164,7 +164,8 @@ def panels_over(
         apart: whether each axis has a panel of its own, instead of all crossed in one.
 
     Raises:
-        UserError: as `settings`; or there are more grids than axes.
+        UserError: a condition, axis or value is unknown, an axis changes nothing in a condition,
+            there are too many grid points, or more grids than axes.
     """
     axes = [axis_of(name) for name in dict.fromkeys(over)]
     if len(grids) > len(axes):
