@@ -116,7 +116,11 @@ class DecisionPoint:
 
     @property
     def answers(self) -> "pd.DataFrame":
-        """Return the models' answers at this decision point, as rows of `Run.answers`."""
+        """Return the models' answers at this decision point, as rows of `Run.answers`.
+
+        There is one for each vehicle that was asked, and each set of messages with which one was
+        asked again.
+        """
         return self.run.answers[self.run.answers.scene == self.scene.id]
 
     @property
