@@ -328,10 +328,10 @@ class Asker:
         return self.laid_out(scenes)
 
     def whole(self, scenes: Sequence[Scene]) -> Intents:
-        """Return the intents of n scenes after asking every vehicle in them, helpers included.
+        """Return the intents of n scenes, `(n, ...)`, after asking every vehicle in them.
 
-        An intent is the probabilities that a vehicle gives to the ego's actions; NaN where it
-        failed.
+        Helpers are included. An intent is the probabilities that a vehicle gives to the ego's
+        actions; NaN where it failed.
         """
         self._ask_at(scenes)
         return self.laid_out(scenes)
@@ -408,10 +408,10 @@ class Asker:
     def laid_out(
         self, scenes: Sequence[Scene], question: Question = PLAIN, width: int = 1
     ) -> Intents:
-        """Return the answers that there are, of n scenes, as arrays of at least `width` vehicles.
+        """Return the answers that there are, of n scenes, as arrays `(n, ...)`; nothing is asked.
 
-        Nothing is asked. `question` is what helpers were asked; a vehicle without an intent has
-        NaN.
+        They have room for `width` vehicles at least, the ego included. `question` is what helpers
+        were asked; a vehicle without an intent, its probabilities of the ego's actions, has NaN.
         """
         answers = [self._answers_in(scene, question) for scene in scenes]
         return intents_of(self.spec, self.latency, scenes, answers, width)
@@ -492,9 +492,11 @@ class Asker:
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:
-        """Call `more` with the number of requests, and ask those whose answers are missing.
+        """Ask those of these requests whose answers are missing, and keep the answers.
 
-        Raises Unanswered if a question of the ego or a fusion call got no answer, or many in a row.
+        The function `more`, by which a progress bar learns how much there is to do, is first called
+        with the number of requests. Raises Unanswered if a question of the ego or a fusion call
+        (the ego asked again, with messages) got no answer, or many in a row.
         """
         # Requests whose answers were kept stay, so that the chunks begin at the same places as
         # before.

@@ -37,7 +37,7 @@ class FrozenSource:
     """Describe the recorded scenes to evaluate on: some or all episodes of a dataset.
 
     `dataset` is cut to the episodes that are used; these were the first `limit` of what `choice`
-    chose, None for all.
+    (options such as `--danger`) chose, None for all. `kind` is the kind of world.
     """
 
     dataset: Dataset  # the dataset, cut to the episodes that are used
