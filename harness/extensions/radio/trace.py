@@ -84,12 +84,14 @@ class Table:
 class Trace:
     """Define a channel by a table of reception over distance, such as another simulator's.
 
-    The table is averaged over shadowing and for one packet size, so a link's own shadowing and a
-    message's bits change nothing, and replies do not wait for each other. A request reaches each
-    helper after the latency of its own distance, or `latency_s` seconds if the table has none.
-    Between two percentiles a message's latency is drawn from the lognormal distribution that has
-    them; that it is lognormal, and that messages draw independently, is assumed. `beyond` says what
-    reception is beyond the last distance: `zero`, or `held`, that of the last row.
+    `receptions` is the table, averaged over shadowing and for one packet size, so a link's own
+    shadowing and a message's bits change nothing, and replies do not wait for each other. A request
+    reaches each helper after the latency of its own distance, or `latency_s` seconds if the table
+    has none. Between two percentiles a message's latency is drawn from the lognormal distribution
+    that has them; that it is lognormal, and that messages draw independently, is assumed. `beyond`
+    says what reception is beyond the last distance: `zero`, or `held`, that of the last row.
+    `decorrelation_m` is infinite, since shadowing plays no part, and `of_loss` names the settings
+    that change losses alone.
     """
 
     receptions: Table  # the table
