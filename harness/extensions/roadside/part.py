@@ -31,7 +31,9 @@ class Roadside(Part, frozen=True, kw_only=True):
     one that sends helpers' replies once more, or `fusion` for one that asks the helpers in the
     ego's place and fuses what they say; `edge_delay_s` is the seconds from what it receives to what
     it sends. It stands `edge_x_m` m to the east and `edge_y_m` m to the south of the middle of the
-    conflict zone, where paths meet, and its antenna at the height `edge_antenna_m`.
+    conflict zone, where paths meet, and its antenna at the height `edge_antenna_m`. `behind` is the
+    setting after which they stand in records, and `of_radio` says that they mean nothing without a
+    radio.
     """
 
     behind: ClassVar[str] = "helper_rounds"
