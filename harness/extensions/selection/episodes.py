@@ -18,6 +18,7 @@ class Episodes(Selection):
     `only` lists numbers and ranges, such as `3,10:20`, which leave out their end. `danger` is the
     sector (such as `left`) from which the hidden danger comes, or `none`. `sample` is how many to
     draw at random, with the seed `sample_seed`; a larger sample contains the smaller one.
+    `chosen_by` names the settings that choose this selection.
     """
 
     chosen_by: ClassVar[tuple[str, ...]] = ("only", "danger", "sample", "sample_seed")
