@@ -19,8 +19,9 @@ class LeftOut(Struct, frozen=True, kw_only=True):
 
     An object is a vehicle or the like that a prompt lists; the fusion makes the ego's policy of its
     own answer and of helpers' messages. Answers and policies are probabilities of actions. `scene`
-    is the decision point's id, `seed` that of the channel for a message, and `viewer` the vehicle
-    whose answer changes. `item` is the object, or the message's sender, and `kind` what it is.
+    is the decision point's id, `episode` its episode's number, `seed` that of the channel for a
+    message, and `viewer` the vehicle whose answer changes, asked as `ego` or `helper` (`role`;
+    `fusion` for a message). `item` is the object, or the message's sender, and `kind` what it is.
     `action` was the likeliest with it, `instead` is so without it; `change` is by how much the
     probability of `action` rises, and `shift` the total variation distance of both. These three are
     None if that answer failed.
