@@ -301,7 +301,8 @@ class Spoof(Attack):
 class Jump(Attack):
     """Attack by claiming a position off the true one, in a new random direction at each step.
 
-    `offset_m` is the distance from the true position, in metres.
+    `offset_m` is the distance from the true position, in metres. `needs` says that it reads what
+    helpers claim of themselves, positions and speeds.
     """
 
     offset_m: Annotated[float, Meta(ge=0, le=1000)] = 20.0  # distance from the true position, m
