@@ -141,7 +141,11 @@ class View:
         return HTMLResponse(page, headers=OF_LIST if "<script>" in page else None)
 
     def progress(self, request: Request) -> Response:
-        """Return as JSON what changes in the list of runs while runs go on: `pages.now`."""
+        """Return as JSON what changes in the list of runs while runs go on.
+
+        It has `listed`, a digest that changes once a run begins or ends; `going`, whether one goes
+        on; and `unfinished`, how far each is in words, by its name. `request` is not read.
+        """
         every = runs(self.folder)
         return JSONResponse(pages.now(every, pages.extents(self.folder, every)))
 
