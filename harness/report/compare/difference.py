@@ -125,8 +125,9 @@ class AnswersFlipped:
 class AnswerChanged:
     """Hold two answers to the same prompt and picture that differ in text or parse verdict.
 
-    `request` is the request's id, `a` and `b` are the texts of run A's and run B's answer.
-    `verdicts` says how each was read: `strict`, `recovered` or `failed`.
+    `request` is the request's id, `role` who was asked (`ego`, `helper`, or `merge`: the ego after
+    it heard messages), and `a` and `b` are the texts of run A's and run B's answer. `verdicts` says
+    how each was read: `strict`, `recovered` or `failed`.
     """
 
     request: str  # the request's id
