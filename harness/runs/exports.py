@@ -59,7 +59,11 @@ def _are_options(value: Any) -> bool:
 
 
 class Exports(Plugins[Export]):
-    """Hold the export formats by name."""
+    """Hold the export formats by name, such as those that write a run for another program.
+
+    `stated` has a rule for each attribute of a format that a package adds: a test of its value, and
+    words for what is allowed.
+    """
 
     stated: ClassVar = {
         "help": of_type(str),

@@ -18,7 +18,11 @@ from harness.runs.records import roles
 
 
 class Metrics(Plugins[Metric]):
-    """Hold all metrics by name: built-in ones, those of extensions, and other packages'."""
+    """Hold all metrics by name: built-in ones, those of extensions, and other packages'.
+
+    `stated` has a rule for each attribute of a metric that a package adds: a test of its value, and
+    words for what is allowed.
+    """
 
     stated: ClassVar = {
         "meaning": of_type(str),

@@ -72,9 +72,10 @@ def asked_key(viewer: str, question: str) -> str:
 class FirstTurn(Struct, frozen=True, kw_only=True):
     """Hold a failed answer that was followed by a repair turn: a second question after the failure.
 
-    `raw` is its text, `status` the outcome of parsing it, such as `bad_sum`, and `slow_s` the
-    declared seconds that it takes beyond its model's latency. The numbers of tokens are None if the
-    engine has no tokenizer, and `seconds` if it was not timed alone.
+    `raw` is its text, `status` the outcome of parsing it, such as `bad_sum`, and `finish_reason`
+    why it ends: `stop`, `length`, `refusal` or `error`. `slow_s` are the declared seconds that it
+    takes beyond its model's latency. `prompt_tokens` and `completion_tokens` are those read and
+    written, None if the engine has no tokenizer; `seconds` is None if it was not timed alone.
     """
 
     raw: str  # the completion as it came
