@@ -215,8 +215,9 @@ class Setting:
     named set of grid points that are shown together: along an axis, over several crossed axes, or
     to compare conditions.
 
-    `vehicles` includes the ego. `value` is that of the axis `variable`: one for each if axes are
-    crossed, None if conditions are compared.
+    `condition` is the name of the operating point that is varied, and `point` that with the varied
+    settings. `vehicles` includes the ego. `value` is that of the axis `variable`, in the axis's
+    unit: one for each if axes are crossed, None if conditions are compared.
     """
 
     condition: str  # name of the operating point that it is a change of

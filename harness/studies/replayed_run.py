@@ -291,7 +291,7 @@ class ReplayedRun:
             return self._asker(scenes)
 
     def whole(self, scenes: Sequence[Scene]) -> Intents:
-        """Return the intents (distributions over actions) of all vehicles in these n scenes.
+        """Return the intents (distributions over actions) of all vehicles in n scenes, (n, ...).
 
         The model is asked for what is not stored, and its answers are stored in the run's folder.
         """
@@ -303,9 +303,9 @@ class ReplayedRun:
     ) -> Intents:
         """Return the intents (distributions over actions) of helpers where `wanted`, a mask (n, H).
 
-        The axes are n scenes and H helpers. The model is asked for what is not stored: `question`
-        says whether plainly, or another way. Raises UserError if it may not be asked and an answer
-        is missing.
+        The axes are n scenes and H helpers; the result has the m scenes in which one is wanted, (m,
+        ...), in their order. The model is asked for what is not stored: `question` says whether
+        plainly, or another way. Raises UserError if it may not be asked and an answer is missing.
         """
         asked_scenes, places = wanted_in(scenes, wanted)
         if not self._asks and any(self._asker.lacks(asked_scenes, question, places)):
@@ -320,7 +320,7 @@ class ReplayedRun:
             return self._asker.helpers(scenes, wanted, question)
 
     def intents(self, scenes: Sequence[Scene], leave_out: Callable[[Bools], None]) -> Intents:
-        """Return the vehicles' intents (distributions over actions) in n scenes, as stored.
+        """Return all vehicles' intents (distributions over actions) in n scenes, (n, ...), stored.
 
         Those of helpers that the run did not ask are missing. Where the ego's is, the model is
         asked; if it may not be, `leave_out` is called with the mask (n,) of these scenes, whose
