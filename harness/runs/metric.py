@@ -35,7 +35,7 @@ class Metric:
     names two metrics, with a danger and without, whose mean it is. One without any is computed
     where `summary.csv` is made.
 
-    `better` says which change is better (`higher`, `lower`, or none), `interval` whether it is a
+    `better` says which change is better (`higher`, `lower`, `neither`), `interval` whether it is a
     share (`rate`) or a mean, and `most` is the greatest value. `primary` ones are those that
     comparisons of runs are judged by. `world` names the only kind of run that has it; an `optional`
     one has no row where it is unknown, `half` says that it is of a part of the episodes, and a
