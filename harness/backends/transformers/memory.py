@@ -76,7 +76,10 @@ class Prefixes:
         return any(kept.ids == ids for kept in self._kept)
 
     def keep(self, prefix: Prefix) -> None:
-        """Keep a beginning, and drop the least recently used above the limit."""
+        """Keep the beginning of a prompt that was read, `prefix`: token ids, keys and values.
+
+        The least recently used ones are dropped until at most `MOST_TOKENS` tokens are kept.
+        """
         self._kept = [*(kept for kept in self._kept if kept.ids != prefix.ids), prefix]
         while sum(len(kept.ids) for kept in self._kept) > MOST_TOKENS:
             del self._kept[0]
