@@ -11,7 +11,11 @@ DASH = "–"
 
 
 class Bounded(Protocol):
-    """Describe a value with the ends of its confidence interval; None or NaN if not known."""
+    """Describe a value with the two ends of its confidence interval, for functions that write it.
+
+    It has `value`, and the ends `low` and `high`, in the unit of the value; None or NaN where
+    unknown.
+    """
 
     @property
     def value(self) -> float | None: ...
