@@ -36,8 +36,8 @@ MOST_KNOWN = 20
 class FrozenSource:
     """Describe the recorded scenes to evaluate on: some or all episodes of a dataset.
 
-    `dataset` is cut to the episodes that are used; these were the first `limit` of what `choice`
-    (options such as `--danger`) chose, None for all. `kind` is the kind of world.
+    `dataset` is cut to the episodes that are used: the first `limit` (None for all) of those that
+    `choice`, by settings of an extension, has selected. `kind` is the kind of world.
     """
 
     dataset: Dataset  # the dataset, cut to the episodes that are used

@@ -48,8 +48,8 @@ class LiveSource:
 
     A layout is one start situation, drawn by its seed; episode e of the `episodes` has layout seed
     `first_seed` + e. `scenario_name` is the scenario's name, with settings as they are typed. With
-    a `choice` (of options such as `--sample`), only those of the episodes are driven. `name` stands
-    in names of runs' folders, and `kind` is the kind of world.
+    a `choice`, only the episodes that it has selected, by settings of an extension, are driven.
+    `name` stands in names of runs' folders, and `kind` is the kind of world.
     """
 
     first_seed: int  # layout seed of episode 0
