@@ -246,13 +246,13 @@ class Result:
         return dict(zip(places, corrected(p_values), strict=True))
 
     def p(self, setting: Setting, content: str) -> float | None:
-        """Return the p-value of the success with a content of messages being that with intents.
+        """Return the p-value of no change in success by another content of messages than intents.
 
-        `setting` is the grid point, an operating point with a number of vehicles, and `content`
-        what messages hold there, such as `objects`. Both successes are at this point, over the same
-        episodes. The p-value is corrected by Holm's method over all contents and grid points of the
-        model; it is None for intents themselves (a vehicle's probabilities of actions), and where
-        no interval is known.
+        It compares success when messages hold `content`, such as `objects`, with that when they
+        hold intents (a vehicle's probabilities of actions), over the same episodes, at the grid
+        point `setting`: an operating point with a number of vehicles. The p-value is corrected by
+        Holm's method over all contents and grid points of the model; it is None for intents
+        themselves, and where no interval is known.
         """
         return self._p.get(place(setting, content))
 
