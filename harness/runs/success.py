@@ -59,17 +59,21 @@ class Success:
 
     @property
     def metric(self) -> str:
-        """Return the metric's name: balanced success if there are episodes of both kinds."""
+        """Return the name of the metric of success that this rule computes, as in `summary.csv`.
+
+        It is that of balanced success if there are episodes with a danger and without, else of
+        plain success.
+        """
         return BALANCED if 0 < self.dangerous.sum() < len(self.dangerous) else SUCCESS
 
     @property
     def words(self) -> str:
-        """Return the metric's name for people."""
+        """Return the name of the metric of success that this rule computes, in words for people."""
         return IN_WORDS[self.metric]
 
     @property
     def plain(self) -> "Success":
-        """Return the rule that averages the same episodes plainly."""
+        """Return the rule that averages the same episodes plainly, be there a danger or not."""
         return Success(np.zeros_like(self.dangerous))
 
     @property
