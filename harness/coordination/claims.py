@@ -14,28 +14,29 @@ from harness.core.arrays import Bools, Floats, Ints
 class Claims:
     """Hold the positions and speeds that H helpers claim, and what the ego can check them by.
 
-    Helpers claim them in their beacons. The conflict zone is where their paths and the ego's meet.
-    Arrays are of decisions of any shape `(...)`. On an axis of length 1+H index 0 is the ego and
-    1+h is helper h; on one of length H, index h is helper h.
+    Helpers claim them in their beacons, broadcasts about themselves. The conflict zone is where
+    their paths and the ego's meet. Arrays are of decisions of any shape `(...)`. On an axis of
+    length 1+H index 0 is the ego and 1+h is helper h; on one of length H, index h is helper h.
     """
 
-    # claimed place, m to the east and to the south of the centroid of the conflict zone, `(...,
-    # 1+H, 2)`, the ego first; NaN for a helper that is absent
+    # claimed places, m to the east and to the south of the centroid of the conflict zone, `(...,
+    # 1+H, 2)`; NaN for a helper that is absent
     xy_m: Floats
     speed_mps: Floats  # each helper's claimed speed, m/s, `(..., H)`
-    time_s: Floats  # when the claims were made, seconds since the start of the episode, `(...)`
-    # standard deviation on each axis, m, by which the beacons' declared noise moves a true place,
+    time_s: Floats  # when the claims were made, s since the start of the episode, `(...)`
+    # standard deviation on each axis, m, of the errors that beacons declare for their places,
     # `(...)`
     error_m: Floats
     # each helper's distance to that centroid by the ego's own sensors, m, `(..., H)`; NaN if they
     # do not see it
     sensed_m: Floats
-    # the map: returns metres from places `(..., 2)` to the middle of the nearest lane
+    # the map: takes places, m to the east and to the south of that centroid, `(..., 2)`, and
+    # returns the distance of each to the middle of the nearest lane, m, `(...)`
     from_road_m: Callable[[Floats], Floats]
 
     @cached_property
     def off_road_m(self) -> Floats:
-        """Return metres from each claimed position to the nearest lane's middle, `(..., H)`."""
+        """Return how far each claimed place is from the nearest lane's middle, m, `(..., H)`."""
         return self.from_road_m(self.xy_m[..., 1:, :])
 
     def take(self, at: Any) -> "Claims":

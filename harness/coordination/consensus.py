@@ -19,40 +19,37 @@ from harness.core.arrays import Bools, Floats, summed
 class Messages:
     """Hold what a consensus rule fuses: the ego's intent and its helpers' messages.
 
-    An intent is the probabilities that a vehicle gives to the ego's actions. Arrays are of
-    decisions of any shape `(...)`, with H helpers and A actions: `intents` `(..., 1+H, A)`,
-    `weights` and `distance_m` `(..., 1+H)`, all else `(..., H)`. On an axis of length 1+H index 0
-    is the ego and 1+h is helper h; on one of length H, index h is helper h. `weights` sum to 1 and
-    are 0 for a helper not heard, whose intent may hold anything.
+    An intent is the probabilities that a vehicle gives to the A actions of the ego. Arrays are of
+    decisions of any shape `(...)`. On an axis of length 1+H index 0 is the ego and 1+h is helper h;
+    on one of length H, index h is helper h.
     """
 
     # the probabilities that each vehicle gives to the ego's actions, `(..., 1+H, A)`, each row
     # summing to 1; the row of a helper not heard may hold anything
     intents: Floats
     # each vehicle's weight by distance (paper Eq. 2), `(..., 1+H)`, summing to 1; 0 for a helper
-    # not heard
+    # not heard.
     weights: Floats
     heard: Bools  # whether each helper's reply came within the decision window, `(..., H)`
     # seconds from the start of the decision until each reply came, `(..., H)`; inf if it was lost
-    # or not asked for. This is also a message's age, since every vehicle sees the scene at 0
+    # or not asked for. This is also a message's age, since every vehicle sees the scene at 0.
     arrival_s: Floats
     # each vehicle's distance to the centroid of the conflict zone, m, `(..., 1+H)`; the ego's is
     # what its operating point declares, if it declares one
     distance_m: Floats
     range_m: Floats  # each helper's distance to the ego, m, `(..., H)`
-    # what helpers claim about themselves, for a rule whose `needs` names it; else None
+    # what helpers claim of their places and speeds, for a rule whose `needs` names it; else None
     claims: Claims | None = None
-    # what agents say of themselves, for a rule whose `needs` names it; `intents` are then plans.
-    # Else None
+    # what agents, vehicles that decide for themselves, say of their own motion, for a rule whose
+    # `needs` names it; `intents` are then plans. Else None.
     plans: Plans | None = None
 
 
 class Fused(NamedTuple):
     """Hold what a consensus rule returns for decisions `(...)` with H helpers and A actions.
 
-    `policy`, `(..., A)`, are the probabilities of the ego's actions, `weights`, `(..., 1+H)`, what
-    each vehicle counted, the ego first, and `state`, `(..., K)`, the rule's memory for the
-    episode's next decision. `trust`, `(..., H)`, is None if the rule rates none.
+    On the axis of length 1+H index 0 is the ego and 1+h is helper h; on one of length H, index h is
+    helper h.
     """
 
     policy: Floats  # probabilities of the ego's actions after fusion, `(..., A)`
@@ -62,7 +59,7 @@ class Fused(NamedTuple):
     # rule's own; K may be 0
     state: Floats
     # how far the rule trusts each helper that it heard, from 0 to 1, `(..., H)`; below 0.5 it
-    # treats the helper as an attacker. NaN for a helper not heard. None if the rule rates no trust
+    # treats the helper as an attacker. NaN for a helper not heard. None if the rule rates no trust.
     trust: Floats | None = None
 
 
@@ -72,9 +69,10 @@ class Rule(Protocol):
 
     A rule is a pure function of arrays; its memory is an argument, one row an episode. The steps of
     an episode are fused in order, each from the memory that the last one returned. This includes
-    steps in which the ego hears nobody; there it acts on its own intent, whatever the rule returns.
-    A rule that uses `Messages.claims` has `needs = ("claims",)`. With `needs = ("plans",)` it reads
-    what each vehicle that decides plans to do itself, and the ego's own intent is then its plan; no
+    steps in which the ego hears nobody; there it acts on its own intent, its probabilities of the
+    actions, whatever the rule returns. The attribute `needs` names optional fields of `Messages`: a
+    rule that reads the helpers' claimed places has `("claims",)`. With `("plans",)` it reads what
+    each vehicle that decides plans to do itself, and the ego's own intent is then its plan; no
     other rule sees plans.
     """
 

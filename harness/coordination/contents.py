@@ -59,9 +59,9 @@ class Call:
     ) -> Sequence["SceneGraph | None"]:
         """Return the scene graph to show the ego in each case, or None where its own graph stays.
 
-        A scene graph is what one vehicle knows of a scene. Each case is one ego's: its scene, its
-        own graph and the graphs of the helpers that it has heard. All egos are of `scenario`: they
-        come from the same approach, with the same route.
+        A scene graph is what one vehicle knows of a scene. Each of `cases` is one ego's: its scene,
+        its own graph and the graphs of the helpers that it has heard. All egos are of `scenario`:
+        they come from the same approach, with the same route.
         """
         return [None] * len(cases)
 
@@ -77,15 +77,13 @@ class Content:
     """Describe what helpers' messages hold: the setting `content` of an operating point.
 
     An operating point is the settings of radio, asking and fusion. Messages hold helpers' intents
-    with their words, words alone, lists of detected objects, or senders' own plans: `holds` has
-    some of `KINDS`, and `needs` what the world must know to make such messages. An intent is
+    with their words, words alone, lists of detected objects, or senders' own plans. An intent is
     probabilities of the ego's actions. Methods of this base class are right for an intent with its
     words.
     """
 
     holds: frozenset[str]  # the kinds of what such a message holds, some of `KINDS`
-    # what the world must know to make such messages, some of `NEEDS`
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()  # what the world must know to make such messages, some of `NEEDS`
     # second question to the ego's model, which shows it what it has heard; None without one
     call: Call | None = None
 
@@ -198,7 +196,7 @@ def _own_calls() -> frozenset[str]:
 
 
 def is_ours(call: Call) -> bool:
-    """Return whether a second question to the ego's model is the harness's own.
+    """Return whether `call`, a second question to the ego's model, is the harness's own.
 
     It is that of a content of messages that ships, rather than a package's.
     """

@@ -113,9 +113,9 @@ def graphs(
     """Return the scene graph that a second question shows the ego in each case.
 
     None keeps the ego's own graph. Call it in place of `Call.graphs`, which a package may have
-    written. Each case is one ego's: its scene, its own graph (what it knows of the scene) and those
-    of the helpers that it has heard. All egos are of `scenario`. Raises UserError if a package's
-    call fails or returns another vehicle's graph.
+    written. `call` is the question; each of `cases` is one ego's: its scene, its own graph (what it
+    knows of the scene) and those of the helpers that it has heard. All egos are of `scenario`.
+    Raises UserError if a package's call fails or returns another vehicle's graph.
     """
     if is_ours(call):
         return call.graphs(scenario, cases)
@@ -151,9 +151,9 @@ def words(call: Call, evidence: str) -> str:
 def graph_like(given: object, own_graph: SceneGraph, whose: str) -> SceneGraph:
     """Return what a package gave as a scene graph: a fresh copy, checked as one from a file is.
 
-    A scene graph is what one vehicle knows of a scene; `own_graph` is the one that this vehicle has
-    here. Raises ValueError or TypeError, with `whose` (such as `the ego's`) in the message, unless
-    both are of the same viewer, role, step and ego.
+    `given` is what it gave. A scene graph is what one vehicle knows of a scene; `own_graph` is the
+    one that this vehicle has here. Raises ValueError or TypeError, with `whose` (such as
+    `the ego's`) in the message, unless both are of the same viewer, role, step and ego.
     """
     if not isinstance(given, SceneGraph):
         raise TypeError(f"it returns what is no graph of {whose}")

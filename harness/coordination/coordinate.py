@@ -48,18 +48,20 @@ TIE = 1e-9  # probabilities that differ by less are equal: pooling rounds
 class FusionInputs:
     """Hold what `coordinate` and `fuse` need besides intents and draws; each may be None.
 
-    `call` takes who was heard, `(..., H)`, and asks the ego's model once more; it returns the ego's
-    intents, `(..., A)`, and the seconds that each took. `state`, `(..., K)`, is the consensus
-    rule's memory, and `ties` draws between equally likely actions.
+    An intent is the probabilities of the ego's A actions. Arrays are of decisions of any shape
+    `(...)`, with H helpers.
     """
 
-    # asks the ego's model once more, with what the ego has heard; required where the operating
-    # point makes such a fusion call, as with consensus `ego-prompt`
+    # asks the ego's model once more, with what the ego has heard: takes which helpers were heard,
+    # `(..., H)`, and returns the ego's intent, `(..., A)`, NaN if that failed or nobody was heard,
+    # and the seconds that it took, `(...)`; required where the operating point makes such a fusion
+    # call, as with consensus `ego-prompt`
     call: FusionCall | None = None
     # the consensus rule's memory of each decision's episode, `(..., K)`, K numbers of the rule's
-    # own: `Coordination.state` of the episode's last decision. None at the first decision
+    # own: `Coordination.state` of the episode's last decision. None at the first decision.
     state: Floats | None = None
-    # the draws that decide between actions that are equally likely; None takes the first of them
+    # draws to decide between actions that are equally likely: takes where several are, `(...)`, and
+    # returns a draw in [0, 1) for each such decision, `(k,)`; None takes the first of the actions
     ties: TieDraws | None = None
 
 
@@ -67,25 +69,24 @@ class FusionInputs:
 class Coordination(Exchange):
     """Hold all that happened in each decision: exchange, fused policy, action and latency.
 
-    Made by `coordinate` and `fuse`. Arrays are of decisions of any shape `(...)`, with H helpers
-    and A actions; of 1+H vehicles the ego is first. `fused`, `(..., A)`, is the policy, the
-    probabilities of the ego's actions after fusion, and `action`, `(...)`, the index of the one
-    taken. `weights`, `(..., 1+H)`, are what each vehicle counted, `trust`, `(..., H)`, is how far
-    the rule trusts each helper, and `state`, `(..., K)`, its memory. `latency_s`, `(...)`, is when
-    the ego acts; times are s from the start of the decision.
+    Made by `coordinate` and `fuse`; the fields of `Exchange` are its, too. Arrays are of decisions
+    of any shape `(...)`, with H helpers and A actions; of 1+H vehicles the ego is first. A fusion
+    call is a second question to the ego's model, with what it has heard; the window is how long
+    replies are waited for. Times are s from the start of the decision.
     """
 
-    # each vehicle's weight in the policy, `(..., 1+H)`; NaN where a fusion call answered
+    # each vehicle's weight in the policy, `(..., 1+H)`, the ego first; NaN where a fusion call
+    # answered
     weights: Floats
     fused: Floats  # the policy: probabilities of the ego's actions after fusion, `(..., A)`
-    # index of its most probable action, `(...)`. A tie is drawn; without draws it goes to the
+    # index of its most probable action, `(...)`; a tie is drawn, and without draws it goes to the
     # earlier action, the more careful one
     action: Ints
     # whether the fusion call's answer was unusable, so that `fused` is the ego's own intent,
     # `(...)`
     fusion_failed: Bools
-    # when the ego acts, `(...)`: end of exchange and fusion. The paper's `latency_proxy`. NaN where
-    # the ego's inference time is unknown
+    # when the ego acts, `(...)`: the end of exchange and fusion, the paper's `latency_proxy`; NaN
+    # where the ego's inference time is unknown
     latency_s: Floats
     deadline_missed: Bools  # whether that is after the window, `(...)`
     # the rule's memory for the episode's next decision, `(..., K)`, K numbers of the rule's own; K

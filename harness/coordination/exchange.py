@@ -58,15 +58,13 @@ class Exchange:
     # whether the ego's answer was unusable, so that `own` is the fallback that the settings name,
     # `(...)`
     own_failed: Bools
-    entropy_nats: Floats  # entropy of `own`, `(...)`: how unsure the ego is
-    # whether the ego asks at least one helper, `(...)`. By default it asks those in the radius if
-    # the entropy is above the threshold tau. Without a channel, or with nobody in the radius, it
-    # asks nobody
+    entropy_nats: Floats  # entropy of `own` in nats, `(...)`: how unsure the ego is
+    # whether the ego asks at least one helper, `(...)`; by default it asks those in the radius if
+    # the entropy is above the threshold tau, and nobody without a channel
     triggered: Bools
     asked: Bools  # which helpers are asked; each has a scheduled reply, `(..., H)`
-    # which helpers' computers infer for this decision, `(..., H)`: those in the radius, asked or
-    # not, or on demand those that are asked. None without a channel, or where messages hold no
-    # intents
+    # which helpers' models answer for this decision, `(..., H)`: those in the radius, asked or not,
+    # or on demand those that are asked; none without a channel, or where messages hold no intents
     infers: Bools
     # number of requests broadcast, `(...)`: 1 for all who are asked together, plus 1 of another
     # that asks for the ego; 0 if nobody is asked
@@ -86,7 +84,7 @@ class Exchange:
     # when each helper's reply ends where it is fused, by the ego or another, `(..., H)`; inf if it
     # is lost or not asked for
     arrival_s: Floats
-    # whether it arrived within the decision window and so is fused, `(..., H)`
+    # whether the reply arrived within the decision window and so is fused, `(..., H)`
     on_time: Bools
     exchange_s: Floats  # end of the whole exchange, `(...)`
     # number of scheduled replies in further rounds of asking, as where agents answer each other's

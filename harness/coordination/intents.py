@@ -19,53 +19,54 @@ from harness.radio.channel import Site
 class Intents:
     """Hold what vehicles intend in decisions, and what else coordination needs to play these.
 
-    An intent is the probabilities that a vehicle gives to the ego's actions: what the ego should
-    do, as that vehicle sees it. Arrays are of decisions of any shape `(...)`, with H helpers and A
-    actions. On an axis of length 1+H index 0 is the ego and 1+h is helper h; on one of length H,
-    index h is helper h. `own`, the ego's intent, is `(..., A)`, `helpers` `(..., H, A)`,
-    `distance_m` and `inference_s` `(..., 1+H)`, `own_bits` and `own_text_bytes` `(...)`, and all
-    other arrays `(..., H)`. `valid` says which helpers have something to send; a field that is None
-    is not needed, or holds for nobody.
+    An intent is the probabilities that a vehicle gives to the ego's A actions: what the ego should
+    do, as that vehicle sees it. The conflict zone is where their paths and the ego's meet. Arrays
+    are of decisions of any shape `(...)`. On an axis of length 1+H index 0 is the ego and 1+h is
+    helper h; on one of length H, index h is helper h.
     """
 
     own: Floats  # the ego's intent, `(..., A)`; a row with a NaN is a failed answer
     helpers: Floats  # each helper's intent, `(..., H, A)`
-    # whether the helper exists and its answer parsed, `(..., H)`. Any other helper sends nothing,
+    # whether the helper exists and its answer parsed, `(..., H)`; any other helper sends nothing,
     # takes no slot on air, and may hold NaN in every array
     valid: Bools
     # each vehicle's distance to the centroid of the conflict zone, m, `(..., 1+H)`, the ego first;
     # that of a helper is as the ego knows it, from beacons
     distance_m: Floats
     range_m: Floats  # each helper's distance to the ego, m, `(..., H)`, as the ego knows it
-    payload_bits: Floats  # size of each helper's reply, `(..., H)`
+    payload_bits: Floats  # size of each helper's reply, bits, `(..., H)`
     # seconds that each vehicle's model takes to answer, `(..., 1+H)`, the ego first; NaN where
     # unknown
     inference_s: Floats
-    site: Site | None = None  # where the vehicles truly are, if the channel needs it; else None
-    # whether the helper, if asked, sends nothing in its slot, `(..., H)`. None if no helper is
+    # where the vehicles truly are and what stands between them, if the channel needs it; else None
+    site: Site | None = None
+    # whether the helper, if asked, sends nothing in its slot, `(..., H)`. None if no helper is.
     silent: Bools | None = None
     # index from 0 of the helper that is behind each of the H voices, `(..., H)`: an attacker may
-    # send as several. None if each helper has one voice
+    # send as several. None if each helper has one voice.
     voice_of: Ints | None = None
-    # what the ego sees and what helpers would add, if a schedule needs it; else None
+    # how much the ego sees of where a danger may come from, and what helpers would add, if a
+    # schedule needs it; else None
     outlook: Outlook | None = None
-    # what helpers claim about themselves, if a rule or an attack needs it; else None
+    # what helpers claim of their places and speeds, if a rule or an attack needs it; else None
     claims: Claims | None = None
     # bytes of each reply's text, `(..., H)`; None if replies have none
     text_bytes: Floats | None = None
     # how many objects each helper lists, `(..., H)`, if messages hold objects; else None
     objects: Floats | None = None
-    object_bits: Floats | None = None  # size of these lists as compact JSON, `(..., H)`
+    # size of these lists as compact JSON, bits, `(..., H)`; None if messages hold none
+    object_bits: Floats | None = None
     # whether the helper's model was not asked yet, `(..., H)`; until then it counts as valid. None
-    # if the models of all were
+    # if the models of all were.
     unasked: Bools | None = None
     # what agents, the vehicles that decide for themselves, say of their own motion, if messages
     # hold plans; of the ego of each decision alone, `(..., 1)`, until it is known whom it hears.
-    # Else None
+    # Else None.
     plans: Plans | None = None
-    # size of the ego's own answer if it is sent as a message, `(...)`, where messages hold plans
+    # size of the ego's own answer if it is sent as a message, bits, `(...)`, where messages hold
+    # plans; else None
     own_bits: Floats | None = None
-    own_text_bytes: Floats | None = None  # bytes of the text in it, `(...)`
+    own_text_bytes: Floats | None = None  # bytes of the text in it, `(...)`; else None
 
     def take(self, at: Any) -> "Intents":
         """Return some decisions: those at `at` of the leading axis of all arrays.
@@ -95,8 +96,8 @@ class Intents:
     def without_models(self) -> "Intents":
         """Return a copy for messages that list objects and need no answer of a helper's model.
 
-        Every present helper is then valid (able to send), has an inference time of 0 s, and is not
-        waited for.
+        Every present helper is then valid (able to send), has an inference time of 0 s, and does
+        not count as one whose model was not asked yet.
         """
         own_s = self.inference_s[..., :1]
         return replace(
@@ -149,7 +150,7 @@ class Intents:
 
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
-        """Return the decisions of several objects as one, concatenated along the leading axis.
+        """Return the decisions of several objects, `parts`, as one, along the leading axis.
 
         All must have the same numbers of helpers and actions, the same optional arrays, and None as
         `site`, `outlook`, `claims` and `plans`.

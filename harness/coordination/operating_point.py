@@ -80,7 +80,7 @@ class Rewrites(NamedTuple):
     """
 
     question: str = ""  # name of the question that helpers were asked; empty for the ordinary one
-    changes: Changes = Changes()  # names of what attacks and defences change of messages
+    changes: Changes = Changes()  # names of the changes that attacks and defences make to messages
     # name of the second question that the content, what messages carry, puts to the ego's model
     # (`contents.Call`); empty if it has none
     call: str = ""
@@ -221,7 +221,7 @@ class OperatingPoint:
         return record
 
     def setting(self, key: str) -> Any:
-        """Return the value of a setting by its flat name, such as `tau_nats`.
+        """Return the value of the setting `key`, a flat name such as `tau_nats`.
 
         Raises KeyError if there is no such setting.
         """

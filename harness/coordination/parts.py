@@ -64,10 +64,10 @@ class Question:
     that shows nothing does.
     """
 
-    # its name; ends the key under which its answers are kept, behind a `~`, and is the role that
-    # they are listed under; empty for the ordinary question
+    # its name, empty for the ordinary question; it ends the key under which its answers are kept,
+    # behind a `~`, and is the role that they are listed under
     name: str = ""
-    words: str = "are asked"  # in messages, behind "that": how helpers are asked
+    words: str = "are asked"  # how helpers are asked, in messages behind "that"
     pictured: bool = True  # whether the prompt may have the picture of the helper's camera
 
     def shown(self, graph: "SceneGraph") -> "SceneGraph":
@@ -113,9 +113,10 @@ class Changes(NamedTuple):
     names become part of the key under which its answer is kept, so they hold no `+` and no `&`.
     """
 
-    # of the changes to messages of attackers, several joined by `&`; empty for none
+    # names of the changes to messages of attackers, several joined by `&`; empty for none
     of_attackers: str = ""
-    of_all: tuple[str, ...] = ()  # of the changes to messages of all helpers, in their order
+    # names of the changes to messages of all helpers, in the order in which they are made
+    of_all: tuple[str, ...] = ()
 
 
 class ActsOn(NamedTuple):
@@ -127,10 +128,11 @@ class ActsOn(NamedTuple):
 
     setting: str  # name of the setting
     value: object  # its value; of a text that names several things, one of them
-    # the kinds of content, of `contents.KINDS`, one of which messages must hold
+    # the kinds of content, such as `intent`, of which messages must hold at least one
+    # (`contents.KINDS`)
     kinds: Collection[str]
     instead: str = "left out"  # what the setting must be where they hold none
-    # returns other values that the setting may have, given the kinds that messages hold
+    # returns other values that the setting may have; takes the kinds that messages hold
     others: "Callable[[frozenset[str]], Collection[str]]" = lambda holds: ()
 
 
@@ -168,22 +170,23 @@ class Part(Struct, frozen=True, kw_only=True):
     """Hold one group of an operating point's settings, checked when made; a base class.
 
     An operating point is all settings that a decision depends on besides scene and model, and a
-    part those of one concern, such as the radio. An extension adds a subclass (`adds={"parts":
-    ...}`); the hooks below do nothing unless overridden, and are called in their order here, only
-    for a part that differs from its defaults. Whole numbers become floats where a float is
-    declared. Raises ValueError for a value that is not allowed.
+    part those of one concern, such as the radio. An extension adds a subclass
+    (`adds={"parts": ...}`); the hooks below do nothing unless overridden, and are called in their
+    order here, only for a part that differs from its defaults. Whole numbers become floats where a
+    float is declared. Raises ValueError for a value that is not allowed.
     """
 
     behind: ClassVar[str] = ""  # name of the setting behind which its own stand in run files
     of_ego: ClassVar[bool] = False  # whether it matters to an ego that asks nobody
     of_radio: ClassVar[bool] = False  # whether its settings mean nothing without a channel
-    # its settings that name something, and what returns the names that there are; empty names
-    # nothing
+    # for each of its settings that names something, what returns the names that there are; an empty
+    # setting names nothing
     named: ClassVar[Mapping[str, Callable[[], Collection[str]]]] = {}
-    questions: ClassVar[tuple[Question, ...]] = ()  # what helpers may be asked by it
-    # what the ego hears under a control, by its setting, such as `messages=blind`
+    questions: ClassVar[tuple[Question, ...]] = ()  # the questions that helpers may be asked by it
+    # what the ego hears under a control, in words, by its setting, such as `messages=blind`
     controls: ClassVar[Mapping[str, str]] = {}
-    # of its settings that are words, the values that a sweep takes if none are given, with commas
+    # for its settings that are words, by name, the values that a sweep takes if none are given,
+    # with commas
     usual: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
@@ -381,8 +384,8 @@ class Part(Struct, frozen=True, kw_only=True):
     def before(self, intents: "Intents") -> "Intents":
         """Return what vehicles intend in n decisions, corrected before anything else uses it.
 
-        A calibration does so. Only `own`, `(n, A)`, and `helpers`, `(n, H, A)`, may change; a
-        failed or missing answer is a row of NaN.
+        A calibration does so. Of `intents` only `own`, `(n, A)`, and `helpers`, `(n, H, A)`, the
+        probabilities of actions, may change; a failed or missing answer is a row of NaN.
         """
         return intents
 
@@ -442,16 +445,21 @@ def _lacking(setting: str, name: str, plugins: Plugins[Any], *others: str) -> Us
 
 
 class Ask(Part, frozen=True, kw_only=True):
-    """Hold the settings of whom the ego asks, when, and what helpers' messages hold."""
+    """Hold the settings of whom the ego asks, when, and what helpers' messages hold.
 
-    # The rule for whom and when: `entropy`, the paper's, or another of `SCHEDULES`.
+    An intent is the probabilities of the ego's actions; the more alike they are, the higher is
+    their entropy.
+    """
+
+    # the rule for whom and when: `entropy`, the paper's, or another of `SCHEDULES`
     schedule: Text = PAPER
-    # The entropy of the ego's intent, in nats, above which it asks, under the paper's schedule.
+    # the entropy of the ego's intent, in nats, above which it asks, under the paper's schedule
     tau_nats: Annotated[float, Meta(ge=0, description="a finite number of nats, 0 or more")] = 0.7
-    # The worth above which another schedule asks, in its unit; None keeps the schedule's own.
+    # the worth above which another schedule asks, in its unit; None keeps the schedule's own
     threshold: Annotated[float, Meta(ge=0, description="a finite number, 0 or more")] | None = None
-    radius_m: Metres = 100.0  # the paper's R; helpers farther from the ego are not asked
-    # The most helpers that are asked in one decision. If more may be, those are that the schedule
+    # distance from the ego, m, beyond which helpers are not asked: the paper's R
+    radius_m: Metres = 100.0
+    # the most helpers that are asked in one decision. If more may be, those are that the schedule
     # says are worth the most, and of equals the nearest.
     max_helpers: Annotated[
         int,
@@ -459,14 +467,15 @@ class Ask(Part, frozen=True, kw_only=True):
             ge=0, le=MOST_HELPERS, description=f"a whole number, 0 or more, at most {MOST_HELPERS}"
         ),
     ] = 3
-    # Size of the request. The default is 50 bytes: who asks whom and until when, as compact JSON
-    # without a signature or headers. Replies are counted in the same way.
+    # size of the request, bits. The default is 50 bytes: who asks whom and until when, as compact
+    # JSON without a signature or headers. Replies are counted in the same way.
     request_bits: Annotated[
         float, Meta(ge=0, le=1e12, description="bits, 0 or more, at most 1e12")
     ] = 400.0
     # whether a helper infers only when it is asked, not in parallel with the ego
     on_demand: Flag = False
-    content: Text = INTENT  # what a message holds (`harness.coordination.contents`)
+    # what a message holds, such as `intent` (`harness.coordination.contents`)
+    content: Text = INTENT
 
     def check(self) -> None:
         if self.content not in CONTENTS:
@@ -509,16 +518,19 @@ class Ask(Part, frozen=True, kw_only=True):
 
 
 class Radio(Part, frozen=True, kw_only=True):
-    """Hold the settings of the radio: a channel profile, a file of `channels/`, and overrides."""
+    """Hold the settings of the radio: a channel profile, a file of `channels/`, and overrides.
+
+    A channel decides which messages arrive, and when.
+    """
 
     profile: Text | None = None  # name of the channel profile, such as `6g`; None disables V2V
-    # Probability that one transmission is lost; None keeps that of the profile or of the link.
+    # probability that one transmission is lost; None keeps that of the profile or of the link
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")] | None = None
     latency_s: Seconds | None = None  # nominal seconds of one exchange; None keeps the profile's
     density_coupled: Flag = False  # whether loss follows the number of active vehicles
-    # Whether a helper whose entropy is above tau opens a round of its own, which loads the channel.
+    # whether a helper whose entropy is above tau opens a round of its own, which loads the channel
     helper_rounds: Flag = False
-    # How messages are encoded, which is their size (`harness.coordination.encodings`).
+    # how messages are encoded, which is their size (`harness.coordination.encodings`)
     encoding: Text = JSON
     further: Text = ""  # further settings of the profile's channel, such as `jitter_s=0.01`
 
@@ -539,19 +551,19 @@ class Fusion(Part, frozen=True, kw_only=True):
 
     # the rule that fuses intents, or `ego-prompt`: the ego's model is asked again with the messages
     consensus: Text = "linear"
-    # Decision window, from the start of the decision; a later reply is not fused.
+    # decision window, seconds from the start of the decision; a later reply is not fused
     window_s: Annotated[
         float, Meta(gt=0, le=LONGEST_S, description="seconds above 0, at most 3600")
     ] = 0.2
-    # Lower bound of d, a vehicle's distance that its weight falls with, in the paper's Eq. 2.
+    # lower bound of d, m, a vehicle's distance that its weight falls with, in the paper's Eq. 2.
     min_distance_m: Metres = 1.0
-    # The ego's d in Eq. 2; None takes its distance to the centroid of the conflict zone. The
+    # the ego's d in Eq. 2, m; None takes its distance to the centroid of the conflict zone. The
     # paper's preset declares a proxy of 3.5 m (section IV-A).
     ego_distance_m: Metres | None = None
-    # Largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing.
+    # largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing
     weight_cap: Annotated[float, Meta(gt=0, le=1, description="a share above 0, up to 1")] = 1.0
-    # What replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass
-    # on the first action, which is the most conservative one.
+    # what replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass
+    # on the first action, which is the most conservative one
     fallback: Text = "uniform"
 
     def check(self) -> None:
@@ -567,11 +579,11 @@ class Cloud(Part, frozen=True, kw_only=True):
     With none set it runs in the vehicle.
     """
 
-    # Seconds from the ego's question to the answer of a model in a cloud, in place of the ego's own
-    # inference.
+    # seconds from the ego's question to the answer of a model in a cloud, in place of the ego's own
+    # inference; None for none
     round_trip_s: Seconds | None = None
-    # Network over which the ego asks its model in a cloud, a name of `harness.radio.networks`. Each
-    # decision draws a round trip, which is added to the model's inference.
+    # network over which the ego asks its model in a cloud, a name of `harness.radio.networks`;
+    # empty for none. Each decision draws a round trip, which is added to the model's inference.
     round_trip: Text = ""
 
     def check(self) -> None:

@@ -59,9 +59,9 @@ def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
 def prepared(part: Part, intents: Intents) -> Intents:
     """Return what vehicles intend in n decisions as a part's `before` corrects it.
 
-    A part is a group of settings, as a calibration's. What is intended are probabilities of
-    actions; `before` is the part's hook that may correct them. Raises UserError if a package's part
-    fails, changes more than `own` and `helpers`, or returns no distribution for an answer.
+    A part is a group of settings, as a calibration's. `intents` has probabilities of actions;
+    `before` is the part's hook that may correct them. Raises UserError if a package's part fails,
+    changes more than `own` and `helpers`, or returns no distribution for an answer.
     """
     if is_ours(part):
         return part.before(intents)
@@ -83,7 +83,7 @@ class SpeakerOfPart:
     """
 
     part: Part  # the package's group of settings that the speaker is of
-    speaker: Speaker  # what is checked: it decides what helpers send
+    speaker: Speaker  # the speaker that is checked
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         given = (read_only(truth), read_only(draws), read_only(episode), read_only(seed))
@@ -154,7 +154,8 @@ class ChangeOfPart:
     """Wrap a package's change of helpers' messages, such as an attack's, and check what it returns.
 
     Messages are changed before a fusion call, a second question to the ego's model, shows them.
-    Raises UserError if it fails, or returns what is no such message or scene graph.
+    `what` is how messages on errors call the part, and `change` is the package's own. Raises
+    UserError if it fails, or returns what is no such message or scene graph.
     """
 
     what: str  # what messages on errors call the part

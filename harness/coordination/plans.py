@@ -22,12 +22,12 @@ class Plans:
     """
 
     # index of the decision that each other agent makes itself now, among the decisions made
-    # together, `(..., H)`; -1 where it makes none. H is 0 until it is known whom an agent hears
+    # together, `(..., H)`; -1 where it makes none. H is 0 until it is known whom an agent hears.
     row: Ints
     # each agent's number among the vehicles of its world, `(..., 1+H)`; -1 for one without a plan
     vehicle: Ints
-    # seconds until each is at the centroid of the conflict zone if it keeps its speed,
-    # `(..., 1+H)`; inf for one that stands or has passed it, NaN without a plan
+    # seconds until each is at the centroid of the conflict zone if it keeps its speed, `(...,
+    # 1+H)`; inf for one that stands or has passed it, NaN without a plan
     reaches_s: Floats
     # seconds by which each is later than at the speed that it had in the beginning, `(..., 1+H)`,
     # at least 0; NaN without a plan

@@ -28,6 +28,7 @@ class Heads(Pool):
     It is made of a function `pool` from intents `(..., 1+H, A)` and weights `(..., 1+H)` to
     policies `(..., A)`. If all vehicles but at most one, the ego among them, have the same
     likeliest action and the policy has another, the mean intent of these vehicles replaces it.
+    `by_distance` is false: claimed distances weigh nothing.
     """
 
     # whether claimed distances weigh; read by the checks of an operating point

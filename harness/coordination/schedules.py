@@ -25,7 +25,9 @@ def _is_threshold(value: Any) -> bool:
 class Schedules(FilesAndPlugins[Schedule]):
     """Hold all schedules, rules for whom the ego asks, by name.
 
-    They are built in, of installed packages, or in files of a folder `schedules/`.
+    They are built in, of installed packages, or in files of a folder `schedules/`. `stated` has, by
+    an attribute that a package's schedule must have, the test of its value and what is allowed in
+    words.
     """
 
     folder = "schedules"
@@ -47,7 +49,7 @@ class Schedules(FilesAndPlugins[Schedule]):
         return READERS[self.folder](file)
 
     def file_sha256(self, name: str) -> str | None:
-        """Return the SHA-256 hex digest of a schedule's file; None if no file holds it."""
+        """Return the SHA-256 hex digest of the file of schedule `name`; None if it has none."""
         file = self.file(name)
         return sha256_file(file) if file else None
 

@@ -21,14 +21,13 @@ class Outlook:
 
     A place that a danger may come from is one of the road's R sectors, or regions: stretches of
     other roads before the ego's conflict zone. Arrays are of decisions of any shape `(...)`, with H
-    helpers: `unseen` `(..., R)` and `added` `(..., H, R)` are shares from 0 to 1, and `to_zone_s`
-    `(...)` is how many s the ego has until that zone.
+    helpers; index r of an axis of length R is region r, and index h of one of length H helper h.
     """
 
-    unseen: Floats  # share of each region that the ego does not see, `(..., R)`
-    # share of each region that a helper sees and the ego does not, `(..., H, R)`. It follows from
-    # the place in the helper's last beacon and the obstacles that the ego knows. NaN for a helper
-    # that is absent
+    unseen: Floats  # share of each region, 0 to 1, that the ego does not see, `(..., R)`
+    # share of each region, 0 to 1, that a helper sees and the ego does not, `(..., H, R)`: it
+    # follows from the place in the helper's last beacon and the obstacles that the ego knows. NaN
+    # for a helper that is absent.
     added: Floats
     # seconds until the ego reaches the conflict zone at its speed, `(...)`; 0 once it is there, and
     # inf at a standstill
@@ -54,24 +53,27 @@ class ScheduleInputs:
     """Hold what the ego knows before it asks anybody, the input of a schedule.
 
     A schedule is the rule for whom to ask. Arrays are of decisions of any shape `(...)`, with H
-    helpers and A actions: `own` `(..., A)`, `entropy_nats` and `lot` `(...)`, `distance_m`
-    `(..., 1+H)` with the ego first, and the others `(..., H)`. Values for a helper that may not be
-    asked are arbitrary.
+    helpers, index h for helper h, and A actions. Values for a helper that may not be asked are
+    arbitrary.
     """
 
     # the ego's intent, its probabilities of its actions, `(..., A)`; the fallback, such as all
     # alike, where its answer failed
     own: Floats
-    entropy_nats: Floats  # entropy of `own`, `(...)`: how unsure the ego is
+    entropy_nats: Floats  # entropy of `own` in nats, `(...)`: how unsure the ego is
     may_ask: Bools  # which helpers are in the radius and would answer, `(..., H)`
     range_m: Floats  # each helper's distance to the ego, m, `(..., H)`
     # each vehicle's distance to the centroid of the conflict zone, m, `(..., 1+H)`, the ego first
     distance_m: Floats
-    # probability that request and reply are received within the window, `(..., H)`, by the
-    # channel's model for such links, if all who may be asked are asked
+    # probability that request and reply are received within the decision window, `(..., H)`, by the
+    # channel's model, if all who may be asked are asked; None if the schedule does not need it
     in_time: Floats | None = None
-    outlook: Outlook | None = None  # what the ego sees, and what helpers would add
-    lot: Floats | None = None  # a draw in [0, 1), new at each decision, `(...)`
+    # how much the ego sees of where a danger may come from, and what helpers would add; None if the
+    # schedule does not need it
+    outlook: Outlook | None = None
+    # a random number in [0, 1), new at each decision, `(...)`; None if the schedule does not need
+    # it
+    lot: Floats | None = None
 
 
 @runtime_checkable
@@ -137,7 +139,7 @@ class Formula:
 def never(inputs: ScheduleInputs) -> Floats:
     """Return a worth of minus infinity, `(..., 1)`, so that nobody is ever asked.
 
-    It is the formula of schedule `never`, for decisions `(...)`.
+    It is the formula of schedule `never`; `inputs` is what the ego knows in decisions `(...)`.
     """
     return np.full((*inputs.entropy_nats.shape, 1), -np.inf)
 
@@ -145,8 +147,8 @@ def never(inputs: ScheduleInputs) -> Floats:
 def entropy(inputs: ScheduleInputs) -> Floats:
     """Return how unsure the ego is as the worth of asking anybody, `(..., 1)` (paper Eq. 3).
 
-    It is the entropy of its intent, in nats, in decisions `(...)`: the formula of schedule
-    `entropy`.
+    It is the formula of schedule `entropy`: the entropy, in nats, of the ego's intent, its
+    probabilities of the actions. `inputs` is what the ego knows in decisions `(...)`.
     """
     return inputs.entropy_nats[..., None]
 

@@ -34,29 +34,28 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 class Trust:
     """Learn during an episode which helpers to trust, and fuse only the intents of those.
 
-    A consensus rule. A helper's claimed place and speed, and its intents, count for or against it
-    (the module's description has the checks). `faith` is what counts for and against one before its
-    first message, a full contradiction counts `contradiction` times a full agreement, and the share
-    `kept` of all that counts is left at the next decision. The other numbers bound what may be
-    true, in m and m/s.
+    A consensus rule. A helper's claimed place and speed, and its intents, its probabilities of the
+    ego's actions, count for or against it (the module's description has the checks).
 
     All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`).
     """
 
-    # what counts for and against a helper before its first message
+    # what counts for, and what against, a helper before its first message
     faith: tuple[float, float] = (2.5, 0.5)
     kept: float = 0.6  # share of what counts for and against a helper that is left at the next step
     contradiction: float = 4.0  # how much more a full contradiction counts than a full agreement
-    place_tolerance_m: float = 5.0  # how far a claimed distance may be from the sensed one
-    # how far from the middle of a lane a claimed place may be, in addition to `noise`
+    # how far a helper's claimed distance to the conflict zone may be from the one that the ego's
+    # sensors give, m
+    place_tolerance_m: float = 5.0
+    # how far from the middle of a lane a claimed place may be, m, in addition to `noise`
     lane_tolerance_m: float = 2.0
     # how much the mean speed between two claimed places may differ from the mean of the claimed
-    # speeds, in addition to `noise`
+    # speeds, m/s, in addition to `noise`
     speed_tolerance_mps: float = 2.0
-    top_mps: float = 60.0  # the highest speed of a vehicle
-    apart_m: float = 2.5  # the smallest distance between two vehicles
+    top_mps: float = 60.0  # the highest speed of a vehicle, m/s
+    apart_m: float = 2.5  # the smallest distance between two vehicles, m
     noise: float = 4.0  # how many standard deviations of a beacon's error a true place may be off
-    needs: ClassVar[tuple[str, ...]] = ("claims",)
+    needs: ClassVar[tuple[str, ...]] = ("claims",)  # the optional field of `Messages` that it reads
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
         """Return the rule's memory before the first decision of each episode, `(*batch, K)`.

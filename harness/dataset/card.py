@@ -41,22 +41,20 @@ KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool
 class Table:
     """Describe a Parquet table of a published dataset: its source, size and reference results.
 
-    `sha256` and `bytes` are of its file, `dataset_sha256` is the digest of the manifest of the
-    dataset that it was made of. `rows` is the number of its decision points, `lag_s` the time from
-    a decision to its action. `references` has by name the success of policies that need no model,
-    and `prompt` is the version of the prompt whose chats it has.
+    A decision point is a moment at which a vehicle decides.
     """
 
     manifest: Manifest  # manifest of the dataset that it was made of
-    dataset_sha256: str  # digest of that manifest
-    title: str  # its scenario, for people
+    dataset_sha256: str  # hex digest of that manifest
+    title: str  # name of its scenario, for people
     lag_s: float  # seconds from the moment of a decision to its action
-    released: bool  # whether it is one of the harness's own
-    prompt: str  # the prompt version that its chats are of
+    released: bool  # whether the dataset is one of the harness's own releases
+    prompt: str  # name of the prompt version whose chats it has
     rows: int  # number of its decision points, one a row
-    sha256: str  # digest of its Parquet file
-    bytes: int  # size of that file
-    # success of each policy that needs no model, by name: the mean over layouts, start situations
+    sha256: str  # hex digest of its Parquet file
+    bytes: int  # size of that file, bytes
+    # success of each policy that needs no model, by its name: the mean over layouts, start
+    # situations
     references: Mapping[str, Estimate]
 
     @property

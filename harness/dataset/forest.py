@@ -36,20 +36,20 @@ class Forest:
 
     A decision tree has every decision point that decisions can lead to from a layout, the start
     situation of an episode. There are E trees with N decision points in all and A actions. Decision
-    points are numbered from 0 tree by tree, and within a tree by step, the number of the decision
-    in its episode. `root` (E,), `tree`, `step` (N,) and `child` (N, A) say how they hang together:
-    `child` is the decision point after each action, -1 where the episode ends. `edge` (N, A) is an
-    index in `edges`: an edge is what one or several equivalent actions do at a decision point,
-    which leads to another one or ends the episode. Times are in s.
+    points are numbered from 0 tree by tree, and within a tree by the number of the decision in its
+    episode. An edge is what one or several equivalent actions do at a decision point: it leads to
+    another one or ends the episode.
     """
 
     actions: tuple[str, ...]  # names of the A meta-actions
-    # seconds of needless delay with which an episode of each tree is a success, (E,)
+    # seconds later than the driver that sees everything at which an episode of each tree is still a
+    # success, (E,)
     allowance_s: Floats
     time_limit_s: float  # seconds after which every episode ends
     episodes: Ints  # number of each tree's episode, (E,)
     seeds: Ints  # layout seed of each tree, (E,)
-    # the sector from which each tree's danger comes, E of them; None without one
+    # the sector, a direction, from which the dangerous vehicle of each tree comes, E of them; None
+    # without one
     dangers: tuple[str | None, ...]
     root: Ints  # number of each tree's first decision point, (E,)
     ids: tuple[str, ...]  # scene ids of the N decision points
@@ -58,8 +58,10 @@ class Forest:
     # number of the decision point to which each action leads, (N, A); -1 if the episode ends
     child: Ints
     edge: Ints  # index in `edges` of the edge that each action takes, (N, A)
-    edges: tuple[Edge, ...]  # the edges of all trees
-    # by name of a reference driver the index of the action that it takes at each point, (N,)
+    # the edges of all trees, with where each leads and what happens on the way
+    edges: tuple[Edge, ...]
+    # index of the action that a reference driver takes at each decision point, (N,), by the name of
+    # the driver
     drivers: Mapping[str, Ints]
 
     @classmethod

@@ -29,9 +29,9 @@ class Frozen(NamedTuple):
     """Hold a layout's decision tree and the record of each decision point.
 
     A layout is the start situation of an episode, and its tree has every decision point that
-    decisions can lead to. Both lists have a list for each step, one decision after another:
-    `branchings` what each action does there, and `scenes` the state and what each vehicle knows of
-    it.
+    decisions can lead to. Both lists have a list for each step, the number of the decision from 0,
+    with an entry for each decision point there, in the same order: `branchings` what each action
+    does there, and `scenes` the state and what each vehicle knows of it.
     """
 
     branchings: list[list[Branching]]  # what each action does at each decision point of a step
@@ -42,8 +42,9 @@ class Frozen(NamedTuple):
 def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
     """Simulate and return the decision tree of each layout, in the order of `seeds`.
 
-    A layout is the start situation of an episode, and its tree has every decision point that
-    decisions can lead to. `seeds` has by number of an episode the seed that draws its layout.
+    A layout is the start situation of an episode of `scenario`, and its tree has every decision
+    point that decisions can lead to. `seeds` has the seed that draws a layout, by the number of its
+    episode.
     """
     level = [(episode, World.start(scenario, seed)) for episode, seed in seeds.items()]
     trees = {episode: Frozen([], []) for episode in seeds}
@@ -72,9 +73,10 @@ def edges(
 ) -> tuple[list[list[Edge]], list[tuple[int, World]]]:
     """Simulate every action at the decision points of one step.
 
-    `worlds` are the decision points, and `episodes` the number of each one's episode. Returned are
-    for each point its edges, what its actions lead to, and then the distinct decision points of the
-    next step, each as (episode, world). `Edge.to` counts the next points of the same episode.
+    `worlds` are the simulations at these decision points, and `episodes` the number of each one's
+    episode. Returned are for each point the list of its edges, each what one or several actions
+    lead to, and then the distinct decision points of the next step, each as (number of the episode,
+    simulation). `Edge.to` is an index from 0 among the next points of the same episode.
     """
     waiting = [world.branch() for world in worlds]
     p = worlds[0].scenario.parameters
@@ -167,7 +169,7 @@ def records_of(
     """Return the record of each decision point, as a dataset has it: state and scene graphs.
 
     Each of `points` is the simulation, its state, the number of the episode, and the vehicles whose
-    scene graphs (what they know) are made, the ego first.
+    scene graphs (what they know) are made, the ego first. All are of `scenario`.
     """
     looks = [(state, viewer.id) for _, state, _, viewers in points for viewer in viewers]
     graphs, zone_m = iter(scene_graphs(scenario, looks)), scenario.road().zone_m

@@ -49,14 +49,12 @@ TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over al
 class Scene:
     """Hold one decision point of a dataset or of a drive: its state and its scene graphs.
 
-    A scene graph is what one vehicle knows of the state; `record` has both. Who decides is an
-    agent, `agent` its index, 0 the ego; where that is not the ego of the scenario, the scene is as
-    this agent sees it, with itself as the ego, and `seat` is the scenario so. `several` says
-    whether vehicles beside the ego can decide. `notes` keeps results computed from the scene.
+    A scene graph is what one vehicle knows of the state. An agent is a vehicle that decides; the
+    scene is as the agent that decides here sees it, with itself as the ego.
     """
 
     record: Record  # state and scene graphs, as a dataset has them
-    # results computed from it, by name, kept so that they are computed once
+    # results computed from the scene, by name, kept so that they are computed once
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
     # the scenario with the agent that decides as its ego; None where that is the scenario's own ego
     seat: Scenario | None = None
@@ -96,8 +94,8 @@ class Scene:
     def place(self, viewer: int) -> int:
         """Return the index of a vehicle among all that can be asked, the scenario's own ego first.
 
-        `viewer` is its index in this scene's `viewers`, which begin with the agent that decides
-        here.
+        `viewer` is its index in this scene's `viewers`, which begin with the agent, the vehicle
+        that decides, of this scene.
         """
         if not viewer:
             return self.agent
@@ -139,14 +137,13 @@ class Trees(Sequence[Tree]):
 class Dataset:
     """Hold a verified dataset; its trees and scenes are read and verified when they are used.
 
-    `trees` are the decision trees of its episodes: all that decisions can lead to from each start.
-    `sha256` is the digest of its manifest, which pins every file, and `trusted` says whether it is
-    a released dataset, whose digests vouch for its scenes.
+    A decision tree has all that decisions can lead to from one layout, a start situation; a scene
+    is one decision point.
     """
 
     path: Path  # the dataset's folder
-    manifest: Manifest  # its manifest
-    sha256: str  # digest of the manifest, which pins every file
+    manifest: Manifest  # what the dataset was built from, and the digest of each file
+    sha256: str  # hex digest of the manifest, which pins every file
     trees: Trees  # the decision trees of its layouts, in the order of the episodes
     trusted: bool = False  # whether it is a released dataset, whose digests vouch for its scenes
     _scenes: dict[str, Scene] = field(default_factory=dict, repr=False, compare=False)
@@ -300,7 +297,7 @@ class Dataset:
                 yield record
 
     def scene(self, scene_id: str) -> Scene:
-        """Return the scene with this id, or with the only id that begins like this.
+        """Return the scene with the id `scene_id`, or with the only id that begins like this.
 
         A scene is one decision point. Raises UserError if there is none, or several.
         """

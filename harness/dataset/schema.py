@@ -219,7 +219,10 @@ def _narrowed(kind: type[Closed], /, **fields: Any) -> Any:
 
 
 def record_schema(scenario: Scenario) -> dict[str, Any]:
-    """Return the JSON Schema of a line of `<episode>/<step>.jsonl`: a decision point."""
+    """Return the JSON Schema of a line of `<episode>/<step>.jsonl`: a decision point.
+
+    Only the names of paths and sectors of `scenario` fit it.
+    """
     return _published(record_type(scenario), "decision point")
 
 

@@ -17,10 +17,7 @@ PREFIX = "suite:"  # marks a suite's name where a dataset's name is expected
 
 
 class Suite(Struct, frozen=True, forbid_unknown_fields=True):
-    """Describe a suite: datasets of several scenarios that are evaluated together.
-
-    `datasets` has their names, in the order of tables, and `description` is its purpose.
-    """
+    """Describe a suite: datasets of several scenarios that are evaluated together."""
 
     name: str  # the suite's name
     description: str  # its purpose
@@ -69,7 +66,8 @@ def named(text: str) -> Suite | None:
 def datasets(text: str) -> Sequence[str]:
     """Return the dataset names that `--dataset` gives: those of a suite `suite:NAME`, or the one.
 
-    Raises UserError if there is no such suite, or two, or its table is wrong.
+    `text` is what was typed there. Raises UserError if there is no such suite, or two, or its table
+    is wrong.
     """
     suite = named(text)
     return suite.datasets if suite else (text,)

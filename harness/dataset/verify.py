@@ -41,7 +41,7 @@ LARGEST_ENTRY = 1 << 28  # bytes
 
 
 def read_manifest(path: Path) -> tuple[Manifest, str]:
-    """Read `manifest.json` of a dataset's folder; return it and its SHA-256 digest, in hex.
+    """Read `manifest.json` of the dataset folder `path`; return it and its SHA-256 digest, in hex.
 
     Raises UserError if it is missing or wrong.
     """
@@ -113,7 +113,7 @@ def scenario_of(manifest: Manifest) -> Scenario:
 
 
 def check(path: Path) -> list[str]:
-    """Return all problems of the dataset in a folder, one line each; empty if it is sound.
+    """Return all problems of the dataset in the folder `path`, one line each; empty if none.
 
     Every file, decision tree and scene is read. Raises UserError if the manifest is missing or
     wrong.
@@ -147,7 +147,10 @@ def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[s
 
 
 def file_problems(path: Path, manifest: Manifest) -> Iterator[str]:
-    """Yield a line for each file of the manifest that is missing or whose digest differs."""
+    """Yield a line for each file of the manifest that is missing or whose digest differs.
+
+    `path` is the dataset's folder.
+    """
     for name, expected in manifest.files.items():
         if not (path / name).is_file():
             yield f"{name}: missing"
@@ -161,7 +164,7 @@ class Damaged(Exception):
 
 @contextmanager
 def opened(path: Path) -> Iterator[ZipFile]:
-    """Open the archive `layouts.zip` of a dataset's folder, for as long as the context lasts.
+    """Open the archive `layouts.zip` of the dataset folder `path`, as long as the context lasts.
 
     Its entries are not yet verified. Raises UserError if it cannot be read.
     """
@@ -209,8 +212,9 @@ def _entry(file: ZipFile, name: str, sha256: str) -> bytes:
 def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = False) -> Tree:
     """Read an episode's decision tree: every course that decisions can take from its start.
 
-    `file` is the archive `layouts.zip`. The content of a `trusted` dataset is not checked beyond
-    its digest and types. Raises Damaged if its digest or content is wrong.
+    `file` is the archive `layouts.zip`, `episode` the episode's number, and `manifest` has the
+    tree's digest. The content of a `trusted` dataset is not checked beyond its digest and types.
+    Raises Damaged if its digest or content is wrong.
     """
     name = tree_name(episode)
     data = _entry(file, name, manifest.trees_sha256[episode])
@@ -306,8 +310,9 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
 def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, list[str]]:
     """Decode a scene's JSON line; return the scene's record, and a line for each problem.
 
-    The record is None if it cannot be decoded, and may be used only if there is no problem. `name`
-    is the scene id that it should have.
+    The record is None if it cannot be decoded, and may be used only if there is no problem.
+    `manifest` is the dataset's, which the record must fit, and `name` is the scene id that it
+    should have.
     """
     scenario = scenarios.get(manifest.scenario)
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
@@ -322,9 +327,9 @@ def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, 
 
 
 def unusable(path: Path, problem: str) -> UserError:
-    """Return the error for a dataset, by its folder, that has a problem (a phrase).
+    """Return the error for the dataset in the folder `path` that has a problem.
 
-    It says what to do about it.
+    `problem` is a phrase, such as that a file is missing. The error says what to do about it.
     """
     return UserError(
         f"dataset {printable(path)}, {problem}; `harness dataset check` lists all; restore or "

@@ -69,7 +69,7 @@ def decides(fields: set[str], role: str) -> bool:
 def in_schema(schema: dict[str, Any], role: str, actions: Sequence[str]) -> list[Found]:
     """Return the answers that a model wrote into a JSON Schema, in place of an answer to it.
 
-    `schema` is the object that it wrote. Each answer is a pair: its members, and the repairs
+    `schema` is the object that it wrote. Each answer is a pair: its members by key, and the repairs
     (corrections) that finding it took. Answers stand beside the schema's keywords, or under
     `properties` in place of types. `role` is `ego` or `helper`, and `actions` are the names of
     meta-actions.
@@ -122,10 +122,10 @@ def gathered(
 ) -> Found:
     """Return an answer's members with its fields moved up from one level deeper, and the repairs.
 
-    A repair is one correction of the text. `members` are the answer's values by key. `role` is
-    `ego` or `helper`, and `actions` are the names of meta-actions. Members whose keys are in
-    `apart` are left alone. Raises Failure (of status conflicting_answers) if two members have the
-    same field.
+    A repair is one correction of the text. `members` are the answer's values by key, and so are
+    those returned. `role` is `ego` or `helper`, and `actions` are the names of meta-actions.
+    Members whose keys are in `apart` are left alone. Raises Failure (of status conflicting_answers)
+    if two members have the same field.
     """
     given = fields_of(members, role, actions)
     repairs: frozenset[Repair] = frozenset()

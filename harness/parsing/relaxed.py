@@ -48,7 +48,7 @@ _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "b": "\b", "f": "\f", "\n": ""}
 
 
 class Repeated(dict[str, Any]):
-    """Hold an object in which a key was repeated, with the last value of each key."""
+    """Hold a JSON object in which a key was repeated, as a dict with the last value of each key."""
 
 
 class Broken(Exception):
@@ -112,7 +112,11 @@ class Token:
 
 
 def next_token(text: str, at: int) -> Token:
-    """Return the first token of almost-JSON at or after `at`, skipping white space and comments."""
+    """Return the first token of almost-JSON in `text` at or after the index `at`.
+
+    White space and comments are skipped. Almost-JSON is JSON with the slips of models, such as bare
+    keys.
+    """
     repairs: frozenset[Repair] = frozenset()
     while True:
         while at < len(text) and text[at].isspace():

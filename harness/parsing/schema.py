@@ -24,7 +24,10 @@ def further(members: dict[str, Any], shape: Shape) -> dict[str, Any] | None:
 
 
 def is_json(value: object) -> bool:
-    """Return whether a decoded value has no repeated key and no NaN, which JSON does not allow."""
+    """Return whether a decoded value has no repeated key and no NaN, which JSON does not allow.
+
+    Objects with a repeated key are `relaxed.Repeated`.
+    """
     if isinstance(value, dict):
         return not isinstance(value, Repeated) and all(map(is_json, value.values()))
     if isinstance(value, list):

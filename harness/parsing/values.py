@@ -189,7 +189,10 @@ def _in_unit(numbers: list[tuple[float, bool]], repairs: set[Repair]) -> list[fl
 
 
 def check_range(name: str, value: float) -> None:
-    """Raise Failure (out_of_range) unless a probability is from 0 to 1; `name` is for messages."""
+    """Raise Failure (out_of_range) unless a probability, `value`, is from 0 to 1.
+
+    `name` is what messages call it.
+    """
     if not 0 <= value <= 1:
         raise Failure(Status.OUT_OF_RANGE, f"{printable(name, 40)} is {value:.4g}, outside 0..1")
 
@@ -206,7 +209,10 @@ def in_percent(value: object, rest: Sequence[object]) -> object:
 
 
 def is_placeholder(value: object) -> bool:
-    """Return whether a value is a prompt's placeholder for a number: p1, <number>, 0..1."""
+    """Return whether a value that a model wrote is a prompt's placeholder for a number.
+
+    Such are `p1`, `<number>` and `0..1`, which stand in a prompt in place of a number.
+    """
     return isinstance(value, str) and bool(_PLACEHOLDER.fullmatch(value.strip()))
 
 
@@ -242,7 +248,7 @@ def _folded(text: str) -> str:
 
 
 def is_schema(value: object) -> bool:
-    """Return whether an object is a JSON Schema instead of an answer to it."""
+    """Return whether a decoded JSON value is a JSON Schema instead of an answer to it."""
     return isinstance(value, dict) and ("$schema" in value or "properties" in value)
 
 

@@ -70,8 +70,8 @@ def _marks(text: str) -> Iterator[Mark]:
 def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
     """Return a template's text with each mark replaced by one of its alternatives.
 
-    A mark (see `Mark`) names alternatives in the text. `choice` has the number of the alternative,
-    from 0, by the mark's name; marks that it lacks take the first.
+    A mark (see `Mark`) is a place in `text` that has alternative texts. `choice` has the index,
+    from 0, of the alternative to take, by the mark's name; marks that it lacks take the first.
     """
     pieces, place = [], 0
     for mark in _marks(text):
@@ -83,9 +83,10 @@ def resolved(text: str, choice: Mapping[str, int] = FIRST) -> str:
 def counts(texts: Iterable[str]) -> dict[str, int]:
     """Return the number of alternatives of each mark in some templates, by the mark's name.
 
-    A mark (see `Mark`) names alternatives in a template; `texts` are the templates' texts. Raises
-    ValueError if a mark has one alternative, too many parts, a reserved name, or another number of
-    alternatives elsewhere, and if there are more than `MOST_MARKS` marks.
+    A mark (see `Mark`) is a place in a template that has alternative texts; `texts` are the
+    templates' texts. Raises ValueError if a mark has one alternative, too many parts, a reserved
+    name, or another number of alternatives elsewhere, and if there are more than `MOST_MARKS`
+    marks.
     """
     sizes: dict[str, int] = {}
     for text in texts:

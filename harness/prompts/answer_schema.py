@@ -169,7 +169,8 @@ def longest(schema: Mapping[str, Any]) -> int:
 def plainest(schema: Mapping[str, Any]) -> Any:
     """Return a minimal value that fits a JSON Schema: an empty text, the first choice, 0.
 
-    It stands for a further member of an answer that a rule writes, which has nothing to say.
+    `schema` is that of a further member of an answer, which a prompt may ask for beside the
+    decision; a rule that answers has nothing to say there.
     """
     if "enum" in schema:
         return schema["enum"][0]

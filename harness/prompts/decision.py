@@ -37,15 +37,14 @@ CARE = {
 class Question:
     """State a choice between actions, or other options.
 
-    A decision model gives each option a probability. `state` is what the prompt says of the scene,
-    `instructions` what is asked, and `meanings` what each option means, by its name, None where
-    nobody says. `kind` is the question's type in the API of servers of such models.
+    A decision model gives each option a probability.
     """
 
     state: str  # what the prompt says of the scene
     instructions: str  # what is asked, in the scenario's words
-    meanings: Mapping[str, str | None]  # of each action or other option; None where nobody says
-    kind: Kind = "choice"  # how servers of decision models type it
+    # what each action, or other option, means, by its name; None where nobody says
+    meanings: Mapping[str, str | None]
+    kind: Kind = "choice"  # the question's type in the API of servers of such models
 
     def reworded(self, change: Callable[[str], str]) -> "Question":
         """Return the question with `change` applied to all of its texts."""

@@ -101,7 +101,7 @@ class Sent:
 
 
 def change(a: Prompt, b: Prompt) -> PromptChange:
-    """Compare the settings and the template texts of prompt version A with those of B.
+    """Compare the settings and the template texts of prompt version `a` with those of `b`.
 
     A prompt version is a folder of templates and settings.
     """
@@ -153,12 +153,12 @@ def sent(
     scenario: Scenario,
     count: Callable[[Iterable[Mapping[str, str]]], int] | None = None,
 ) -> list[Sent]:
-    """Render what prompt versions A and B ask about a scene, and compare it question by question.
+    """Render what two prompt versions ask about a scene, and compare it question by question.
 
-    A prompt version is a folder of templates and settings. The questions are that to the ego, that
-    to its first helper, and that to the ego with a message of every helper. `scenario` gives the
-    actions and words of the prompts. `count` returns the number of tokens of chat messages; None
-    leaves them uncounted.
+    `a` and `b` are prompt versions, folders of templates and settings. The questions are that to
+    the ego, that to its first helper, and that to the ego with a message of every helper.
+    `scenario` gives the actions and words of the prompts. `count` returns the number of tokens of
+    chat messages; None leaves them uncounted.
     """
     ego, *helpers = scene.viewers
     questions: list[tuple[str, str, Sequence[str]]] = [(ego, "ego", ())]
@@ -197,7 +197,7 @@ def _size(messages: Iterable[Mapping[str, str]]) -> int:
 
 
 def words(a: str, b: str) -> TextChange:
-    """Compare text A with text B word by word; return the changes with the words around them."""
+    """Compare text `a` with `b` word by word; return the changes with the words around them."""
     before, after = WORD.findall(a), WORD.findall(b)
     hunks, removed, added = [], 0, 0
     for group in SequenceMatcher(None, before, after, autojunk=False).get_grouped_opcodes(CONTEXT):
@@ -220,7 +220,7 @@ def _count(tokens: Iterable[str]) -> int:
 
 
 def marked(hunk: Hunk) -> list[tuple[Kind, str]]:
-    """Return the pieces of a change as they are printed, with marks around what differs.
+    """Return the pieces of a change, `hunk`, as they are printed, with marks around what differs.
 
     Each is a pair: `same`, `removed` or `added`, and the words. Marks are `[-removed-]` and
     `{+added+}`. A line break in a change is shown as ↵.

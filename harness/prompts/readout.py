@@ -49,7 +49,10 @@ def spelt(token: str) -> str:
 
 
 def question(actions: Sequence[str]) -> str:
-    """Return the line that asks for a letter: `Answer with one letter: A SLOWER, B IDLE`."""
+    """Return the line that asks for a letter: `Answer with one letter: A SLOWER, B IDLE`.
+
+    `actions` are the names of the meta-actions; the first has the letter A.
+    """
     options = ", ".join(
         f"{letter} {a}" for letter, a in zip(letters(actions), actions, strict=True)
     )

@@ -193,7 +193,7 @@ class Sandbox(templates.Sandbox):
         super()._put_steps_into(source)
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Return whether an expression of a template is known to cost nothing to read.
+        """Return whether an expression of a template, `node`, is known to cost nothing to read.
 
         Such is a number. The rendering's budget of steps, which limits its work, is charged for all
         others.
@@ -207,10 +207,10 @@ class Sandbox(templates.Sandbox):
         return self.filters["int"](self.filters["round"](value))
 
     def call_binop(self, context: Context | None, operator: str, left: Any, right: Any) -> Any:
-        """Compute a binary operator of the values `left` and `right` in a prompt template.
+        """Compute a binary operator, such as `*`, of `left` and `right` in a prompt template.
 
         `*`, `**` and `%` are for numbers only, and powers must be small; raises jinja2's
-        SecurityError otherwise.
+        SecurityError otherwise. Jinja calls it, with the `context` of the rendering.
         """
         if type(left) is float and operator in ("+", "-", "*") and type(right) in (float, int):
             # costs nothing; the rest takes a microsecond

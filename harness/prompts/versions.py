@@ -51,46 +51,39 @@ class Prompt:
     """Hold one prompt version, which turns scene graphs into chats: its templates and settings.
 
     A version is a folder of templates, one for each role: `ego`, the vehicle that decides, or
-    `helper`. A scene graph is what one vehicle, the viewer, sees of a scene. `version` is the
-    folder's name, `sha256` the digest of its files, and `released` whether it may no longer change.
-
-    `texts` has the templates by role, and `max_answer_tokens` the most tokens of an answer by role;
-    `token_budget` has the least and most of a rendered prompt. `helper_answer` and `ego_answer` are
-    the forms of answers that are asked for: a distribution over the actions, or one action with a
-    confidence. `max_objects` limits the vehicles that are listed, and `max_conflicts` the points
-    where their paths meet the ego's (None for all). `examples` are earlier turns with the right
-    answers, `extension` has the JSON Schemas of further members of an answer by role, and `image`
-    says what picture there is; None for none. `reasons_first` are the roles asked for reasons
-    before the answer; `shows_words` and `shows_plans` say which messages the ego's template can
-    show.
+    `helper`. A scene graph is what one vehicle, the viewer, sees of a scene, and a conflict a point
+    where another vehicle's path meets the ego's.
     """
 
     version: str  # name of its folder
-    sha256: str  # digest of its files
-    released: bool  # whether it is pinned; a draft may still change
+    sha256: str  # hex digest of its files
+    released: bool  # whether it may no longer change; a draft may
     description: str  # one line for people
-    # what a helper is asked for: `distribution`, or `recommendation` with a confidence
+    # what a helper is asked for: `distribution` over the actions, or `recommendation`, one action
+    # with a confidence
     helper_answer: Literal["distribution", "recommendation"]
-    # most objects that are listed, one fewer if there are messages; those in conflict come first,
+    # most vehicles that are listed, one fewer if there are messages; those in conflict come first,
     # then the nearest
     max_objects: Count
     token_budget: tuple[Count, Count]  # least and most tokens a rendered prompt may have
     max_answer_tokens: Mapping[str, Count]  # most tokens an answer may have, by role
     changed: str  # what is new in this version
     known_failures: str  # failures that it is known to provoke
-    texts: Mapping[str, str]  # template text by role
+    texts: Mapping[str, str]  # text of each template, by role
     # roles that are asked for reasons before the answer; the parser then allows such text
     reasons_first: tuple[Literal["ego", "helper"], ...] = ()
-    # what the ego is asked for: `distribution`, or `maneuver`, one action and a confidence
+    # what the ego is asked for: `distribution` over the actions, or `maneuver`, one action with a
+    # confidence
     ego_answer: Literal["distribution", "maneuver"] = "distribution"
-    # most conflicts in the variable `conflicts`, the soonest first; None for all
+    # most conflicts in the template's variable `conflicts`, the soonest first; None for all
     max_conflicts: Count | None = None
-    # earlier turns of the chat, from one scenario; None without any
+    # earlier turns of the chat with the right answers, from one scenario; None without any
     examples: Examples | None = None
     # sets of examples that may be chosen, by their numbers from 1; the first is shown. Empty for
-    # all of them
+    # all of them.
     example_sets: tuple[tuple[Count, ...], ...] = ()
-    # further members of a role's answer, as `Shape` takes them; roles without any are not there
+    # JSON Schemas of further members of an answer, as JSON text, by role; roles without any are not
+    # there
     extension: Mapping[str, str] = field(default_factory=dict)
     # whether the ego's template can show a message that holds words alone, a `sender` and
     # `evidence`
@@ -98,7 +91,7 @@ class Prompt:
     # whether the ego's template can show an agent's plan: `sender`, `number`, `intent`,
     # `reaches_s`, `lost_s`
     shows_plans: bool = False
-    # picture before the user's text: what the viewer's `camera` sees; None if there is none
+    # picture before the user's text: `camera`, what the viewer's cameras see; None if there is none
     image: Literal["camera"] | None = None
     # the text of each of its files by name, as they were read
     files: Mapping[str, str] = field(default_factory=dict, repr=False, compare=False)
@@ -161,7 +154,8 @@ class Prompt:
     def most_answer_tokens(self, role: str) -> int:
         """Return the most tokens that the answer of a role, `ego` or `helper`, may have.
 
-        It is `max_answer_tokens`, and one per character of the further members that are asked for.
+        It is that of `max_answer_tokens`, and one more for each character that the further members
+        asked for may have.
         """
         further = self.shape(role, ()).further
         return self.max_answer_tokens[role] + (longest(closed(further)) if further else 0)

@@ -21,14 +21,14 @@ CLEAR, VEHICLE, BUILDING = 0, 1, 2
 
 
 class Antenna(NamedTuple):
-    """Hold where an antenna stands that is on no vehicle, such as one beside the road, m.
+    """Hold where an antenna stands that is on no vehicle, such as one beside the road.
 
     The conflict zone is the area where other vehicles' paths meet the ego's.
     """
 
     x_m: float  # position, m to the east of the centroid of the conflict zone
     y_m: float  # position, m to the south of it
-    height_m: float  # above the ground, m
+    height_m: float  # height above the ground, m
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,17 @@ class Site:
     # positions, `(..., 1+H, 2)`, the ego's first: m to the east and to the south of the road's
     # origin; NaN for an absent helper
     xy_m: Floats
-    # what stands between the ego and each helper, `(..., H)`: one of the codes CLEAR (nothing),
-    # VEHICLE or BUILDING
+    # what stands between the ego and each helper, `(..., H)`: `CLEAR` (nothing), `VEHICLE` or
+    # `BUILDING`, whole numbers of this module
     sight: Ints
-    # height of the tallest vehicle between them, m, `(..., H)`; 0 without one
-    blocker_m: Floats
+    blocker_m: Floats  # height of the tallest vehicle between them, m, `(..., H)`; 0 without one
     # distance of the ego and of the helper to the crossing of their streets, m, `(..., H, 2)`; NaN
     # if the streets do not cross
     corner_m: Floats
     # height of the antenna at the first position, m; None if it is as high as all others
     first_m: float | None = None
-    # the sites of antennas on no vehicle: each has the antenna in the ego's place, then the ego and
-    # the helpers, `(..., 2+H, 2)`
+    # the sites of antennas on no vehicle, by antenna: each site has the antenna in the ego's place,
+    # then the ego and the helpers, so its `xy_m` is `(..., 2+H, 2)`
     antennas: Mapping[Antenna, "Site"] = field(default_factory=dict)
 
     @property
@@ -85,7 +84,7 @@ class Site:
         )
 
     def select(self, links: slice) -> "Site":
-        """Return the site with only the helpers in a slice of the H, and without antennas."""
+        """Return the site with only the helpers in `links`, a slice of the H, without antennas."""
         xy_m = np.concatenate(
             [self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2
         )
@@ -112,14 +111,13 @@ class Site:
 class Draws:
     """Hold the channel's uniform random numbers in [0, 1), the same for every operating point.
 
-    They are of the links between the ego and H helpers, in decisions of any shape `(...)`. A
-    message is lost if its draw is below the probability of a loss, so that more loss loses the same
-    messages and others.
+    They are of the links between the ego and H helpers, in decisions of any shape `(...)`. An
+    operating point is the settings of radio, asking and fusion. A message is lost if its draw is
+    below the probability of a loss, so that more loss loses the same messages and others.
     """
 
-    # for channels of one loss: draws of the request to each helper and of its reply,
-    # `(..., H, 2)`; equal for all steps of an episode under block fading, where a link that is lost
-    # stays lost
+    # for channels of one loss: draws of the request to each helper and of its reply, `(..., H, 2)`;
+    # equal for all steps of an episode where a link that is lost stays lost (block fading)
     link: Floats
     jitter: Floats  # for such channels: a draw of each reply's delay, `(..., H)`
     # for physical channels, whose loss depends on positions: the keys from which all further draws
@@ -288,7 +286,7 @@ class Delivery(NamedTuple):
     # whether request and reply are received, `(..., H)`; anything for helpers that were not asked
     up: Bools
     # seconds from the request to the end of the reply's slot, `(..., H)`; inf for helpers that were
-    # not asked. A lost reply keeps its slot
+    # not asked. A lost reply keeps its slot.
     delay_s: Floats
     # probability that one transmission, a request or a reply, is lost, `(..., H)`; `(..., 1)` if
     # all links have the same
@@ -338,12 +336,13 @@ class Physical(Channel, Protocol):
         """
 
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
-        """Return the share of background packets that are received at distances, m, `(n,)`.
+        """Return the share of background packets that are received at distances, `(n,)`.
 
-        Background packets are what other vehicles send, such as beacons. `sight` is the obstacle
-        between the antennas, such as `CLEAR`, one for all or `(n,)`. The share is a mean over
-        shadowing, the slow change of received power by what stands around, and without `sight` also
-        over obstacles as in the model's source.
+        `distance_m`, `(n,)`, are m between the antennas. Background packets are what other vehicles
+        send, such as beacons. `sight` is the obstacle between the antennas, such as `CLEAR`, one
+        for all or `(n,)`. The share is a mean over shadowing, the slow change of received power by
+        what stands around, and without `sight` also over obstacles as often as the model's source
+        has them.
         """
 
     def loss(self, site: Site, shadow: Floats, bits: Floats | float) -> Floats:

@@ -20,17 +20,13 @@ from harness.radio.channel import Broadcast, Delivery, Draws, Links, served_s
 class Radio:
     """Define a channel with one nominal latency and one loss for all links, as the paper has it.
 
-    Both are assumptions; there is no link budget. `latency_s` is that of one exchange, request
-    included, and `jitter_s` the largest delay that a reply has beside it. With `access` `serial`
-    replies are sent one after another, with `parallel` all at once. With `density_coupled` the loss
-    follows from the number of vehicles near; with `roadside_edge` a reply has a second path, by a
-    roadside unit.
+    Both are assumptions: nothing is computed from positions.
     """
 
     # nominal seconds of one exchange, the request included, without serialisation
     latency_s: Seconds
     # probability that one transmission is lost. If helpers open rounds of their own, it is the loss
-    # with that many active vehicles, if that is larger
+    # with that many active vehicles, if that is larger.
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")]
     # bits per second while a message is on air
     bandwidth_bps: Annotated[float, Meta(ge=1, le=1e15, description="bits per second, 1 or more")]
@@ -42,13 +38,14 @@ class Radio:
     # whether the loss follows from the vehicles in the radius, the ego included, asked or not
     density_coupled: bool = False
     # whether replies also travel over a roadside edge node, in a second hop as long as the first,
-    # with its jitter. The two paths are declared independent. Requests are direct
+    # with its jitter. The two paths are declared independent. Requests are direct.
     roadside_edge: bool = False
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
         """Return when helpers have a request of `bits`: after these divided by the bandwidth.
 
-        The rest of its time is in the nominal latency.
+        The rest of its time is in the nominal latency. `bits` is one number or `(...)`, and the
+        times have its shape; `draws` are not used.
         """
         return Broadcast(bits / self.bandwidth_bps, bits / self.bandwidth_bps)
 
@@ -56,6 +53,7 @@ class Radio:
         """Return whether, and when, the reply of each helper asked, by `links`, is received.
 
         A serial medium serves the helper first that is ready first, so a slow one delays no other.
+        `draws` are the channel's random numbers.
         """
         active = links.in_radius if self.density_coupled else links.rounds
         loss = density_coupled_loss(1 + count_of(active)[..., None])
@@ -85,7 +83,7 @@ def link_up(uniforms: Floats, loss: Floats, roadside_edge: bool = False) -> Bool
 
     The probability is (1 - loss)^2. `uniforms` are draws in [0, 1) of each helper's request and
     reply, `(..., H, 2)`; `loss` is the probability that one transmission is lost, `(..., H)` or
-    `(..., 1)`. With a roadside edge, an antenna beside the road, a reply has a second path, so that
+    `(..., 1)`. With `roadside_edge`, an antenna beside the road, a reply has a second path, so that
     it is lost with probability loss^2.
     """
     return (uniforms[..., 0] >= loss) & (uniforms[..., 1] >= (loss**2 if roadside_edge else loss))

@@ -27,8 +27,8 @@ class Network:
     source: str  # who measured the round trips, where and how many
     # `cited` from a publication or its data, `measured` by oneself, or `assumed`
     status: Literal["cited", "measured", "assumed"]
-    # milliseconds that so many percent of the round trips stay below, by percentage as a text,
-    # from 0 to 100
+    # milliseconds that so many percent of the round trips stay below, by the percentage as a text,
+    # from `0` to `100`
     quantiles_ms: dict[str, Milliseconds]
 
     def round_trip_s(self, uniforms: Floats) -> Floats:

@@ -31,7 +31,10 @@ MODELS = Shipped[Any]("swarmdrive.channel_models", object, {"constant": Radio})
 
 @dataclass(frozen=True)
 class Profile:
-    """Hold the content of a channel profile, a file of `channels/`: model, parameters, source."""
+    """Hold the content of a channel profile, a file of `channels/`: model, parameters, source.
+
+    A channel decides which messages over the radio arrive, and when.
+    """
 
     model: str  # name of the channel model, one of `MODELS`
     description: str  # one sentence for lists
@@ -39,7 +42,8 @@ class Profile:
     # the source's kind: `measured` on radios, `cited` from a publication, `modelled`, or `assumed`
     status: Literal["measured", "cited", "modelled", "assumed"]
     parameters: dict[str, Any] = field(default_factory=dict)  # the model's parameters, by name
-    # for some parameters, the least and largest value for which the source validated the model
+    # for some parameters, by name, the least and largest value for which the source validated the
+    # model
     limits: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 

@@ -21,9 +21,10 @@ from harness.radio.channel import (
 
 @dataclass(frozen=True)
 class Wrapped:
-    """Wrap a physical channel, whose loss depends on positions, and forward everything to it.
+    """Wrap `channel`, a physical one, and forward everything to it; a base class.
 
-    It is a base class: subclasses change part of what the channel does.
+    A physical channel is one whose losses follow from the vehicles' positions. Subclasses change
+    part of what the channel does.
     """
 
     channel: Physical  # the wrapped channel
@@ -132,7 +133,7 @@ def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) ->
 
 @dataclass(frozen=True)
 class AtLoss(Wrapped):
-    """Wrap a physical channel so that its loss is the same everywhere, whatever the positions.
+    """Wrap a physical channel so that each transmission is lost with the same `probability`.
 
     A physical channel is one whose losses follow from positions; its times stay as they are.
     """

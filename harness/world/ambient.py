@@ -17,8 +17,7 @@ Colour = tuple[int, int, int]
 class Ambient:
     """Describe one kind of light and weather by its effect on cameras and rendered pictures.
 
-    Up to `camera_m` a camera tells a vehicle's class and lamps; over `fades_m` contrast falls to
-    1/e. Lengths are in m, and colours red, green and blue from 0 to 255.
+    A colour is its red, green and blue, from 0 to 255.
     """
 
     camera_m: float  # distance up to which a camera tells class, indicator and brake lamps, m
@@ -44,6 +43,6 @@ AMBIENTS = {
 def sun_rad(episode_seed: int) -> float:
     """Return the bearing of a low sun, rad from +x (east) towards +y (south).
 
-    It is drawn by the episode's layout seed, the number that fixes who stands where at the start.
+    It is drawn by `episode_seed`, the layout seed: it fixes who stands where at an episode's start.
     """
     return float(noise.uniforms((1,), "sun", episode_seed)[0]) * radians(360.0)

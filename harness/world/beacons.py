@@ -101,8 +101,8 @@ def lead_in(p: Parameters, poses: Floats) -> Floats:
     """Extrapolate poses at the start of an episode back in time, to when its beacons begin.
 
     `poses` are x and y (m), heading (rad) and speed (m/s) of V vehicles, (V, 4), which have driven
-    at constant speed until then. The result is (F, V, 4) for F frames, the start last. `p` has the
-    rate and the delay of beacons and the frames a second.
+    at constant speed until then. The result is (F, V, 4): poses in each of F frames, the start
+    last. `p` has the scenario's rate and delay of beacons and the frames a second.
     """
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz

@@ -43,21 +43,24 @@ DECIMALS = 3  # decimals of both, s
 
 @dataclass(frozen=True, eq=False)
 class Conflicts:
-    """Hold how near in time others came to an agent since a decision, and poses still needed.
+    """Hold how near in time others came to an agent since a decision, and where all have been.
 
-    An agent is a vehicle that decides for itself; there are V vehicles, the agent first among them.
-    `ttc_s` and `pet_s` are the least time to collision and post-encroachment time, s, as the module
-    defines them. `trail` and `box` are where vehicles have been: what `observe` needs to go on.
+    An agent is a vehicle that decides for itself. Of V vehicles it is the first, and index v of an
+    axis of length V is vehicle v. `observe` makes the next of these from one and the frames that
+    follow.
     """
 
-    ttc_s: float = np.inf  # least time to collision, s; inf if nobody came near
+    # least time to collision, s: until two outlines touch if both vehicles drive straight on; inf
+    # if nobody came near
+    ttc_s: float = np.inf
     # least post-encroachment time, s: from when one vehicle leaves a place to when another arrives;
     # inf if nobody came near
     pet_s: float = np.inf
-    # x and y, m, and heading, radians, of each vehicle at the last T moments, (T, V, 3)
+    # x and y, m, and heading, rad, of each vehicle at the last T moments at which all were
+    # measured, oldest first, (T, V, 3)
     trail: Floats = field(default_factory=lambda: np.empty((0, 0, 3)))
-    # the box around all outlines of each vehicle so far, m: least x, least y, and the negatives of
-    # greatest x and greatest y, (4, V)
+    # bounds of the area that each vehicle's outline has covered so far, m, (4, V): rows are the
+    # least x, the least y, and the negatives of the greatest x and the greatest y
     box: Floats = field(default_factory=lambda: np.empty((4, 0)))
 
     def anew(self) -> "Conflicts":
@@ -70,8 +73,8 @@ class Conflicts:
     def recast(self, places: Sequence[int]) -> "Conflicts":
         """Return a copy for another list of vehicles, as when one has come or gone.
 
-        `places` has, for each vehicle of the list now, its index in the list before, -1 for a new
-        one. The past poses of a vehicle that has left are dropped.
+        `places` has, for each vehicle of the new list, its index from 0 in the old one, -1 for one
+        that was not in it. What is kept of a vehicle that has left is dropped.
         """
         at = np.array(places)
         trail = (
@@ -84,7 +87,10 @@ class Conflicts:
 
 
 def rounded(measure_s: float) -> float | None:
-    """Return a time of conflict (s), such as TTC, rounded for a file; None if not finite."""
+    """Return a time of conflict, `measure_s` (s), rounded for a file; None if it is not finite.
+
+    It is a time to collision or a post-encroachment time.
+    """
     return round(measure_s, DECIMALS) if np.isfinite(measure_s) else None
 
 
@@ -111,11 +117,12 @@ def observe(
     """Return the conflict times of each of W simulated episodes, after F more frames.
 
     Args:
-        before: each episode's record until then, of its agent, the vehicle that decides.
+        before: what is known of each episode until then, W of them, from the last call or
+            `Conflicts()`.
         poses: x and y (m), heading (rad) and speed (m/s) of V vehicles in each frame, (W, F, V, 4),
-            the agent first; NaN where there is no vehicle.
+            first the agent, the vehicle that decides; NaN where there is no vehicle.
         sizes_m: length and width of each vehicle, m, (W, V, 2).
-        first_frame: number of each episode's first frame here, (W,).
+        first_frame: number of each episode's first frame here, counted from its start, (W,).
         hz: frames a second.
     """
     every = max(1, round(hz / MOMENTS_HZ))
@@ -180,8 +187,9 @@ def times_to_collision(
     """Return the time to collision of n pairs of vehicles that drive straight on, (n,) s.
 
     It is inf for never. `poses` and `others` are x and y (m), heading (rad) and speed (m/s) of the
-    one and the other of each pair, (n, 4), and the sizes their lengths and widths, m, (n, 2).
-    Vehicles are rectangles, which touch when their extents overlap along all four of their axes.
+    one and the other of each pair, (n, 4); `sizes_m` and `their_sizes_m` are their lengths and
+    widths, m, (n, 2). Vehicles are rectangles, which touch when their extents overlap along all
+    four of their axes.
     """
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     its_cos, its_sin = np.cos(others[:, 2]), np.sin(others[:, 2])

@@ -144,10 +144,10 @@ def network() -> Any:
 
 
 def ground(far_m: float) -> Ground:
-    """Return what pictures show of both roads: their surface, centre lines and stop lines.
+    """Return what rendered pictures show of both roads: their surface, centre lines and stop lines.
 
-    They reach `far_m` from the centre of the crossing; positions are in m to the east and the
-    north.
+    They are drawn up to `far_m` m from the centre of the crossing. The `Ground` has their points, m
+    to the east and the north of it.
     """
     half = LANE_WIDTH_M
     # One corner of the junction, from the north arm to the east arm; a quarter turn gives the next.

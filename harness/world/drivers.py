@@ -38,10 +38,11 @@ def choose(
 ) -> str:
     """Return the meta-action, such as `SLOWER`, that a reference driver takes for the ego.
 
-    `driver` is `cruise`, `brake`, `local-view` or `full-view`, a rule of the road (`right-hand`,
-    `first-come`), or an action that is always taken. `graph` is the ego's scene graph, what its
-    sensors and beacons tell; `truth` is the graph with everything in view and no noise, which only
-    `full-view` reads. Drivers that read neither accept None. Raises ValueError if the driver's
+    A reference driver is a rule that needs no model. `driver` is `cruise`, `brake`, `local-view` or
+    `full-view`, a rule of the road (`right-hand`, `first-come`), or an action that is always taken.
+    `graph` is the ego's scene graph, what its sensors and beacons tell; `truth` is the graph with
+    everything in view and no noise, which only `full-view` reads. Drivers that do not read one
+    accept None for it. `scenario` has the actions and the road. Raises ValueError if the driver's
     graph is missing.
     """
     [action] = choices(scenario, [(driver, graph, truth)])
@@ -53,10 +54,10 @@ def choices(
 ) -> list[str]:
     """Return the meta-action that the driver of each request takes for its ego.
 
-    A request is what `choose` takes beside the scenario: a driver's name, or that of an action that
-    is always taken, then the ego's scene graph by its sensors, and the graph with everything in
-    view, which only `full-view` reads. Raises ValueError if a driver was not given the graph that
-    it reads.
+    Each of `requests` is a driver's name, or that of an action that is always taken; the ego's
+    scene graph, what its sensors and beacons tell; and the graph with everything in view, which
+    only `full-view` reads. A graph that the driver does not read may be None. All are of one
+    `scenario`. Raises ValueError if a driver was not given the graph that it reads.
     """
     always = {**{action: action for action in scenario.actions}, **ALWAYS}
     planned = iter(

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class Family(Protocol):
     """Make scenarios by name: an extension's reader of names such as `env:merge-v0`.
 
-    What stands before the colon is the family's own name. `heading` stands above the family's
-    `options` in the help of commands; `options` has each option's name and help, such as that of a
-    module to import.
+    What stands before the colon is the family's own name. `options` are options of a command by
+    which users can describe such a scenario in place of its name: the help text of each, by its
+    name, such as that of a module to import. `heading` stands above them in the command's help.
     """
 
     heading: str  # text above the family's options in the help of commands
@@ -66,6 +66,7 @@ FAMILIES = Shipped[Family]("swarmdrive.families", Family, {})  # of none but ext
 def family_of(text: str) -> Family | None:
     """Return the family that a scenario's name begins with, as in `env:merge-v0`; None without.
 
+    A family is an extension's reader of such names; `text` is the name, with or without settings.
     Raises UserError if the family is of an extension that is not installed.
     """
     name, colon, _ = text.partition(":")

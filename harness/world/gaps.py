@@ -10,10 +10,10 @@ from harness.world.state import rectangle, separation_m
 def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
     """Return the least gap between the outlines of the ego and any other vehicle, (W,) m.
 
-    It is of each of W simulated episodes over F frames. `poses` are x and y (m) and heading (rad)
-    of V vehicles, (W, F, V, 3 or more), the ego first, NaN where there is no vehicle. `sizes_m` are
-    their lengths and widths, (W, V, 2). `least_m`, (W,), is the least gap of earlier frames; no
-    result exceeds it.
+    It is of each of W simulated episodes over F frames. `poses` are x and y (m) and heading (rad),
+    then anything, of V vehicles, (W, F, V, 3 or more), the ego first, NaN where there is no
+    vehicle. `sizes_m` are their lengths and widths, (W, V, 2). `least_m`, (W,), is the least gap of
+    earlier frames; no result exceeds it.
     """
     centres_m = np.hypot(*np.moveaxis(poses[:, :, 1:, :2] - poses[:, :, :1, :2], -1, 0))
     # Two centres are at least both half widths apart from touching, and at most both half

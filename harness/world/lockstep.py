@@ -39,7 +39,8 @@ AT_ONCE = 128  # more worlds do not fit into the processor's cache
 def advance(worlds: "Sequence[World]", until_frames: Sequence[int]) -> None:
     """Simulate several episodes of one scenario together, in place.
 
-    Each goes on until its frame number in `until_frames`, or until all of its outcomes are decided.
+    Each of `worlds` goes on until its frame number in `until_frames`, counted from the start of its
+    episode, or until all of its outcomes are decided.
     """
     pairs = [
         (world, until)
@@ -130,9 +131,8 @@ class Lanes:
     """Hold the L lanes of a road network as arrays, so that many vehicles are located at once.
 
     A lane has a number from 0, its index in the arrays, and a name, highway-env's index of it: the
-    two nodes of its road, and its place from the left. It is straight (`base`, `along`, `across`,
-    `heading`) or an arc (`base`, `radius`, `phase`, `sign`); any other kind is in `others`, and
-    left to highway-env. Lengths are in m and angles in rad.
+    two nodes of its road, and its place from the left. It is straight or an arc of a circle; what
+    is of the other kind means nothing for it. x is to the east and y to the south.
     """
 
     number: dict[Lane, int]  # number of each lane by highway-env's index
@@ -225,9 +225,9 @@ def _lanes(road: Callable[[], Road]) -> Lanes:
 class Fleet:
     """Hold the vehicles of B episodes, at most V each, as arrays that are simulated together.
 
-    Arrays are (B, V), the ego first in each episode. Positions `xy`, collision impacts and sizes
-    are (B, V, 2) m, headings are in rad and speeds in m/s; `frame`, (B,), counts each episode's
-    frames. Where an episode has fewer than V vehicles, `there` is false.
+    Arrays are (B, V), a row an episode, with its ego first; those of two components, such as the
+    positions `xy`, m, are (B, V, 2). Headings are in rad and speeds in m/s. `frame`, (B,), counts
+    each episode's frames. Where an episode has fewer than V vehicles, `there` is false.
     """
 
     def __init__(self, worlds: "Sequence[World]") -> None:
@@ -308,7 +308,7 @@ class Fleet:
         self._index()
 
     def write(self, row: int, world: "World") -> set[str]:
-        """Copy the vehicles of one row of the arrays back into the episode's `World`.
+        """Copy the vehicles of one row of the arrays back into `world`, the episode's simulation.
 
         `row` is the episode's index among the B. Returns the ids of vehicles that had crashed
         before the last frame.

@@ -35,15 +35,15 @@ class Draft:
     """Hold one random draw of an episode's start, not yet checked for who sees the danger.
 
     A danger is the vehicle that would meet an ego which keeps its speed; a sector is a direction
-    that it may come from. `layout` is the start situation, with the lookouts as helpers: they see a
-    danger wherever it comes from. `phantoms` has the danger that each sector would have, and
-    `seats` are cars in blind seats, places from which it cannot be seen.
+    that it may come from. Lookouts are helpers that see a danger wherever it comes from; blind
+    seats are places from which none can be seen.
     """
 
-    layout: Layout  # start situation, with lookouts as helpers and nobody in the blind seats
-    # for each sector, the vehicle that would be its danger; it replaces the one with the same id
+    layout: Layout  # the start situation, with lookouts as helpers and nobody in the blind seats
+    # for each sector, the vehicle that would be its danger; it takes the place of the one in
+    # `layout` with the same id
     phantoms: tuple[Spawn, ...]
-    seats: tuple[Spawn, ...]  # cars that cannot see the danger; empty if the draws name none
+    seats: tuple[Spawn, ...]  # further cars, in blind seats; empty if the draws name none
 
 
 def placed(
@@ -52,9 +52,10 @@ def placed(
     """Return the layout of a seed, with the witnesses and radios that the parameters declare.
 
     A layout is the start situation of an episode, and a witness a helper that has the danger in
-    sight at the first decision. `draft` makes one random draw of it from the `Draws` and the
-    parameters; it is called again until the vehicles meant to see the danger do, and no others.
-    Raises UserError if none of `MOST_ATTEMPTS` draws fits.
+    sight at the first decision. `draft` makes one random draw of the situation; it takes the
+    `Draws`, which draw its quantities by the seed, and the `parameters`. It is called again until
+    the vehicles meant to see the danger do, and no others. Raises UserError if none of
+    `MOST_ATTEMPTS` draws fits.
     """
     if parameters.witnesses == "any":
         layout = draft(Draws(scenario.name, seed), parameters).layout
@@ -92,8 +93,9 @@ def radios(scenario: Scenario, seed: int, danger: str | None) -> dict[str, Any]:
     """Return the columns `witnesses` (a count) and `danger_radio` (a bool) of a layout's table row.
 
     They say how many helpers have the danger in sight at the first decision, and whether the danger
-    itself sends beacons. `danger` is the sector (direction) that the danger comes from, None
-    without one. A value is None where the scenario's parameters declare none.
+    itself sends beacons. The layout, a start situation, is the one that `seed` draws; `danger` is
+    the sector (direction) that its danger comes from, None without one. A value is None where the
+    scenario's parameters declare none.
     """
     p = scenario.parameters
     radio = has_radio(scenario.name, p, seed) if danger and p.radio_share else None
@@ -110,9 +112,10 @@ def queue(
     """Return helper cars lined up behind the ego, from where they cannot see the danger.
 
     Args:
-        draws: the layout's draws; one car is made for each of its `seats`, none if it has none.
-        ids: id of the vehicle for each name in `draws.seats`.
-        ego: the ego's start, whose path they share.
+        draws: draws the layout's random quantities; one car is made for each name in its `seats`,
+            none if it has none.
+        ids: id of the vehicle, such as `v7`, for each name in `draws.seats`.
+        ego: the ego's start, whose path the cars share.
         gaps_m: bounds of the uniform gap between centres, m, for each car from the ego backwards.
         speed_mps: bounds of the speed that they have in common, m/s.
     """

@@ -31,10 +31,7 @@ ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 class Outcome:
     """Describe how an episode ended for one agent (usually the ego), or that it still runs.
 
-    An agent is a vehicle that decides. `result` says how, and `time_s` when, in s from the start.
-    `partner`, `striker` and `fault` describe a collision, and are None without one. `least_gap_m`
-    is the nearest that another vehicle's outline came, m, and `other_crashes` counts vehicles that
-    crashed without the ego.
+    An agent is a vehicle that decides for itself.
     """
 
     # `cleared` (the ego reached its goal, the only success), `collision`, or a forced failure:
@@ -42,10 +39,13 @@ class Outcome:
     # while undecided
     result: Result = "running"
     time_s: float | None = None  # seconds from the start until it was decided; None while running
-    partner: str | None = None  # id of the vehicle that the ego collided with
-    # whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe)
+    # id of the vehicle that the ego collided with; None without a collision
+    partner: str | None = None
+    # whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe); None without a
+    # collision
     striker: str | None = None
-    # who should have given way, or drove into the other's back: `ego` or `other`
+    # who should have given way, or drove into the other's back: `ego` or `other`; None without a
+    # collision
     fault: str | None = None
     # smallest distance so far between the ego's outline and any other vehicle's, m
     least_gap_m: float = 1000.0
@@ -104,14 +104,14 @@ def rating(failure: str, parameters: Parameters) -> Rating | None:
     """Return `success`, `late`, `unsafe` or `stuck` for the result of an ended episode.
 
     `failure` is empty for a success, else `late`, `collision`, `off_road` (both unsafe) or
-    `time_out` (stuck). None if the parameter `limits` is 1, under which outcomes are not put into
-    these words.
+    `time_out` (stuck). `parameters` are the scenario's: None is returned if their `limits` is 1,
+    under which outcomes are not put into these words.
     """
     return None if parameters.limits == 1 else RATINGS[failure or "cleared"]
 
 
 def outline(v: VehicleState) -> Polygon:
-    """Return a vehicle's outline as a shapely polygon, in m to the east and the south."""
+    """Return the outline of vehicle `v` as a shapely polygon, in m to the east and the south."""
     return Polygon(v.corners())
 
 

@@ -26,7 +26,8 @@ class OwnWorld(World):
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> World:
         """Restore the episode of a state: play it again from its seed with the actions taken.
 
-        `snapshot` is the `ActionsTaken` that the method `snapshot` returned then.
+        It is an episode of `scenario`; `snapshot` is the `ActionsTaken` that the method `snapshot`
+        returned in that state.
         """
         world = cls.begun(scenario, state.episode_seed)
         for frame, action in snapshot.taken:
@@ -42,14 +43,14 @@ class OwnWorld(World):
 
     @classmethod
     def examine(cls, scenario: Scenario, seed: int) -> None:
-        """Try the episode of a layout seed before many are frozen or driven.
+        """Try the episode of a layout `seed` of `scenario`, before many are frozen or driven.
 
         Raises UserError unless equal seeds and actions lead to equal episodes, also for copies.
         """
 
     @classmethod
     def configuration(cls, scenario: Scenario) -> Mapping[str, Any] | None:
-        """Return how such episodes are made, for a dataset's manifest to state; None for nothing.
+        """Return how episodes of `scenario` are made, for a dataset's manifest; None for nothing.
 
         Keys and values are the class's own: plain ones, which JSON can hold, such as an
         environment's settings.

@@ -43,9 +43,19 @@ class Parameters:
     """Hold the parameters that every scenario has; a scenario adds its own in a subclass.
 
     A unit ends a name where there is one: `_s`, `_m`, `_mps` (m/s), `_mps2` (m/s2), `_rad` or
-    `_hz`; a `_share` is a probability. A beacon is what a vehicle broadcasts about itself. `limits`
-    and `perception` are versions of the rules by which an arrival is late, and by which a vehicle
-    that no sensor reports hides others. Raises UserError if a value is out of bounds.
+    `_hz`; a `_share` or `_loss` is a probability. The ego steps through `target_speeds_mps` by its
+    actions, `decisions` times in an episode, every `decision_period_s`, and acts `decision_lag_s`
+    after it has seen. It fails after `time_limit_s`, or if it arrives later than the driver that
+    sees everything by more than `delay_allowance_s` (`harmless_allowance_s` where no danger is, if
+    `limits` is 2).
+
+    A beacon is what a vehicle broadcasts about itself, at times that `beacon_rule` says, over the
+    radio named `beacon_channel` or with `beacon_loss`, and with normal errors of the standard
+    deviations `beacon_noise_`; there are none under `perfect_knowledge`. `ambient` names light and
+    weather, and `witnesses` says how many helpers have the danger in sight at first (`any`, `each`,
+    `drawn` or a number). `limits` and `perception` are versions of the rules by which an arrival is
+    late, and by which a vehicle that no sensor reports hides others. Raises UserError if a value is
+    out of bounds.
     """
 
     # speeds that SLOWER, IDLE and FASTER step through, m/s
@@ -199,8 +209,9 @@ class Shared(Parameters):
     """Hold the parameters of a scenario whose helpers may be agents, with goals of their own.
 
     An agent is a vehicle that decides for itself (`Scenario.seats`). `agent_share` is the
-    probability that one which could does; under `clock` `apart` each decides at times of its own.
-    The other fields are those of `Parameters`, with other defaults. Raises UserError if a value is
+    probability that one which could does. Under `clock` `together` all decide at the same times,
+    under `apart` each at times of its own. The other fields, such as `decisions` and
+    `time_limit_s`, are those of `Parameters`, with other defaults. Raises UserError if a value is
     out of bounds.
     """
 

@@ -45,18 +45,18 @@ Point = tuple[Floats, Floats]
 class Sequences:
     """Hold n sequences of meta-actions that the planner tries, with what each does to the ego.
 
-    A way is one of the ego's paths that lie side by side, as lanes do. `levels` are changes of
-    target speed, in steps of the scenario's speeds, and `ends` the way on which a sequence ends,
-    counted to the right from the present one; `right_m` is where the ego is across, after each step
-    of `STEP_S` seconds. `calm` ranks sequences, to choose among equals, and `shift` numbers lateral
-    motions.
+    A way is one of the ego's paths that lie side by side, as lanes do. A step is `STEP_S` seconds.
     """
 
     first: Sequence[str]  # name of each one's first action, (n,)
-    levels: Ints  # levels by which each decision changes the target speed, (n, decisions)
+    # number of steps in the scenario's list of target speeds by which each decision changes the
+    # target speed, (n, decisions)
+    levels: Ints
     ends: Ints  # final way, counted to the right from the present one, (n,)
-    calm: Ints  # rank of each among all of them, the calmest first, (n,)
-    # distance to the right of the way that the ego is on now, m, (n, steps); None if it stays
+    # rank of each among all of them, 0 for the calmest, by which one of equals is chosen, (n,)
+    calm: Ints
+    # distance to the right of the way that the ego is on now, after each step, m, (n, steps); None
+    # if it stays on it
     right_m: Floats | None
     shift: Ints  # index of each one's lateral motion among the distinct ones, (n,)
 
@@ -65,15 +65,14 @@ class Sequences:
 class Rollouts:
     """Hold the ego's predicted motions, each shared by all action sequences that lead to it.
 
-    Positions are m along the ego's way and to its right after each step of `STEP_S` seconds,
-    (motions, steps). A way is one of the ego's paths that lie side by side, as lanes do. `motion`,
-    (n,), has for each of n sequences the index of its motion.
+    A step is `STEP_S` seconds. A way is one of the ego's paths that lie side by side, as lanes do.
     """
 
-    travelled_m: Floats  # distance along the ego's way, m, (motions, steps)
-    # distance to the right of the way that the ego is on now, m, (motions, steps); None if it stays
+    travelled_m: Floats  # distance along the ego's way after each step, m, (motions, steps)
+    # distance to the right of the way that the ego is on now, after each step, m, (motions, steps);
+    # None if it stays on it
     right_m: Floats | None
-    motion: Ints  # index of the motion to which each of n sequences leads, (n,)
+    motion: Ints  # index of the motion to which each of n sequences of actions leads, (n,)
 
     @cached_property
     def speed_mps(self) -> Floats:
@@ -94,7 +93,8 @@ Start = tuple[float, float, int, tuple[int, int], int]
 def plan(scenario: Scenario, graph: SceneGraph) -> str:
     """Return the meta-action, such as `SLOWER`, that the reference planner takes for the ego.
 
-    `graph` is the ego's scene graph, all that the planner knows.
+    `graph` is the ego's scene graph, all that the planner knows; `scenario` has the road and the
+    actions.
     """
     [action] = plans(scenario, [graph])
     return action
@@ -103,7 +103,8 @@ def plan(scenario: Scenario, graph: SceneGraph) -> str:
 def plans(scenario: Scenario, graphs: Sequence[SceneGraph]) -> list[str]:
     """Return the meta-action, such as `SLOWER`, that the reference planner takes for each ego.
 
-    Each of `graphs` is an ego's scene graph, all that the planner knows of its scene.
+    Each of `graphs` is an ego's scene graph, all that the planner knows of its scene; all are of
+    `scenario`.
     """
     p, road = scenario.parameters, scenario.road()
     places = [(_way(road, graph.ego), road.zone_arc_m - graph.ego.zone_m) for graph in graphs]
@@ -300,23 +301,22 @@ def _right_m(ends: Ints, parameters: Parameters) -> Floats:
 class Motion:
     """Describe the predicted motion of another vehicle, and the ego's path that it may meet.
 
-    A position on a path is its distance along it from the beginning, m. `way` is the ego's path and
-    `begin_m` where the ego is on it now; `path` is the other's, and `arc_m`, (steps,), where it is
-    after each step of `STEP_S` seconds.
+    A position on a path is its distance along it from the beginning, m. A step is `STEP_S` seconds.
     """
 
     way: Path  # the ego's path
     begin_m: float  # the ego's present position on it, m
     path: Path  # the other's path
-    arc_m: Floats  # the other's position on its path after each step of `STEP_S`, m, (steps,)
+    arc_m: Floats  # the other's position on its path after each step, m, (steps,)
     size_m: tuple[float, float]  # the other's length and width, m
 
 
 def predicted(road: Road, graph: SceneGraph, steps: int) -> list[Motion]:
     """Predict the motions of vehicles that the ego could meet, for `steps` steps of `STEP_S` s.
 
-    They are those with a conflict in the ego's scene graph. They keep path and speed, unless they
-    queue behind another one or are seen to brake.
+    They are those with a conflict, a place where both may meet, in `graph`, the ego's scene graph;
+    `road` has the paths. They keep path and speed, unless they queue behind another one or are seen
+    to brake.
     """
     time_s = np.arange(1, steps + 1, dtype=np.float64) * STEP_S
     key = _way(road, graph.ego)
@@ -412,10 +412,10 @@ def _middles(tried: Rollouts, way: Path, begin_m: float) -> tuple[Point, float]:
 
 @lru_cache(maxsize=64)
 def cover(length_m: float, width_m: float) -> tuple[Floats, float]:
-    """Return equal discs that cover a vehicle of so many metres: their centres and their radius.
+    """Return equal discs that cover a vehicle of length `length_m` and width `width_m`, m.
 
-    Centres are offsets along the vehicle's axis from its middle, (discs,) m, in a shared array that
-    must not be written to; the radius is in m.
+    The first result are their centres, offsets along the vehicle's axis from its middle, (discs,)
+    m, in a shared array that must not be written to; the second is their radius, m.
     """
     count = max(3, round(length_m / width_m))
     places = (np.arange(count) - (count - 1) / 2) * length_m / count

@@ -85,10 +85,10 @@ RULES: Mapping[str, Callable[[Road, SceneGraph, Conflict], bool]] = {
 def under(rule: str, scenario: Scenario, graph: SceneGraph) -> SceneGraph:
     """Return the ego's scene graph, changed as if others obeyed a right-of-way rule.
 
-    `rule` is a key of `RULES`: `right-hand` or `first-come`. Conflicts with vehicles that must give
-    way are dropped. Beside the conflict with a vehicle that goes first stand two like it, in which
-    it comes faster and later, so that a planner leaves it room. Vehicles that keep no rule stay as
-    they are.
+    `rule` is a key of `RULES`: `right-hand` or `first-come`; `graph` is the ego's scene graph in
+    `scenario`. Conflicts with vehicles that must give way are dropped. Beside the conflict with a
+    vehicle that goes first stand two like it, in which it comes faster and later, so that a planner
+    leaves it room. Vehicles that keep no rule stay as they are.
     """
     p, road = scenario.parameters, scenario.road()
     top_mps, conflicts = p.target_speeds_mps[-1], list[Conflict]()

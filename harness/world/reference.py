@@ -27,9 +27,10 @@ BY_DANGER = ("balanced", "dangerous", "harmless")  # success by danger, in a `su
 def decide(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, str]]:
     """Return the meta-actions that drivers now take: for each world, those of its agents.
 
-    A world is one simulated episode; all are of one scenario. `drivers` has the name of each
-    world's reference driver, which decides for all of its agents. Actions are keyed by an agent's
-    index among the vehicles (0 is the ego); an agent whose drive has ended is left out.
+    Each of `worlds` is one simulated episode; all are of one scenario. `drivers` has the name of
+    each world's reference driver, a rule such as `brake`, which decides for all of its agents, the
+    vehicles that decide. Actions are keyed by an agent's index among the vehicles (0 is the ego);
+    an agent whose drive has ended is left out.
     """
     deciding: list[Place] = []
     for n, world in enumerate(worlds):
@@ -67,8 +68,9 @@ def _graphs(
 def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
     """Let each world's driver take all remaining decisions; return each ego's outcome.
 
-    A world is one simulated episode; all are of one scenario, and are driven in place. `drivers`
-    has the name of each world's reference driver, which decides for all of its agents.
+    Each of `worlds` is one simulated episode; all are of one scenario, and are driven in place.
+    `drivers` has the name of each world's reference driver, a rule such as `brake`, which decides
+    for all of its agents, the vehicles that decide.
     """
     turns(worlds, drivers)
     return [world.outcome for world in worlds]
@@ -77,8 +79,9 @@ def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
 def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, list[str]]]:
     """Drive worlds, simulated episodes of one scenario, to their ends; return the actions taken.
 
-    For each world these are the meta-actions of each agent, in order, by the agent's index among
-    the vehicles (0 is the ego). `drivers` has the name of each world's reference driver.
+    For each world these are the meta-actions, in order, of each agent, a vehicle that decides, by
+    the agent's index among the vehicles (0 is the ego). `drivers` has the name of each world's
+    reference driver, a rule such as `brake`.
     """
     scripts: list[dict[int, list[str]]] = []
     for world in worlds:
@@ -113,8 +116,9 @@ def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
     """Drive the episode of a layout seed with a reference driver, and return the ego's outcome.
 
-    `driver` is a name of `DRIVERS`, such as `full-view`, which sees everything. Success is not yet
-    judged for being `late` (`Outcome.judged`).
+    The seed draws the episode's start in `scenario`. `driver` is a name of `DRIVERS`, such as
+    `full-view`, which sees everything. Success is not yet judged for being `late`
+    (`Outcome.judged`).
     """
     [outcome] = finish([World.start(scenario, seed)], [driver])
     return outcome
@@ -123,8 +127,9 @@ def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
     """Drive each seed's episode with every driver of `DRIVERS`; return outcomes by driver.
 
-    There is one dict for each layout seed, in order; a driver is a rule such as `brake`. An outcome
-    is `late` if that driver reached the goal too long after `full-view`, which sees everything.
+    There is one dict for each of `seeds`, layout seeds that draw the episodes' starts in
+    `scenario`; a driver is a rule such as `brake`. An outcome is `late` if that driver reached the
+    goal too long after `full-view`, which sees everything.
     """
     worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
     outcomes = finish(worlds, DRIVERS * len(seeds))
@@ -144,8 +149,9 @@ def drive_apart(
 ) -> list[dict[str, Outcome]]:
     """Drive the episodes of layout seeds on workers; return, for each, outcomes by driver.
 
-    They are those of `drive_all`: of every reference driver, judged for being late. `progress` is
-    called with the number of episodes just done.
+    They are those of `drive_all`: of every reference driver of `scenario`, judged for being late.
+    `workers` are processes or a cluster; `progress` is called with the number of episodes just
+    done.
     """
     return in_chunks(partial(drive_all, scenario), seeds, TOGETHER, workers, progress)
 
@@ -180,8 +186,9 @@ def check(
 ) -> dict[str, Any]:
     """Drive every reference driver through the same episodes; return how well each did.
 
-    By driver, it is a `summary`: how often episodes ended in each way. The layout seeds are
-    `episodes` ones from `seed` on; `progress` is called with the number of episodes just done.
+    The result has, by driver's name, a `summary`: how often episodes ended in each way. The layout
+    seeds of the episodes in `scenario` are `episodes` ones from `seed` on. `workers` are processes
+    or a cluster; `progress` is called with the number of episodes just done.
     """
     seeds = range(seed, seed + episodes)
     layouts = drive_apart(scenario, seeds, workers, progress)
@@ -196,11 +203,11 @@ def check(
 def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str, Any]:
     """Return how often episodes ended in each way, and counts of collisions and crashes.
 
-    The keys `success`, `collision`, `late`, `time_out` and `off_road` have rates with Wilson
-    intervals; `ego_at_fault`, `other_at_fault` and `other_crashes` (of vehicles without the ego)
-    have counts. `dangerous` says which episodes hold a danger, a vehicle that would meet a cruising
-    ego; if some do and some do not, success is also given as `dangerous`, `harmless` and their mean
-    `balanced`.
+    `outcomes` has one of each episode. The keys `success`, `collision`, `late`, `time_out` and
+    `off_road` have rates with Wilson intervals; `ego_at_fault`, `other_at_fault` and
+    `other_crashes` (of vehicles without the ego) have counts. `dangerous` says which episodes hold
+    a danger, a vehicle that would meet a cruising ego; if some do and some do not, success is also
+    given as `dangerous`, `harmless` and their mean `balanced`.
     """
     rates: dict[str, Estimate] = {}
     for result in ("cleared", "collision", "late", "time_out", "off_road"):

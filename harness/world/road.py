@@ -34,14 +34,11 @@ NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
 class Path:
     """Describe one path along the road, in consecutive sections, each a lane of highway-env.
 
-    `points`, (n, 2), are m to the east and to the south of the road's origin. An arc length is the
-    distance along the path from its beginning, m: `arc_m`, (n,), of each point, and `ends_m` of the
-    end of each section but the last. `roles` and `lanes` name each section, in scene graphs and in
-    highway-env. `priority` is the right of way; the higher one goes first.
+    An arc length is the distance along the path from its beginning, m.
     """
 
     approach: str  # where it comes from, such as `left`
-    route: str  # what it does, such as `straight`. A vehicle on a route `left` or `right` indicates
+    route: str  # what it does, such as `straight`; a vehicle on a route `left` or `right` indicates
     # n evenly spaced points, m to the east and to the south of the road's origin, (n, 2)
     points: Floats
     arc_m: Floats  # arc length of each point, m, (n,)
@@ -120,7 +117,11 @@ class Path:
 
     @cached_property
     def uneven_m(self) -> float:
-        """Return how far, at most, a point is along the path from where even spacing puts it, m."""
+        """Return the largest distance, m, of a point from its place if all were evenly spaced.
+
+        It is along the path. Points count as evenly spaced if their arc lengths are whole multiples
+        of the first spacing; then it is 0.
+        """
         return float(np.abs(self.arc_m - self.arc_m[1] * np.arange(len(self.arc_m))).max())
 
     @cached_property
@@ -134,8 +135,9 @@ class Path:
     def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         """Project a position on the path: arc length (m), unsigned lateral offset (m), heading.
 
-        The position is in m to the east and south of the road's origin. The heading is that of the
-        path there, rad from +x (east) towards +y (south).
+        `x_m` and `y_m` are m to the east and south of the road's origin; the arc length is the
+        distance along the path from its beginning. The heading is that of the path there, rad from
+        +x (east) towards +y (south).
         """
         arc, lateral, heading = self.project_all(np.array([x_m]), np.array([y_m]))[:, 0].tolist()
         return arc, lateral, heading
@@ -144,8 +146,8 @@ class Path:
         """Project n positions on the path; return arc lengths, offsets and headings, (3, n).
 
         Arc lengths along the path and unsigned offsets from it are in m, and headings those of the
-        path there, rad. The positions, (n,) each, are in m to the east and south of the road's
-        origin.
+        path there, rad from +x (east) towards +y (south). `x_m` and `y_m`, (n,), are m to the east
+        and south of the road's origin.
         """
         if self._step is None:
             nearest = self._tree.query_nearest(shapely.points(x_m, y_m), all_matches=False)[1]
@@ -182,16 +184,17 @@ class Path:
     def at(self, arc_m: float) -> tuple[float, float, float]:
         """Return x (m), y (m) and heading (rad) of the path at an arc length.
 
-        That is the distance from the path's beginning, m. x is to the east and y to the south of
+        `arc_m` is the distance from the path's beginning, m. x is to the east and y to the south of
         the road's origin.
         """
         x, y, heading = self.places(np.array(arc_m))
         return float(x), float(y), float(heading)
 
     def places(self, arc_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return x (m), y (m) and heading (rad) of the path at arc lengths (...), each (...).
+        """Return x (m), y (m) and heading (rad) of the path at arc lengths, each (...).
 
-        An arc length is the distance from the path's beginning, m.
+        `arc_m`, (...), are distances from the path's beginning, m. x is to the east and y to the
+        south of the road's origin.
         """
         x, y = (np.interp(arc_m, self.arc_m, along) for along in self.columns)
         return (
@@ -201,7 +204,10 @@ class Path:
         )
 
     def points_at(self, arc_m: Floats) -> Floats:
-        """Return positions on the path, (n, 2) m, at arc lengths (n,), m from its beginning."""
+        """Return positions on the path, (n, 2) m to the east and south of the road's origin.
+
+        They are at `arc_m`, (n,), distances from the path's beginning, m.
+        """
         return np.stack(self.places(arc_m)[:2], axis=-1)
 
     def section(self, arc_m: float) -> int:
@@ -229,8 +235,7 @@ def _within(points: Floats, reach_m: float) -> Floats:
 class Crossing:
     """Describe the point where another path meets the ego's: it crosses it, or merges into it.
 
-    An arc length is the distance along a path from its beginning, m. The point is in m to the east
-    and south of the road's origin.
+    An arc length is the distance along a path from its beginning, m.
     """
 
     x_m: float  # position, m to the east of the road's origin
@@ -243,11 +248,11 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Ground:
-    """Hold what pictures show of a road's ground, in m to the east and to the *north*.
+    """Hold what rendered pictures show of a road's ground, in m to the east and to the *north*.
 
-    `outlines` are edges of the surface, `marks` centre lines and `stops` stop lines, each points
-    (n, 2); `boxes` are areas that labels must avoid, each its south-west and north-east corner,
-    (2, 2).
+    `outlines` are edges of the road's surface, `marks` centre lines and `stops` stop lines, each an
+    array of points, (n, 2); `boxes` are areas that labels must avoid, each its south-west and
+    north-east corner, (2, 2).
     """
 
     # edges of the surface, (n, 2) each: the outer one, and those of islands
@@ -263,43 +268,43 @@ class Road:
     """Describe a road with all of its paths, and which of its places matter to the ego.
 
     A path's key is its approach (where it comes from) and its route (what it does). The conflict
-    zone is where others may meet the ego, at `zone_m`; `crossings` are the points where other paths
-    meet the ego's. A sector is a direction that danger can come from, with the points, (k, 2), that
-    must be seen. `ways` are the ego's paths side by side, as lanes are. `network()` returns
-    highway-env's road network, `goal_m(parameters)` how far along its path the ego's goal is, and
-    `ground(far_m)` what pictures show; `facts` describe the road in datasets. Positions are in m to
-    the east and south of the origin.
+    zone is where others may meet the ego. A sector is a direction that danger can come from.
+    Positions are in m to the east and south of the origin.
     """
 
     # description in frozen records: texts, and numbers with their unit in the name
     facts: Mapping[str, str | float]
-    paths: Mapping[PathKey, Path]  # every path, by approach and route
+    paths: Mapping[PathKey, Path]  # every path, by its key
     ego: PathKey  # key of the ego's path
-    # points where other paths meet the ego's, at which conflicts are looked for
+    # points where other paths meet the ego's, at which conflicts are looked for, by the other
+    # path's key
     crossings: Mapping[PathKey, Crossing]
-    # position of the conflict zone; messages are weighted by the distance to it
+    # position of the centroid of the conflict zone; messages are weighted by the distance to it
     zone_m: tuple[float, float]
-    # sectors that danger can come from, each with the points (k, 2) m that must be seen
+    # the points, (k, 2) m, that must be seen in each sector, by its name
     sectors: Mapping[str, Floats]
     # returns the road network, a `highway_env.road.road.RoadNetwork`, always the same object, which
     # must not be written to
     network: Callable[[], Any]
-    # paths that the ego reaches by changing lane, from left to right, `ego` among them; they lie
-    # side by side and are equally long
+    # keys of the paths that the ego reaches by changing lane, from left to right, `ego` among them;
+    # they lie side by side and are equally long
     ways: tuple[PathKey, ...] = ()
     # form of the scene graphs: 2 lists every relation to the ego's ways; 1 lists crossings only, as
     # in the frozen dataset `occluded-intersection-v2`
     form: Literal[1, 2] = 2
     origin_m: tuple[float, float] = (0.0, 0.0)  # position of the origin in highway-env's own frame
-    # returns, for the scenario's parameters, the arc length of the ego's path at which the episode
-    # ends; vehicles beyond do not matter. None if the goal is not a place on its path
+    # returns, for the scenario's parameters, the distance along the ego's path, m, at which the
+    # episode ends; vehicles beyond do not matter. None if the goal is not a place on its path.
     goal_m: Callable[[Any], float] | None = None
-    # returns the ground for a picture that reaches so many metres from the origin; None if it is
-    # that of the network's lanes
+    # returns the ground for a picture that reaches so many metres, its argument, from the origin;
+    # None if it is that of the network's lanes
     ground: Callable[[float], Ground] | None = None
 
     def ground_within(self, far_m: float) -> Ground:
-        """Return what pictures show of the ground, up to `far_m` from the origin on each side."""
+        """Return what pictures show of the ground: the surface, centre lines and stop lines.
+
+        They are drawn up to `far_m` m from the road's origin on each side.
+        """
         return self.ground(far_m) if self.ground else ground(self.network(), far_m, self.origin_m)
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[Side, PathKey]:
@@ -372,7 +377,7 @@ def paths_along(
 ) -> dict[PathKey, Path]:
     """Build the paths of a network by key (approach, route).
 
-    `network` is a `highway_env.road.road.RoadNetwork`. Each path is given as the indices of its
+    `network` is a `highway_env.road.road.RoadNetwork`. `ways` has, by key, the indices of a path's
     consecutive lanes, the role of each lane in scene graphs, and the right of way, the higher one
     first.
     """
@@ -448,9 +453,10 @@ def to_the_left(
 
 
 def lanes_of(network: Any) -> dict[Lane, Any]:
-    """Return the lanes of a road network by their index: two nodes and a number from the left.
+    """Return the lanes of a road network by highway-env's index of each.
 
-    `network` is a `highway_env.road.road.RoadNetwork`, and a lane an object of highway-env.
+    Such an index is the two nodes of the lane's road, and its number from the left. `network` is a
+    `highway_env.road.road.RoadNetwork`, and a lane an object of highway-env.
     """
     lanes: dict[Lane, Any] = {}
     for begin, following in network.graph.items():
@@ -460,10 +466,10 @@ def lanes_of(network: Any) -> dict[Lane, Any]:
 
 
 def ground(network: Any, far_m: float, origin_m: tuple[float, float] = (0.0, 0.0)) -> Ground:
-    """Build the ground that pictures show of all lanes within `far_m` of the origin.
+    """Build what rendered pictures show of the ground: the edges and centre lines of the lanes.
 
-    It is made of the lanes of `network`, a `highway_env.road.road.RoadNetwork`, in whose frame the
-    road's origin is at `origin_m`, m.
+    It is made of the lanes of `network`, a `highway_env.road.road.RoadNetwork`, within `far_m` m of
+    the road's origin. `origin_m` is where that origin is in the network's own frame, m.
     """
     lanes = network.lanes_list()
     view = shapely.box(-far_m, -far_m, far_m, far_m)

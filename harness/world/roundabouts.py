@@ -26,8 +26,9 @@ NAMES = ("own", "right", "oncoming", "left")
 class Roundabout:
     """Describe a one-lane roundabout with four arms around the origin.
 
-    `ring_m` is the radius of the middle of its lane, `entry_m` that of the arcs by which cars enter
-    and leave, and `beside_m` the distance of an arm's centre line to the middle of its lanes, m.
+    `ring_m` is the radius of the middle of its lane, m, `entry_m` that of the arcs by which cars
+    enter and leave, m, and `beside_m` the distance of an arm's centre line to the middle of its
+    lanes, m.
     """
 
     ring_m: float  # radius of the middle of the ring's lane, m

@@ -22,15 +22,15 @@ class Draws:
     """Draw the random quantities of one layout, each keyed by its name and the layout seed.
 
     A layout is the start situation of an episode. So a parameter that changes one quantity leaves
-    the draws of all others as they are. `attempt` counts earlier draws that did not fit, and
-    `seats` names further cars that see no danger (`harness.world.lookouts`).
+    the draws of all others as they are.
     """
 
     scenario: str  # name of the scenario
-    seed: int  # layout seed
-    attempt: int = 0  # number of earlier draws that did not fit (`harness.world.lookouts`)
-    # names of the cars in blind seats, places from which no danger can be seen
-    seats: tuple[str, ...] = ()
+    seed: int  # layout seed, the number that fixes the layout
+    # number of earlier draws of this layout that did not fit, since the wrong vehicles saw the
+    # danger
+    attempt: int = 0
+    seats: tuple[str, ...] = ()  # names of further cars, which stand where no danger can be seen
 
     def share(self, what: str) -> float:
         again = (self.attempt,) if self.attempt else ()
@@ -40,10 +40,12 @@ class Draws:
         return bounds[0] + self.share(what) * (bounds[1] - bounds[0])
 
     def ids(self, names: Collection[str]) -> dict[str, str]:
-        """Draw vehicle ids from `v5` on for the vehicles named in `names` and `seats`, by name.
+        """Draw the ids of a layout's other vehicles; return each one's id by its name.
 
-        Ids are shuffled, and absent vehicles get one too, so neither an id nor a gap between two
-        tells anything about a vehicle. The ego and the helpers have `v1` to `v4`.
+        `names` are the scenario's own words for vehicles that a layout may have, such as `late`;
+        those in `seats` are added. Ids are `v5` and on in random order, and absent vehicles get one
+        too, so neither an id nor a gap between two tells anything about a vehicle. The ego and the
+        helpers have `v1` to `v4`.
         """
         names = (*names, *self.seats)
         order = noise.generator(self.scenario, self.seed, "ids").permutation(len(names)).tolist()
@@ -54,37 +56,34 @@ class Draws:
 class Spawn:
     """Describe one vehicle at the start of an episode, and when it brakes by itself.
 
-    It is `arc_m` m along its path, which is known by its approach (where it comes from) and its
-    route (what it does). `part` is `ego`, `helper` (may be asked for messages) or `other`; `radio`
-    says whether an `other` sends beacons. From `brakes_at_s` s on, if that is not None, it brakes
-    with `brakes_mps2` down to `brakes_to_mps`.
+    Its path is known by its approach (where it comes from) and its route (what it does).
     """
 
     id: str  # `v1`, `v2`, …
-    kind: Kind  # class of vehicle
-    part: Part  # `ego`, `helper` or `other`
-    approach: str  # where its path comes from
-    route: str  # what its path does
+    kind: Kind  # class of vehicle: `car`, `van` or `truck`
+    part: Part  # `ego`, `helper` (may be asked for messages) or `other`
+    approach: str  # where its path comes from, such as `left`
+    route: str  # what its path does, such as `straight`
     arc_m: float  # position along the path, m from its beginning
-    speed_mps: float  # speed, m/s
+    speed_mps: float  # speed at the start, m/s
     # seconds from the start until it begins to brake by itself; None if it does not
     brakes_at_s: float | None = None
     brakes_mps2: float = 0.0  # its deceleration then, m/s2
     brakes_to_mps: float = 0.0  # the speed down to which it brakes, m/s
-    radio: bool = field(default=False, kw_only=True)  # whether one that does not help sends beacons
+    radio: bool = field(default=False, kw_only=True)  # whether an `other` sends beacons
 
 
 @dataclass(frozen=True)
 class Layout:
     """Hold the start situation of one episode: its vehicles, its buildings and its danger.
 
-    A danger is the vehicle that would meet an ego which keeps its speed: `danger_id` is its id, and
-    `danger` the sector, the direction that it comes from. Both are None without a danger.
+    A danger is the vehicle that would meet an ego which keeps its speed.
     """
 
-    spawns: tuple[Spawn, ...]  # vehicles in spawn order, the ego first
+    spawns: tuple[Spawn, ...]  # its vehicles at their starts, the ego first
     buildings: tuple[Building, ...]  # obstacles to sight besides vehicles
-    danger: str | None  # sector that the danger comes from; None without a danger
+    # name of the sector, the direction that the danger comes from; None without a danger
+    danger: str | None
     danger_id: str | None  # id of the dangerous vehicle; None without a danger
 
     @classmethod
@@ -97,9 +96,9 @@ class Layout:
     ) -> "Layout":
         """Return a layout with the vehicles in the order of their ids.
 
-        `spawns` are the vehicles in any order. `danger` is the sector, or direction, that the
-        dangerous vehicle `danger_id` comes from; if it is None the layout has no danger, and the id
-        is ignored.
+        `spawns` are the vehicles in any order, and `buildings` what blocks sight beside them.
+        `danger` is the sector, or direction, that the dangerous vehicle `danger_id` comes from; if
+        it is None the layout has no danger, and the id is ignored.
         """
         order = sorted(spawns, key=lambda spawn: int(spawn.id[1:]))
         return cls(tuple(order), tuple(buildings), danger, danger_id if danger else None)
@@ -109,9 +108,10 @@ class Layout:
 class Seat:
     """Describe the scenario as an agent other than the ego plays it: with that agent as the ego.
 
-    An agent is a vehicle that decides for itself. The road network, name, actions and parameters
-    are the shared scenario's; road, goal and prompt words are the agent's own. `names` translates
-    keys of paths, (approach, route), from the shared road's to the agent's.
+    An agent is a vehicle that decides for itself. `scenario` has the road network, name, actions
+    and parameters of the shared scenario, but road, goal and prompt words of the agent's own.
+    `names` has, by the key (approach, route) of a path of the shared road, the key that it has on
+    the agent's.
     """
 
     scenario: "Scenario"  # the scenario with the agent as its ego
@@ -123,44 +123,41 @@ class Seat:
 class Scenario:
     """Describe one scenario: its road, layouts, goal, actions, parameters and words for prompts.
 
-    A layout is the start situation of an episode. `road()` returns the road,
-    `layout(seed, parameters)` draws the start of an episode,
-    `cleared(xy_m, approaches, parameters)` tells whether egos have reached their goal, and
-    `seats()` returns the scenario as other vehicles that decide play it. `words` are texts for
-    prompts, `prompt` the default prompt version, and `dials` the parameters that a user may set
-    behind the name. `one_sided` says why a mirrored scene would be wrong. A scenario is pickled by
-    name and parameters, so it must be found by name in the registry, `harness.world.scenarios`.
+    A layout is the start situation of an episode. A scenario is pickled by name and parameters, so
+    it must be found by name in the registry, `harness.world.scenarios`.
     """
 
     name: str  # its name for users, and in manifests and frozen states
     description: str  # text whose first line is `Scenario <name>: <summary>`
     # names of highway-env's meta-actions that the ego chooses from, the most careful first
     actions: tuple[str, ...]
-    parameters: Parameters  # its parameters
+    parameters: Parameters  # its parameters, such as speeds and the time limit
     road: Callable[[], Road]  # returns the road, always the same object
-    # draws the start of a seed's episode, `(seed, parameters)`
+    # draws the start of an episode: takes its layout seed and the parameters
     layout: Callable[[int, Any], Layout]
-    # tells whether the ego has reached its goal, `(xy_m, approaches, parameters)`. It is called
-    # after every frame, for any number of worlds: `xy_m` has the vehicles' centres in highway-env's
-    # own frame (..., V, 2), the ego first, NaN where a world has fewer, and `approaches` theirs
-    # (..., V)
+    # tells whether egos have reached their goal, (...): takes `xy_m`, the centres of V vehicles of
+    # any number of episodes in highway-env's own frame, m, (..., V, 2), the ego first, NaN where an
+    # episode has fewer, then `approaches`, where their paths come from, (..., V), and the
+    # parameters. It is called after every frame.
     cleared: Callable[[Floats, Texts, Any], Bools]
-    # texts for prompts: `task`, after "You drive car v1:", and `hiding`, after "Others may be
-    # hidden by". Templates read `words.<name>`
+    # texts for prompts by name: `task`, after "You drive car v1:", and `hiding`, after "Others may
+    # be hidden by". Templates read `words.<name>`.
     words: Mapping[str, str]
     brake_lamps: bool = False  # whether vehicles have brake lamps
     prompt: str = "v4"  # default prompt version
     # why scenes with left and right swapped are not valid scenes; None if they are
     one_sided: str | None = "nothing says that a mirrored scene is one of it"
-    dials: tuple[str, ...] = SETTABLE  # parameters that a name may set: `NAME:beacon_loss=0.3`
-    # returns the seats of vehicles with goals of their own, by the path that they begin on, always
-    # the same object; `cleared` of a seat's scenario is asked about its agent alone. None if only
-    # the ego has a goal
+    # names of the parameters that a user may set behind the name: `NAME:beacon_loss=0.3`
+    dials: tuple[str, ...] = SETTABLE
+    # returns the scenario as other vehicles that decide play it, each with itself as the ego, by
+    # the path (approach, route) that they begin on, always the same object; `cleared` of such a
+    # scenario is asked about its agent alone. None if only the ego has a goal.
     seats: Callable[[], Mapping[PathKey, Seat]] | None = None
     # the class of its worlds, an `OwnWorld`, if they are played elsewhere; None for the harness's
     # own simulator
     world: type[Any] | None = None
-    # spelling of 0.2, until 0.4.0: what starts an episode of such a world, `(scenario, seed)`
+    # spelling of 0.2, until 0.4.0: what starts an episode of such a world; takes the scenario and
+    # the layout seed
     start: InitVar[Callable[["Scenario", int], Any] | None] = None
 
     def __post_init__(self, start: Callable[["Scenario", int], Any] | None) -> None:

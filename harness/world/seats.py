@@ -19,7 +19,7 @@ from harness.world.state import VehicleState, WorldState
 
 
 def agent_share(scenario: Scenario) -> float:
-    """Return the probability that a vehicle which could decide for itself does so.
+    """Return the probability that a vehicle of a scenario which could decide for itself does so.
 
     It is for each vehicle but the ego, which always decides; 0 in scenarios where only the ego has
     a goal.
@@ -57,9 +57,10 @@ def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
 def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tuple[int, ...]]:
     """Return a layout, and the indices among its vehicles of the agents, which decide.
 
-    A layout is the start situation of an episode, drawn by `seed`. The ego, an agent, comes first.
-    If `agent_share` is 0 it is the only one and the layout is unchanged. Otherwise agents are drawn
-    by the seed, and a vehicle that could be one and was not drawn becomes traffic (`other`).
+    `layout` is the start situation of an episode of `scenario`, drawn by `seed`. The ego, an agent,
+    comes first. If the parameter `agent_share` is 0 it is the only one and the layout is unchanged.
+    Otherwise agents are drawn by the seed, and a vehicle that could be one and was not drawn
+    becomes traffic (`other`).
     """
     share, seats = agent_share(scenario), seats_of(scenario)
     if not share:
@@ -79,7 +80,7 @@ def agents_of(scenario: Scenario, layout: Layout, seed: int) -> tuple[Layout, tu
 
 
 def offsets(scenario: Scenario) -> list[int]:
-    """Return by how many frames agents may decide later than the ego's clock, ascending.
+    """Return by how many frames agents of a scenario may decide later than its ego, ascending.
 
     An agent is a vehicle that decides for itself. It is [0] unless the parameter `clock` is
     `apart`: then multiples of a quarter of the decision period, in frames of the simulation.
@@ -90,10 +91,10 @@ def offsets(scenario: Scenario) -> list[int]:
 
 
 def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
-    """Return by how many frames one agent decides later than the common clock.
+    """Return by how many frames one agent of a scenario decides later than the common clock.
 
     It is drawn by the layout `seed` and `agent`, the agent's index among the vehicles; 0 for all
-    unless the parameter `clock` is `apart`.
+    unless the parameter `clock` of `scenario` is `apart`.
     """
     times = offsets(scenario)
     if len(times) == 1:
@@ -104,17 +105,18 @@ def offset_of(scenario: Scenario, seed: int, agent: int) -> int:
 
 
 def seat_of(scenario: Scenario, vehicle: VehicleState | Spawn) -> Seat:
-    """Return the seat of an agent other than the ego: the scenario with that agent as its ego.
+    """Return the scenario as an agent other than the ego plays it: with that agent as its ego.
 
-    `vehicle` is that agent, at any time. Raises KeyError if its path has none.
+    An agent is a vehicle that decides for itself; `vehicle` is it, at any time. `scenario` is the
+    shared one. Raises KeyError if nobody decides on its path.
     """
     return seats_of(scenario)[vehicle.approach, vehicle.route]
 
 
 def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
-    """Return, for each scenario in a sequence, the indices from 0 at which it stands there.
+    """Return, for each scenario in `scenarios`, the indices from 0 at which it stands there.
 
-    Scenarios are in the order in which they first come.
+    The keys are in the order in which they first come.
     """
     places: dict[Scenario, list[int]] = {}
     for n, scenario in enumerate(scenarios):

@@ -128,8 +128,8 @@ class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
 def populated(scenario: Scenario, layout: Layout, agents: Collection[int] = (0,)) -> Any:
     """Return a `highway_env.road.road.Road` with a layout's vehicles on it, the ego first.
 
-    A layout is the start situation of an episode. `agents` are the indices among its vehicles of
-    those that decide; all others are traffic, which keeps route and speed.
+    `layout` is the start situation of an episode of `scenario`. `agents` are the indices among its
+    vehicles of those that decide; all others are traffic, which keeps route and speed.
     """
     road, static = new_road(scenario), scenario.road()
     for n, spawn in enumerate(layout.spawns):
@@ -206,9 +206,10 @@ def vehicle_on(
 
 
 def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
-    """Return a vehicle as one that starts at its present position and speed.
+    """Return vehicle `v` as one that starts at its present position and speed.
 
-    `layout` is the start situation of its episode, which says when the vehicle brakes by itself.
+    `layout` is the start situation of its episode in `scenario`, which says when the vehicle brakes
+    by itself.
     """
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     start = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)
@@ -219,7 +220,7 @@ def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
 def state_of(
     v: ControlledVehicle, lamps: bool = False, origin_m: tuple[float, float] = (0.0, 0.0)
 ) -> VehicleState:
-    """Return the state of a highway-env vehicle, with positions from `origin_m`.
+    """Return the state of highway-env's vehicle `v`, with positions from `origin_m`.
 
     `origin_m` is the origin of the scenario's road in highway-env's frame, m. Numbers are rounded
     to `DECIMALS`, since the last bits depend on the machine. Brake lamps are reported only if

@@ -84,8 +84,8 @@ def rectangle(
 ) -> Floats:
     """Return corners of rectangles, (..., 4, 2) m: front left first, then clockwise from above.
 
-    The arguments are centres to the east and south, m, headings (rad, from +x towards +y), lengths
-    and widths (m), each of shape (...).
+    All arguments are of shape (...): `x_m` and `y_m` of the centres, m to the east and south,
+    `heading_rad` (from +x towards +y), and the sizes `length_m` and `width_m`.
     """
     cos, sin = np.cos(heading_rad)[..., None], np.sin(heading_rad)[..., None]
     along = np.multiply.outer(length_m, [1.0, 1.0, -1.0, -1.0]) / 2
@@ -98,7 +98,8 @@ def separation_m(poses: Floats, sizes_m: Floats, others: Floats, their_sizes_m: 
     """Return a lower bound of the gap between n pairs of rectangles, (n,) m, by separating axes.
 
     A negative value means that they overlap. `poses` and `others` are x and y (m) and heading (rad)
-    of the one and the other of each pair, (n, 3); the sizes are length and width, m, (n, 2).
+    of the one and the other of each pair, (n, 3); `sizes_m` and `their_sizes_m` their lengths and
+    widths, m, (n, 2).
     """
     dx, dy = (others - poses)[:, :2].T
     apart = np.full(len(poses), -np.inf)
@@ -177,7 +178,7 @@ class WorldState(Closed, frozen=True):
         return tuple(v for v in self.vehicles if v.part == "helper")
 
     def vehicle(self, vehicle_id: str) -> VehicleState:
-        """Return the vehicle with an id, such as `v2`. Raises KeyError if there is none."""
+        """Return the vehicle with the id `vehicle_id`, such as `v2`. Raises KeyError if none."""
         for v in self.vehicles:
             if v.id == vehicle_id:
                 return v

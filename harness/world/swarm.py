@@ -20,9 +20,9 @@ W = TypeVar("W", bound=World)
 def alone(scenario: Scenario, seeds: Sequence[int]) -> dict[int, dict[int, float]]:
     """Return when each agent would reach its goal with the road to itself, in s.
 
-    An agent is a vehicle that decides for itself. The result is keyed by layout seed, then by the
-    agent's index among the vehicles (0 is the ego). The agent keeps its initial target speed; one
-    that does not arrive gets the scenario's time limit.
+    An agent is a vehicle that decides for itself. The result is keyed by layout seed, one of
+    `seeds`, then by the agent's index among the vehicles (0 is the ego). The agent keeps its
+    initial target speed; one that does not arrive gets the scenario's time limit.
     """
     worlds: dict[tuple[int, int], World] = {}
     for seed in seeds:

@@ -33,15 +33,10 @@ HARD_BRAKING_MPS2 = 4.0  # about 0.4 g, where passengers begin to notice
 
 @dataclass
 class Journey:
-    """Hold what has happened so far in an episode to one agent, a vehicle that decides.
+    """Hold what has happened so far in an episode to one agent, a vehicle that decides."""
 
-    `outcome` says how its drive ended, if it has. `hard_brakings` counts how often it began to
-    brake harder than `HARD_BRAKING_MPS2`, and `conflicts` has how near in time other vehicles came
-    to it.
-    """
-
-    outcome: Outcome = field(default_factory=Outcome)  # its `ended` says whether it is decided
-    hard_brakings: int = 0  # how often it began to brake harder than HARD_BRAKING_MPS2
+    outcome: Outcome = field(default_factory=Outcome)  # how its drive ended, or that it still runs
+    hard_brakings: int = 0  # how often it began to brake harder than `HARD_BRAKING_MPS2`
     braking_hard: bool = False  # whether it braked so hard in the last frame
     conflicts: Conflicts = field(default_factory=Conflicts)  # how near others came to it in time
 
@@ -69,21 +64,20 @@ class World:
     """Simulate one episode: its vehicles, its agents' records and its clock.
 
     An agent is a vehicle that decides for itself, known by its index among the vehicles; the ego
-    has 0. `road` is a `highway_env.road.road.Road` with the vehicles, and `layout` where they
-    started. `journeys` has what became of each agent, by its index. `step` counts decisions and
-    `frame` frames of the simulation.
+    has 0.
     """
 
     scenario: Scenario  # the episode's scenario
     seed: int  # seed of the episode's layout
     layout: Layout  # the start situation, drawn by that seed
-    # a `highway_env.road.road.Road` with the episode's vehicles, the ego first
-    road: Any
+    road: Any  # a `highway_env.road.road.Road` with the episode's vehicles, the ego first
     step: int = 0  # number of decisions taken so far
     frame: int = 0  # number of frames simulated so far
-    # what has become of each agent, by its index among the vehicles; the ego has 0
+    # what has become of each agent so far, by its index
     journeys: dict[int, Journey] = field(default_factory=lambda: {0: Journey()})
-    beacons: tuple[Beacon, ...] = ()  # the beacons that still matter (`WorldState.beacons`)
+    # the vehicles' broadcasts about themselves that still matter: the last that each receiver has,
+    # and those on the air
+    beacons: tuple[Beacon, ...] = ()
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
@@ -248,8 +242,8 @@ class World:
     def target(self, agent: int = 0) -> Target:
         """Return an agent's route, such as `straight`, and its target speed.
 
-        The speed is an index from 0 in the scenario's target speeds, and `agent` one among the
-        vehicles.
+        The speed is an index from 0 in the scenario's target speeds, which ascend. `agent` is the
+        agent's index among the vehicles.
         """
         vehicle = self.vehicles[agent]
         return vehicle.spawn.route, int(vehicle.speed_index)
@@ -267,7 +261,7 @@ class World:
         return target
 
     def advance(self, until_frame: int) -> None:
-        """Simulate until a frame number, or until the outcome of every agent is decided.
+        """Simulate until frame `until_frame`, or until the outcome of every agent is decided.
 
         Frames are counted from the start of the episode.
         """

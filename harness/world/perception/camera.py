@@ -67,8 +67,9 @@ LAMPS = AMBIENTS[DAY]  # lamps fade with distance as by day
 class Frame(Image):
     """Hold a picture of a vehicle's cameras, with the ids of the vehicles and buildings in it.
 
-    `pixels` are (height, width, 3), red, green and blue. `owners`, (height, width), has for each
-    pixel the index in `ids` of what it shows; -1 for road, grass and sky.
+    `pixels` are (height, width, 3), red, green and blue from 0 to 255. `owners`, (height, width),
+    has for each pixel the index in `ids`, the ids of vehicles and buildings, of what it shows; -1
+    for road, grass and sky.
     """
 
     def __init__(self, pixels: Pixels, owners: Places, ids: tuple[str, ...]) -> None:
@@ -98,8 +99,9 @@ def frame(
 ) -> Frame:
     """Render the front and rear cameras of one vehicle as one picture, the front above the rear.
 
-    `viewer_id` is the id of that vehicle in `state`, and `size_px` the picture's width and height,
-    the height even. Vehicles that its sensors do not report are not drawn.
+    `viewer_id` is the id of that vehicle in `state`, a moment of an episode of `scenario`, and
+    `size_px` the picture's width and height, the height even. Vehicles that its sensors do not
+    report are not drawn.
     """
     width, height = size_px
     viewer = state.vehicle(viewer_id)
@@ -123,12 +125,11 @@ def frame(
 class Sight(Image):
     """Hold a picture of a vehicle's cameras that is rendered when its pixels are read.
 
-    It holds what `frame` is called with, the state among it, and no pixels; it is pickled as a
-    plain picture with pixels.
+    Until then it has no pixels. It is pickled as a plain picture with pixels.
     """
 
     scenario: Scenario  # the scenario of the state, whose road is drawn
-    state: WorldState  # what is around
+    state: WorldState  # the moment of an episode that is shown: all vehicles and buildings
     viewer_id: str  # id of the vehicle whose cameras these are
     size_px: tuple[int, int]  # width and height of the picture, pixels
 
@@ -152,15 +153,16 @@ _drawn = lru_cache(maxsize=KEPT)(frame)
 class Box:
     """Describe a vehicle or building, to be drawn, as a box with painted walls.
 
-    It has four walls, with a grid of `ROWS` x `COLUMNS` patches of paint on each; some are lamps.
-    `corners` are where walls meet, (4, 2) m to the east and south of the road's origin.
+    Wall k goes from corner k to the next one. Each of the four has a grid of `ROWS` x `COLUMNS`
+    patches of paint; some are lamps.
     """
 
     name: str  # id of the vehicle or building
-    corners: Floats  # its corners on the ground, (4, 2) m
+    # its corners on the ground, (4, 2), m to the east and south of the road's origin
+    corners: Floats
     height_m: float  # height above the road, m
-    walls: Pixels  # paint on its walls, (4, ROWS, COLUMNS, 3)
-    lamps: Lit  # which of that is a lamp that shines, (4, ROWS, COLUMNS)
+    walls: Pixels  # paint on its walls, (4, ROWS, COLUMNS, 3): red, green and blue of each patch
+    lamps: Lit  # which of these patches are lamps that shine, (4, ROWS, COLUMNS)
 
 
 def focal_px(width: int) -> float:

@@ -25,8 +25,8 @@ ALIGNED = float(np.cos(ALIGNED_RAD))
 class Seat(Struct, frozen=True):
     """Hold the pose of a viewer, from which positions are converted into its frame.
 
-    Its centre is in m to the east and south of the road's origin; `cos` and `sin` are of its
-    heading, from +x (east) towards +y (south).
+    Its centre is at `x_m` and `y_m`, m to the east and south of the road's origin; `cos` and `sin`
+    are of its heading, from +x (east) towards +y (south).
     """
 
     x_m: float  # position of its centre, m to the east of the road's origin
@@ -35,9 +35,10 @@ class Seat(Struct, frozen=True):
     sin: float  # sine of its heading
 
     def relative(self, x_m: float, y_m: float) -> Point:
-        """Return a position of the road's frame, m, in the viewer's frame, rounded to 0.1 m.
+        """Return a position of the road's frame in the viewer's frame, rounded to 0.1 m.
 
-        The viewer's frame has metres forward and to the left of its centre.
+        `x_m` and `y_m` are m to the east and south of the road's origin. The viewer's frame has m
+        forward and to the left of its centre.
         """
         dx, dy = x_m - self.x_m, y_m - self.y_m
         return Point(tenths(dx * self.cos + dy * self.sin), tenths(dx * self.sin - dy * self.cos))
@@ -65,9 +66,10 @@ class Place(Struct, frozen=True):
 class Encounter(Struct, frozen=True):
     """Pair another vehicle with the ego, both as one viewer knows them.
 
-    `seat` is the viewer's pose, `d` the other vehicle as detected and `place` where it is on the
-    road: it follows a path. `ego` is the ego, `ego_arc_m` how far along its path it is, m, and
-    `has_lamps` whether the scenario's vehicles have brake lamps.
+    A viewer is the vehicle whose scene graph, what it knows, is made. `seat` is the viewer's pose,
+    `d` the other vehicle as its sensors report it and `place` where that is on the road: it follows
+    a path. `ego` is the ego, `ego_arc_m` how far along its path it is, m, and `has_lamps` whether
+    the scenario's vehicles have brake lamps.
     """
 
     seat: Seat  # the viewer's pose
@@ -99,7 +101,7 @@ class Encounter(Struct, frozen=True):
 
 
 def tenths(value: float) -> float:
-    """Round a number to one decimal, with 0.0 in place of -0.0."""
+    """Round `value` to one decimal, with 0.0 in place of -0.0."""
     return round(float(value), 1) + 0.0
 
 
@@ -144,8 +146,9 @@ def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
 def conflicts(road: Road, encounters: Sequence[Encounter]) -> list[list[Conflict]]:
     """Return, for each encounter, the conflicts of its vehicle with the ego's paths.
 
-    A conflict is where both meet: their paths cross or merge, or both are in one lane, which the
-    ego is on or may change to.
+    An encounter pairs another vehicle with the ego. A conflict is where both meet: their paths
+    cross or merge, or both are in one lane, which the ego is on or may change to. `road` has the
+    paths.
     """
     conflicts_of: list[list[Conflict]] = [[] for _ in encounters]
     if road.form == 2:

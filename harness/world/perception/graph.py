@@ -35,8 +35,9 @@ def scene_graph(
 ) -> SceneGraph:
     """Return what one vehicle knows of a state by its sensors and by the beacons that it heard.
 
-    `viewer_id` is its id. Vehicles whose ids are in `left_out` are treated as undetected: they are
-    not listed, and nothing is said to be hidden by them.
+    `viewer_id` is its id, and `state` a moment of an episode of `scenario`. Vehicles whose ids are
+    in `left_out` are treated as undetected: they are not listed, and nothing is said to be hidden
+    by them.
     """
     [graph] = scene_graphs(scenario, [(state, viewer_id)], left_out)
     return graph
@@ -47,9 +48,9 @@ def scene_graphs(
 ) -> list[SceneGraph]:
     """Return the scene graph of each look: a state, and the id of the vehicle that looks in it.
 
-    A scene graph is what that vehicle knows by its sensors and by the beacons that it heard.
-    Vehicles whose ids are in `left_out` are treated as undetected. For several looks it is faster
-    than one call of `scene_graph` each.
+    A scene graph is what that vehicle knows by its sensors and by the beacons that it heard. All
+    states are of `scenario`. Vehicles whose ids are in `left_out` are treated as undetected. For
+    several looks it is faster than one call of `scene_graph` each.
     """
     graphs: list[SceneGraph] = []
     for begin in range(0, len(looks), AT_ONCE):
@@ -60,10 +61,11 @@ def scene_graphs(
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
-    """Return the ego's scene graph with every vehicle in view, no noise, and no sectors.
+    """Return the ego's scene graph of a state with every vehicle in view, no noise, and no sectors.
 
-    A scene graph is what one vehicle knows of a scene. Only the reference driver `full-view`, which
-    sees everything, may read this one.
+    A scene graph is what one vehicle knows of a scene, and a sector a direction that danger can
+    come from; `state` is a moment of an episode of `scenario`. Only the reference driver
+    `full-view`, which sees everything, may read this one.
     """
     [graph] = truth_graphs(scenario, [state])
     return graph
@@ -72,7 +74,8 @@ def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
 def truth_graphs(scenario: Scenario, states: Sequence[WorldState]) -> list[SceneGraph]:
     """Return, for each state, the ego's scene graph with every vehicle in view and no noise.
 
-    A scene graph is what one vehicle knows of a scene; only driver `full-view` may read these.
+    A scene graph is what one vehicle knows of a scene; all `states` are of `scenario`. Only driver
+    `full-view` may read these.
     """
     looks: list[Look] = []
     exact: list[list[Detection]] = []
@@ -147,9 +150,10 @@ def listed_graphs(
 ) -> list[SceneGraph]:
     """Return the scene graph of each viewer, given what it detected and how it sees each sector.
 
-    A look is a state and the vehicle that looks in it. `detected` and `sectors` have, for each look
-    in the same order, the vehicles that it knows of, and how much of each direction of danger it
-    sees. Conflicts with the ego's path are computed here.
+    A scene graph is what one vehicle knows of a scene, and a sector a direction that danger can
+    come from. A look is a state of `scenario` and the vehicle that looks in it, the viewer.
+    `detected` and `sectors` have, for each look in the same order, the vehicles that it knows of,
+    and how much of each sector it sees. Conflicts with the ego's path are computed here.
     """
     if not looks:
         return []

@@ -20,16 +20,13 @@ Look = tuple[WorldState, VehicleState]  # a state, and the vehicle that looks ar
 
 @dataclass(frozen=True)
 class Sweep:
-    """Hold the rays that a vehicle casts in one full turn, `RAYS` of them, and what each ray hits.
-
-    `bearing_rad` and `range_m`, (RAYS,), are a ray's direction and the distance to what it meets
-    first; `hits` has, by id, the indices of the rays that end on a vehicle or building.
-    """
+    """Hold the rays that a vehicle casts in one full turn, `RAYS` of them, and what each hits."""
 
     # direction of each ray in the road's frame, radians from +x (east) towards +y (south), (RAYS,)
     bearing_rad: Floats
-    range_m: Floats  # distance to the first surface that it meets, m, (RAYS,); inf if to none
-    # indices of the rays that end on each vehicle or building, by id
+    range_m: Floats  # distance to the first surface that each ray meets, m, (RAYS,); inf if to none
+    # indices from 0 of the rays that end on each vehicle or building, by its id; who is not hit is
+    # left out
     hits: dict[str, NDArray[np.intp]]
 
 
@@ -38,17 +35,16 @@ class Surfaces:
     """Hold the outlines that stop the rays of v viewers, n in all, viewer by viewer.
 
     A viewer is a vehicle that looks. Its surfaces are all other vehicles of its state, in their
-    order, then the buildings: `ids` names them, and `viewer` and `place`, (n,), say which viewer's
-    each surface is, and which of them. Positions are in m to the east and south of the road's
-    origin.
+    order, then the buildings. Positions are in m to the east and south of the road's origin.
     """
 
     origins_m: Floats  # the viewers' centres, (v, 2)
-    ids: tuple[tuple[str, ...], ...]  # ids of each viewer's surfaces
-    viewer: Ints  # number from 0 of the viewer whose surface each is, (n,)
+    # ids of each viewer's surfaces, v tuples in the viewers' order
+    ids: tuple[tuple[str, ...], ...]
+    viewer: Ints  # index from 0 of the viewer whose surface each is, (n,)
     place: Ints  # index from 0 of each among that viewer's surfaces, (n,)
-    vehicle: Bools  # whether each is a vehicle, (n,)
-    corners_m: Floats  # the four corners of each, (n, 4, 2)
+    vehicle: Bools  # whether each surface is a vehicle, rather than a building, (n,)
+    corners_m: Floats  # the four corners of each surface, (n, 4, 2)
 
     def by_viewer(self, values: Any) -> Any:
         """Return `values`, one of each surface, (n,), as a table with a row for each viewer.
@@ -62,7 +58,7 @@ class Surfaces:
 
 
 def turned(angle_rad: Any) -> Any:
-    """Wrap an angle, or an array of angles, to -pi to pi rad."""
+    """Wrap an angle, or an array of angles, `angle_rad`, to -pi to pi rad."""
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
@@ -158,12 +154,12 @@ def _first(surface: Ints, target: Ints, t: Floats, targets: int) -> tuple[Floats
 class Rays:
     """Hold m possible meetings of a ray with a surface, by ascending number of the surface.
 
-    All arrays are (m,): the number of the surface in `Surfaces`, that of the ray, with `RAYS` of
-    them for each viewer, and the distance `t` at which they meet, m; inf if the ray passes by.
+    A surface is the outline of a vehicle or building, and a ray goes from a vehicle that looks, a
+    viewer.
     """
 
-    surface: Ints  # number of the surface among all of `Surfaces`, (m,)
-    target: Ints  # number of the ray, with `RAYS` of them for each viewer, (m,)
+    surface: Ints  # index of the surface in the arrays of `Surfaces`, (m,)
+    target: Ints  # number of the ray from 0, viewer by viewer, `RAYS` of them each, (m,)
     t: Floats  # distance at which the ray meets the surface, m, (m,); inf if it passes by
 
     def of(self, which: Bools) -> "Rays":
@@ -173,7 +169,7 @@ class Rays:
 def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
     """Cast `RAYS` rays in all directions from a vehicle's centre, and return what they hit.
 
-    The rays do not hit `viewer`, the vehicle itself.
+    They hit all vehicles and buildings of `state` but `viewer`, the vehicle itself.
     """
     around = surfaces([(state, viewer)])
     rays = cast(around, np.ones(len(around.place), dtype=bool))
@@ -208,8 +204,9 @@ def cast(around: Surfaces, of: Bools) -> Rays:
 def rays_on(around: Surfaces, rays: Rays, solid: Bools) -> tuple[Ints, Ints]:
     """Return how many rays reach each surface, (n,), and where each ray of `rays` ends, (m,).
 
-    Only the surfaces where `solid`, (n,), is true stop rays; all others let them pass. The second
-    result is, for each of the m meetings, the number of the surface that stops its ray; -1 if none.
+    `around` has the n surfaces, outlines of vehicles and buildings. Only those where `solid`, (n,),
+    is true stop rays; all others let them pass. The second result is, for each of the m meetings,
+    the index of the surface that stops its ray; -1 if none.
     """
     stops = solid[rays.surface]
     ended = rays.of(stops)
@@ -265,7 +262,8 @@ def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
 def blocked_by(state: WorldState, viewer: VehicleState, points: Floats) -> list[str | None]:
     """Return the id of the vehicle or building that hides each point from a viewer; None if seen.
 
-    `points` are (k, 2), m to the east and south of the road's origin.
+    `viewer` is a vehicle of `state`, and `points` are (k, 2), m to the east and south of the road's
+    origin.
     """
     around = surfaces([(state, viewer)])
     met = hidden(around, points, np.ones(len(around.place), dtype=bool))

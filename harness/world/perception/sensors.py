@@ -39,10 +39,7 @@ SENSORS = {
 class Detection(Struct, frozen=True):
     """Describe one object as all sensors of one vehicle together report it, in the road's frame.
 
-    The position of its centre is in m to the east and south of the road's origin. `sensors` are
-    those of camera, lidar and radar that reported it. What a sensor alone tells is None without it:
-    `kind`, `indicator` and `braking` are the camera's, `range_rate_mps` (negative when closing) the
-    radar's; `heading_rad` is None if only the radar saw it.
+    What one sensor alone can tell is None without it.
     """
 
     id: str  # the object's id (association across vehicles is assumed to be perfect)
@@ -61,7 +58,11 @@ class Detection(Struct, frozen=True):
 
 
 def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> list[Detection]:
-    """Return what a vehicle's sensors report, in the order of the state's vehicles."""
+    """Return what the sensors of `viewer` report of a state, in the order of its vehicles.
+
+    The scenario's `parameters` have the light and weather, and the rule of what a vehicle that is
+    not reported hides.
+    """
     looks = [(state, viewer)]
     return list(reports(looks, surfaces(looks), parameters).values())
 

@@ -42,28 +42,27 @@ ROUNDED_M = 0.1 / 12**0.5  # standard deviation of the rounding of a graph's pla
 class Heard(NamedTuple):
     """Hold what the ego sees by itself, and the scene graphs that it got from helpers.
 
-    A scene graph is what one vehicle knows of a state. `state` is the ego's, and `source` that of
-    the helpers: None if it is the same, as it is unless messages of another scene are put in their
-    place.
+    A scene graph is what one vehicle knows of a state.
     """
 
     state: WorldState  # the state in which the ego is
     own: SceneGraph  # the ego's scene graph
     helpers: Sequence[SceneGraph]  # the scene graphs of the helpers that were heard
-    source: WorldState | None = None  # the state in which these helpers are; None for the ego's
+    # the state in which these helpers are; None for the ego's, as it is unless messages of another
+    # scene are put in their place
+    source: WorldState | None = None
 
 
 @dataclass(frozen=True)
 class Report:
     """Describe one object as one sender reports it, with the covariance of its errors.
 
-    The sender is the ego itself or a helper. `place_m2` is (2, 2), of the position to the east and
-    to the south; `node` is the object in the ego's own scene graph, None for one out of a message.
+    The sender is the ego itself or a helper.
     """
 
     detection: Detection  # the object, in the frame of the road
     node: Node | None  # the object in the ego's own scene graph; None for one out of a message
-    place_m2: Floats  # covariance of its position, m2, (2, 2)
+    place_m2: Floats  # covariance of its position to the east and to the south, m2, (2, 2)
     speed_m2ps2: float  # variance of its speed, m2/s2
 
     @property
@@ -75,9 +74,10 @@ class Report:
 def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
     """Return the ego's scene graph of each case, with the objects that helpers' messages report.
 
-    A scene graph is what one vehicle knows of a scene. Reports of several senders are taken for one
-    object if positions and speeds agree (chi-squared test), and the most precise of them is kept.
-    Of each direction of danger as much counts as seen as whoever sees most of it does.
+    A scene graph is what one vehicle knows of a scene of `scenario`, and each of `cases` has the
+    ego's own and those of the helpers heard. Reports of several senders are taken for one object if
+    positions and speeds agree (chi-squared test), and the most precise of them is kept. Of each
+    direction of danger as much counts as seen as whoever sees most of it does.
     """
     own_ids: list[list[str]] = []  # whose report in the ego's own graph stands
     added: list[list[Detection]] = []  # what messages report
@@ -119,7 +119,8 @@ def _reports(p: Parameters, case: Heard) -> list[Report]:
 def state_in_message(p: Parameters, state: WorldState, sender: str) -> VehicleState:
     """Return a helper's state as its message gives it, with the errors of a beacon.
 
-    `sender` is the helper's id. Under perfect knowledge it is the true state.
+    `sender` is the helper's id in `state`, and `p` has the scenario's sizes of these errors. Under
+    perfect knowledge it is the true state.
     """
     vehicle = state.vehicle(sender)
     if p.perfect_knowledge:
@@ -138,9 +139,10 @@ def state_in_message(p: Parameters, state: WorldState, sender: str) -> VehicleSt
 def invented(scenario: Scenario, state: WorldState, viewer: str) -> Node:
     """Return a car that does not exist, on collision course with the ego: an attacker's lie.
 
-    It is on the first path that crosses the ego's, as far from there as the ego and as fast;
-    without such a path it stands `STANDS_M` ahead of the ego. `viewer` is the id of the helper that
-    makes it up, in whose frame (m forward and to the left) it is given.
+    It is on the first path of the scenario's road that crosses the ego's, as far from there as the
+    ego is in `state`, and as fast; without such a path it stands `STANDS_M` ahead of the ego.
+    `viewer` is the id of the helper that makes it up, in whose frame (m forward and to the left) it
+    is given.
     """
     road, sender, ego = scenario.road(), state.vehicle(viewer), state.ego
     path = road.paths[ego.approach, ego.route]

@@ -30,7 +30,8 @@ class PackagesScenarios(Plugins[Scenario]):
     def check(self, name: str, plugin: Scenario) -> None:
         """Raise ValueError if a package's scenario is inconsistent, such as in its actions.
 
-        `name` is that of the entry point, which must be the scenario's own, too.
+        `plugin` is the scenario, and `name` that of the entry point, which must be the scenario's
+        own, too.
         """
         if plugin.name != name:
             raise ValueError(f"its name is {printable(repr(plugin.name))}")
@@ -77,8 +78,8 @@ def witnessed() -> tuple[str, ...]:
 def get(text: str) -> Scenario:
     """Return a scenario by name, with other settings if given: `blind-merge:ambient=fog`.
 
-    Several settings have commas between them. Raises UserError if there is no such scenario or
-    setting, or a value is not allowed.
+    `text` is as a user types it; several settings have commas between them. Raises UserError if
+    there is no such scenario or setting, or a value is not allowed.
     """
     name, settings = split(text)
     scenario = _named(name)

@@ -41,7 +41,13 @@ class Parameters(Shared):
     Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
     `_offset_s` is when a car is in the middle, in s after a cruising ego, one that keeps its speed.
-    A danger is the vehicle that would meet that ego.
+    A danger is the vehicle that would meet that ego, and an agent a vehicle that decides.
+
+    Agents start at `speed_mps` and are in the middle after `arrival_s`: from both sides with
+    `both_share`, else from one, and from ahead with `oncoming_share`. Other cars drive at
+    `car_mps`, `follow_s` or more behind an agent: a danger and, much later, a harmless car
+    (`late_`). Buildings stand `corner_m` from the roads' middle; an agent has reached its goal
+    `cleared_m` behind the junction.
     """
 
     # speeds that an agent's actions step through, m/s: up to 36 km/h

@@ -47,6 +47,12 @@ class Parameters(Witnessed):
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
     `_offset_s` is when a vehicle is at the merge, in s after a cruising ego, one that keeps its
     speed. A danger is the vehicle that would meet that ego.
+
+    The ego starts `ego_start_m` before the merge and has reached its goal `cleared_m` beyond it;
+    the wall ends `wall_end_m` before it. Cars drive at `main_mps`: a danger, and harmless ones on
+    the left lane (`left_`), shortly before the ego (`before_`) and long after it (`late_`). Helpers
+    are a truck on the left lane (`truck_`) and two cars, one on each lane, that start `ahead_m`
+    beyond the merge (`ahead_`).
     """
 
     ego_speed_mps: float = 14.0  # speed of the ego at the start, m/s: 50 km/h

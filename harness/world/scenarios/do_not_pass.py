@@ -46,6 +46,12 @@ class Parameters(Witnessed):
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
     `danger_s` and `late_s` are when an oncoming car is where the ego started, in s from the start.
     A danger is the vehicle that would meet an ego which passes at once.
+
+    The ego starts at `speed_mps`, `ego_start_m` before the place where it would be beside the
+    truck, and `gap_m` behind the truck. It has reached its goal `ahead_m` before the truck, or at
+    most `behind_m` behind it once the oncoming car went by. Oncoming cars, a danger or a harmless
+    one (`late_`), drive at `oncoming_mps`. Helpers are the truck, the car before it (`leader_`) and
+    the one behind the ego (`follower_m`).
     """
 
     # speeds that the ego's actions step through, m/s: up to 54 km/h
@@ -180,11 +186,11 @@ def _draft(draws: Draws, p: Parameters) -> Draft:
 def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
     """Return whether the ego has passed the truck, or safely stayed behind.
 
-    It has if it is on its own lane and either far enough ahead of the truck, or at most `behind_m`
-    behind it after an oncoming vehicle went by. `xy_m`, (..., V, 2), are the centres of the V
-    vehicles of each of any number of episodes at one moment, m in highway-env's frame, the ego
-    first and then the truck; `approaches`, (..., V), are where their paths come from. The result is
-    (...).
+    It has if it is on its own lane and either `parameters.ahead_m` ahead of the truck, or at most
+    `parameters.behind_m` behind it after an oncoming vehicle went by. `xy_m`, (..., V, 2), are the
+    centres of the V vehicles of each of any number of episodes at one moment, m in highway-env's
+    frame, the ego first and then the truck; `approaches`, (..., V), are where their paths come
+    from. The result is (...).
     """
     x, lengths = xy_m[..., 0], (CAR + TRUCK) / 2
     in_lane = np.abs(xy_m[..., 0, 1] - LANE_WIDTH_M) <= LANE_WIDTH_M / 4

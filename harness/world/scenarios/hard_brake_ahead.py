@@ -46,6 +46,11 @@ class Parameters(Witnessed):
     of numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
     A headway is in s between bumpers, and an `_at_s` in s from the start. A danger is the vehicle
     that would meet an ego which keeps its speed: here the car that brakes.
+
+    All start at `speed_mps`, the ego `ego_start_m` before the conflict zone, where the danger comes
+    to stand; `cleared_m` behind it is the goal. `headway_s` is from the ego to the van and
+    `lead_headway_s` from the van to the danger. On the left lane, so far ahead of the ego, are
+    helpers (`beside_m`, `front_m`) and, farthest, a car that may slow down (`slow_`, `slows_`).
     """
 
     # speeds that the ego's actions step through, m/s: 72 km/h, half of it, and standing

@@ -53,7 +53,14 @@ class Parameters(Shared):
     Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
     `_offset_s` is when a danger is where the ego crosses the side road, in s after a cruising ego,
-    one that keeps its speed. A danger is the vehicle that would meet it.
+    one that keeps its speed. A danger is the vehicle that would meet it, and an agent a vehicle
+    that decides.
+
+    Agents start at `speed_mps`; the first of each side is in the middle of the passage after
+    `arrival_s`, a second one `headway_s` behind it with `second_share`. A danger drives at
+    `side_mps`. The passage is `opening_m` wide on each side of its middle, and the embankment that
+    hides a danger stands `embankment_m` from there along the street; an agent has reached its goal
+    `cleared_m` beyond it.
     """
 
     # speeds that an agent's actions step through, m/s: up to 29 km/h

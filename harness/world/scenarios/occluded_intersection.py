@@ -43,9 +43,15 @@ class Parameters(Witnessed):
 
     Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
-    `sector_shares` are probabilities of the directions that a danger comes from. An `_offset_s` is
-    when a vehicle is at the place where both meet, in s after a cruising ego, one that keeps its
-    speed. A danger is the vehicle that would meet that ego.
+    `sector_shares` are probabilities of the directions that a danger comes from: left, right,
+    oncoming. An `_offset_s` is when a vehicle is at the place where both meet, in s after a
+    cruising ego, one that keeps its speed. A danger is the vehicle that would meet that ego.
+
+    The ego starts `ego_start_m` before the conflict zone and has reached its goal `cleared_m`
+    behind the junction. Cars from a side drive at `crossing_speed_mps`, a danger or a harmless one
+    that comes later (`late_`); a truck comes towards the ego (`truck_`), an oncoming danger
+    `follow_m` behind it. Buildings stand `corner_m` from the roads' middle. Helpers start
+    `helper_start_m` behind the junction.
     """
 
     # seconds after which an ego that has not cleared the intersection never will

@@ -45,6 +45,12 @@ class Parameters(Witnessed):
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. An
     `_offset_s` is when a car is where the ego comes into the lane, in s after a cruising ego, one
     that keeps its speed. A danger is the vehicle that would meet that ego.
+
+    The ego starts `ego_start_m` before it pulls out and has reached its goal `cleared_m` beyond the
+    pull-out's end. Cars drive at `lane_mps`: from behind a danger or a later harmless one
+    (`late_`), and on the other lane one (`oncoming_`) that starts so far ahead. Vans are parked
+    `behind_m` behind the ego, `vans_m` apart, and `ahead_m` beyond the pull-out. Helpers are parked
+    opposite (`opposite_m`) or have just driven past (`passed_`).
     """
 
     # speeds that the ego's actions step through, m/s: up to a driver's pace in a car park

@@ -41,6 +41,11 @@ class Parameters(Shared):
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode. The
     row has one place more than cars; `offset_s` is when that place is at the merge, in s after a
     cruising ego, one that keeps its speed. A danger is the vehicle that would meet that ego.
+
+    All start at `speed_mps`, the ego `ego_start_m` before the merge; `cleared_m` beyond it is the
+    goal. The row's places are `headway_s` apart, and it has a third car with `third_share`. A
+    danger takes the free place, and a harmless car (`left_`) may be beside that place on the left
+    lane, `left_offset_s` after it. The wall ends `wall_end_m` before the merge.
     """
 
     # speeds that an agent's actions step through, m/s: up to 54 km/h

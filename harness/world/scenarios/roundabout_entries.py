@@ -65,6 +65,13 @@ class Parameters(Shared):
     agent is a vehicle that decides; `offset_s` is when one enters, in s after the agent from the
     arm before has passed there. A danger is the vehicle that would meet an ego which keeps its
     speed.
+
+    All start at `speed_mps`. The ego enters after `ego_s` if it keeps its speed, and agents come
+    from three arms with `third_share`, else from two. A danger passes the ego's entry `headway_s`
+    behind the car from the west or, without that, `danger_offset_s` after the ego would;
+    without a danger, a car in its place leaves the ring before with `leaver_share`. Sight is
+    blocked by a mound on the island, of radius `mound_m`, and by hedges, which end `hedge_end_m`
+    from the ring's centre and are `hedge_half_m` wide on each side of their middle.
     """
 
     # speeds that an agent's actions step through, m/s
@@ -149,10 +156,11 @@ def road(home: str = EGO) -> Road:
 def cleared(home: str, xy_m: Floats, approaches: Texts, parameters: Any) -> Bools:
     """Return whether the ego has left the ring past the next entry.
 
-    `home` is the arm that it comes from (`s`, `e`, `n` or `w`). `xy_m`, (..., V, 2), are the
-    centres of the V vehicles of each of any number of episodes at one moment, m in highway-env's
-    frame, the ego first. `approaches`, (..., V), where their paths come from, is not read. The
-    result is (...).
+    `home` is the arm that it comes from (`s`, `e`, `n` or `w`).
+
+    `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
+    moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
+    from, and `parameters` are not read. The result is (...).
     """
     turned_rad, edge_m = math.pi / 2 * ARMS.index(home), PLACE.ring_m + LANE_WIDTH_M / 2
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]

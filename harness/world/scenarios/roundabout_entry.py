@@ -44,9 +44,16 @@ class Parameters(Witnessed):
 
     Numbers end in their unit (`_m`, `_mps`, `_s`), and a `_share` is a probability. A pair of
     numbers bounds a uniform draw, made anew for each layout, the start situation of an episode.
-    `sector_shares` are no such pair, but probabilities of the arms that a danger comes from. An
-    `_offset_s` is when a car is at the ego's entry, in s after a cruising ego, one that keeps its
-    speed. A danger is the vehicle that would meet that ego.
+    `sector_shares` are no such pair, but probabilities of the arms that a danger comes from: left,
+    oncoming. An `_offset_s` is when a car is at the ego's entry, in s after a cruising ego, one
+    that keeps its speed. A danger is the vehicle that would meet that ego.
+
+    The ego starts `ego_start_m` before its entry. Cars on the ring drive at `ring_mps`: a danger,
+    else one that leaves before the ego's entry (`leaver_share`), and harmless ones shortly before
+    (`before_`) and long after (`late_`). Sight is blocked by a mound on the island, of radius
+    `mound_m`, and by a hedge that ends `hedge_end_m` from the centre and is `hedge_half_m` wide on
+    each side. Helpers drive at `helper_mps` and start behind the ring's edge on the south and west
+    arm, and beyond the entry (`helper_south_m`, `helper_west_m`, `helper_ahead_m`).
     """
 
     # speeds that the ego's actions step through, m/s
@@ -200,7 +207,7 @@ def cleared(xy_m: Floats, approaches: Texts, parameters: Parameters) -> Bools:
 
     `xy_m`, (..., V, 2), are the centres of the V vehicles of each of any number of episodes at one
     moment, m in highway-env's frame, the ego first. `approaches`, (..., V), where their paths come
-    from, is not read. The result is (...).
+    from, and `parameters` are not read. The result is (...).
     """
     x, y = xy_m[..., 0, 0], xy_m[..., 0, 1]
     return np.asarray((x > 0) & (np.arctan2(y, x) < PLACE.ring_rad(1)))
