@@ -486,6 +486,48 @@ def test_an_engine_that_is_not_here_is_one_line_that_names_the_run(
     assert error.startswith(f"harness: unknown engine of {run}: its model 'zork'; known: ")
 
 
+def test_a_model_that_was_typed_by_name_has_no_other_name(run: Path, harness: Harness) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    stated["model"] |= {"name": "qwen3-4b", "weights": "proxy"}
+    (run / "run.json").write_text(json.dumps(stated))
+    code, out, error = harness("report", run)
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "its settings have model proxy, and beside them it is qwen3-4b" in error
+
+
+def test_a_device_that_timed_nothing_is_refused(run: Path, harness: Harness) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(stated | {"device_profile": {"name": "orin"}}))
+    code, out, error = harness("report", run)
+    assert (code, out, error.count("\n")) == (2, "", 1)
+    assert "device_profile: nothing timed the answers by it" in error
+
+
+@pytest.mark.slow
+def test_a_replay_has_the_delays_that_the_replayed_model_declares(
+    two_path: Path, harness: Harness
+) -> None:
+    first = ("eval", "--dataset", two_path, "--model", "proxy-faulty", "--seeds", "0", "--quiet")
+    assert harness(*first, "--out", "first")[0] == 0
+    again = ("eval", "--dataset", two_path, "--model", "replay:first", "--seeds", "0", "--quiet")
+    assert harness(*again, "--out", "again")[0] == 0
+    code, out, _ = harness("run", "check", "again")
+    assert (code, "again: equal: " in out) == (0, True)
+
+
+@pytest.mark.slow
+def test_helpers_with_models_of_their_own_have_the_times_that_are_named(
+    two_path: Path, harness: Harness
+) -> None:
+    typed = ("eval", "--dataset", two_path, "--model", "proxy", "--seeds", "0", "--quiet")
+    assert harness(*typed, "--helper-model", "proxy-faulty", "--out", "run")[0] == 0
+    assert harness("run", "check", "run")[0] == 0
+    latency(Path("run"), helper_s=0.001)
+    code, out, _ = harness("run", "check", "run")
+    assert code == 1
+    assert "another latency of the helpers than their cards" in " ".join(out.split())
+
+
 def test_more_errors_than_a_result_can_have_are_a_difference(run: Path, harness: Harness) -> None:
     scenes = sorted(read(run).decisions.scenes)
     last = {scene.partition("-")[0]: scene for scene in scenes}.values()
@@ -497,7 +539,7 @@ def test_more_errors_than_a_result_can_have_are_a_difference(run: Path, harness:
 
     change(run, answer=failed)
     model = json.loads((run / "run.json").read_text())["model"]
-    configure(run, model={**model, "engine": "transformers", "weights": "none.safetensors"})
+    configure(run, model={**model, "engine": "transformers", "weights": "proxy.safetensors"})
     code, out, error = harness("run", "check", run)
     assert (code, error) == (1, "")
     assert "questions to helpers: too many for a result" in " ".join(out.split())

@@ -213,7 +213,9 @@ class Kept(Replay):
     """
 
     def _completion(self, request: Request, answer: Answer) -> Completion:
-        return super()._completion(request, structs.replace(answer, slow_s=0.0))
+        replayed = self._run.agent(answer)["model"]["engine"] == "replay"
+        taken = answer if replayed else structs.replace(answer, slow_s=0.0)
+        return super()._completion(request, taken)
 
     def _model(self, role: str, requests: Sequence[Request]) -> Backend:
         """Raise UserError: the run has no such answer."""

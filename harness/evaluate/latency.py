@@ -13,6 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from harness.backends.base import Backend, Timed
+from harness.backends.card import Card
 from harness.core.arrays import Floats
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
@@ -49,10 +50,18 @@ def chosen_latency(
 def _of_agent(choice: str | None, agent: Agent, backend: Backend) -> Latency:
     if choice is None and agent.can.own_latency:
         return cast("Timed", backend).latency()
-    if (choice or agent.card.latency.source) in ("cited", "paper"):
+    return of_card(choice, agent.card)
+
+
+def of_card(choice: str | None, card: Card) -> Latency:
+    """Return the inference times of a model by its card, a file that describes it.
+
+    `choice` is `card` or `paper`; None takes what the card names as its source.
+    """
+    if (choice or card.latency.source) in ("cited", "paper"):
         return PAPER
-    seconds = cast("float", agent.card.latency.inference_s)
-    return Latency("card", agent.card.latency.basis, seconds, seconds, seconds)
+    seconds = cast("float", card.latency.inference_s)
+    return Latency("card", card.latency.basis, seconds, seconds, seconds)
 
 
 def mixed(ego: Latency, helpers: Sequence[Latency]) -> Latency:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,7 +14,7 @@ from msgspec.structs import astuple
 from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
-from harness.backends.registry import open_backend
+from harness.backends.registry import open_backend, registration
 from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
 from harness.core.config import convert
@@ -352,8 +353,25 @@ def _of_latency(run: Run) -> Iterator[str]:
         others = {"a fusion call": latency.fusion_s}
         if not run.manifest.helpers:
             others["the helpers"] = latency.helper_s
+        elif latency.helper_times_s() != _helpers_s(run, latency.helper_times_s()):
+            yield "run.json has another latency of the helpers than their cards, or the paper, have"
         for whose in (whose for whose, seconds in others.items() if seconds != latency.ego_s):
             yield f"run.json has another latency of {whose} than of the ego, whose source it names"
+
+
+def _helpers_s(run: Run, in_manifest: Sequence[float]) -> tuple[float | None, ...]:
+    """Return the times of the models that answer for helpers alone, by what was typed or cards.
+
+    Answers that are replayed have their own, which `in_manifest` states.
+    """
+    typed = run.manifest.settings.latency
+    choice = typed if typed in latencies.NAMES else None
+    times = []
+    for helper, helper_s in zip_longest(run.manifest.helpers, in_manifest):
+        card = model_of(run, helper or run.manifest.helpers[0])
+        has_own = choice is None and registration(card.engine).capabilities.own_latency
+        times.append(helper_s if has_own else latencies.of_card(choice, card).helper_s)
+    return tuple(times)
 
 
 def _of_episodes(run: Run, ours: Run) -> Iterator[str]:

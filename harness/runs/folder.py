@@ -174,7 +174,10 @@ class Run:
         A model card, a file that describes a model, may declare that some answers take longer. None
         if this one took no longer, or so much as declared.
         """
-        failures = self.agent(answer)["model"].get("failures")
+        model, identity = self.agent(answer)["model"], self.manifest.identity
+        while model.get("engine") == "replay" and isinstance(replayed := identity.get("of"), dict):
+            model, identity = replayed.get("model", {}), replayed.get("identity", {})
+        failures = model.get("failures")
         tail_s = failures.get("slow_s", 0.0) if isinstance(failures, Mapping) else 0.0
         if not (isinstance(tail_s, int | float) and 0 <= tail_s <= LONGEST_S):
             tail_s = 0.0

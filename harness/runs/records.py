@@ -835,6 +835,8 @@ class Manifest(Struct, frozen=True, kw_only=True):
     def _check_speeds(self) -> None:
         """Raise ValueError unless answers are timed as what times them says."""
         if not self.latency.speeds:
+            if self.beside:
+                raise ValueError(f"{next(iter(self.beside))}: nothing timed the answers by it")
             return
         if (its_timer := self.timer) is None:
             if self.model["engine"] != "replay":

@@ -12,11 +12,13 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import digest
 from harness.core.formats import WORK
 from harness.core.parallel import Workers
+from harness.core.plugins import package_versions
 from harness.core.seeds import FIRST, LAST_SEED, Purpose, purpose
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, find, load
 from harness.world.scenario import Scenario
+from harness.world.scenario_of_package import is_ours
 
 # What a tree depends on; numbers of it that are kept are of this code alone.
 CODE = ("world/**/*.py", "world/**/*.csv", "dataset/*.py")
@@ -89,7 +91,10 @@ def trees(
     that are not in the user's cache folder are built; a stopped build resumes. `progress` is called
     with the number of layouts just done. Raises UserError if another process is building them.
     """
-    key = digest([scenario.name, scenario.parameters.stated(), kept.code_sha256(*CODE)])[:12]
+    of_code: list[Any] = [kept.code_sha256(*CODE)]
+    if not is_ours(scenario.layout):
+        of_code.append(package_versions())
+    key = digest([scenario.name, scenario.parameters.stated(), *of_code])[:12]
     name = re.sub(r"[^A-Za-z0-9]+", "-", scenario.name)[:60]
     folder = kept.folder() / "trees" / f"{name}-{of.start}-{len(of)}-{key}"
     if not (folder / "manifest.json").is_file() or (folder / WORK).is_dir():
