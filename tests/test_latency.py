@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -23,6 +24,7 @@ from harness.backends.card import Card
 from harness.backends.card import Latency as CardLatency
 from harness.backends.cards import resolve
 from harness.coordination.named_points import POINTS, named_point
+from harness.core import work
 from harness.core.config import LONGEST_S
 from harness.core.errors import Unanswered
 from harness.dataset.load import Dataset
@@ -399,6 +401,28 @@ def test_a_measured_run_repeated_from_its_manifest_by_a_slower_model_has_the_sam
     monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
     is_measured(command, "0:2", harness, small_path, tmp_path)
     has_the_same_rows(harness, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_measured_run_that_was_stopped_as_it_tidied_is_that_run(
+    harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its times bear a seal; without it nobody knows that they were measured here."""
+    monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
+    typed = (
+        "eval", "--model", LANGUAGE_MODEL, "--dataset", small_path, "--limit", "1", "--seeds", "0",
+        "--latency", "measured", "--no-cache", "--quiet", "--out", tmp_path / "run",
+    )  # fmt: skip
+    with monkeypatch.context() as patch:
+        patch.setattr(work, "tidy", lambda out: None)
+        assert harness(*typed)[0] == 0
+    kept = shutil.copytree(tmp_path / "run", tmp_path / "kept")
+    assert harness(*typed)[0] == 0
+    assert not (tmp_path / "run/.work").exists()
+    (kept / ".work/seal-config.json").unlink()
+    code, _, error = harness(*typed[:-1], kept)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "states inference times that were not measured here with your key" in error
 
 
 def is_measured(

@@ -341,10 +341,14 @@ def _check_measured(out: Path, place: Path, run_start: RunStart, resumes: bool) 
     if not resumes:
         write_seal(record, {CONFIG: bytes_of(record, "record")})
     elif not is_sealed(record):
-        raise UserError(
-            f"--out {printable(out)} states inference times that were not measured here with your "
-            "key; begin in another folder"
-        )
+        raise _not_measured_here(out)
+
+
+def _not_measured_here(out: Path) -> UserError:
+    return UserError(
+        f"--out {printable(out)} states inference times that were not measured here with your key; "
+        "begin in another folder"
+    )
 
 
 def _open_unsealed(out: Path, place: Path) -> None:
@@ -757,8 +761,14 @@ def finished_run(spec: Spec, out: Path) -> folder.Run:
     from harness.evaluate.recompute import refuse_otherwise  # which evaluates a run again
 
     folder_in(out.parent, out.name)
-    finished(spec, out)
     run = sound(out)
+    if spec.settings.latency == latencies.MEASURED:
+        begun_with = work.start_of(out, RunStart)
+        if begun_with is None or begun_with.latency != run.manifest.latency:
+            raise _not_measured_here(out)
+        _check_measured(out, out / WORK, begun_with, resumes=True)
+        spec = spec.changed(latency=latencies.as_declared(run.manifest.latency))
+    finished(spec, out)
     work.same(out, rules(versions()), rules(run.manifest.versions))
     refuse_others(run)
     refuse_otherwise(run, spec)

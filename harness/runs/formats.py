@@ -545,10 +545,10 @@ def _condition(table: Mapping[str, Any]) -> dict[str, Any]:
     renamed = {name: value for name, value in table.items() if name != "roadside_edge"}
     if table.get("roadside_edge") is True:
         renamed["edge"] = "relay"
-    known = _with(CONDITION, renamed)
+    complete = _with(CONDITION, renamed)
     plain = OperatingPoint("any").record()
-    lacking = {name: value for name, value in plain.items() if name not in known and name != "name"}
-    return as_here({**known, **lacking})
+    del plain["name"]
+    return as_here({**plain, **complete})
 
 
 def checked(version: object, file: object) -> None:
