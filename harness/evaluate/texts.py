@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import msgspec
+from msgspec import UNSET
 
 from harness.backends.base import BARE
 from harness.core.errors import UserError, printable
@@ -21,7 +22,8 @@ from harness.runs.records import Answer, is_helper
 from harness.runs.sources import lacking, prompt_of
 
 ASKED_AGAIN = "delete that file, and its questions are asked again"
-OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message")  # what is read in a text
+# what is read in a text; of the last two an answer may state nothing
+OF_TEXTS = ("status", "verdict", "repairs", "intent", "mass", "message", "faults", "extension")
 
 
 def refuse_others(run: Run) -> None:
@@ -91,6 +93,8 @@ def same(name: str, stated_answer: Answer, here: Answer | Parsed) -> bool:
     rounding. `here` is the one that was parsed.
     """
     a, b = getattr(stated_answer, name), getattr(here, name)
+    if a is UNSET:
+        return True
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(map(close, a, b))
     return close(a, b)

@@ -69,6 +69,9 @@ def asked_key(viewer: str, question: str) -> str:
     return f"{viewer}{ASKED}{question}" if question else viewer
 
 
+FinishReason = Literal["stop", "length", "refusal", "error"]  # why a model's text ends
+
+
 class FirstTurn(Struct, frozen=True, kw_only=True):
     """Hold a failed answer that was followed by a repair turn: a second question after the failure.
 
@@ -80,7 +83,7 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
 
     raw: str  # the completion as it came
     status: str  # the outcome of parsing (`harness.parsing.status`)
-    finish_reason: str  # `stop`, `length`, `refusal` or `error`
+    finish_reason: FinishReason  # `stop`, `length`, `refusal` or `error`
     prompt_tokens: Whole | None  # tokens in
     completion_tokens: Whole | None  # tokens out
     seconds: Measured | None  # time of this answer, if its request was alone in the engine
@@ -113,7 +116,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     heard: tuple[str, ...] = ()
     role: Role
     raw: str  # the completion as it came, except for lone surrogates, which no file can hold
-    finish_reason: str  # `stop`, `length`, `refusal` or `error`
+    finish_reason: FinishReason  # `stop`, `length`, `refusal` or `error`
     error: str | None  # the engine's message; None if it answered
     prompt_tokens: Whole | None  # tokens in; None if the engine has no tokenizer
     completion_tokens: Whole | None  # tokens out; None if the engine has no tokenizer
