@@ -58,7 +58,7 @@ def command(
     The model is asked only where the run has no answer.
     """
     from harness.studies.play import SOURCES, Source
-    from harness.studies.replayed_run import ReplayedRun
+    from harness.studies.replayed_run import ReplayedRun, name_apart
     from harness.studies.sweep import folder_of, panels_over, run_sweep
 
     if proxy and PROXY not in SOURCES:
@@ -70,6 +70,7 @@ def command(
         replayed = [
             ReplayedRun(run, latency, progress, not no_model, dataset, cards) for run in runs
         ]
+        name_apart(replayed)
         panels = panels_over(
             replayed, over or (), grid or (), list(dict.fromkeys(condition)), apart
         )

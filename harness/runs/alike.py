@@ -5,10 +5,13 @@ from typing import Any
 
 from msgspec import structs
 
+from harness.runs import formats
 from harness.runs.folder import Run
 from harness.world.scenario import Scenario
 
 MEASURED = "measured"  # source of a latency that each run measures for itself
+# what conditions open: a run with other conditions opens others
+OPENED = ("radio", "network", "schedule", "file")
 
 
 def setup(run: Run, scenario: Scenario | None = None) -> dict[str, Any]:
@@ -27,17 +30,39 @@ def setup(run: Run, scenario: Scenario | None = None) -> dict[str, Any]:
         "temperature": (manifest.temperature, manifest.sampling_seed),
         "ties": manifest.ties,
         "latency": MEASURED if times.source == MEASURED else times,
-        "radio": {name: (each.model, each.parameters) for name, each in manifest.channels.items()},
+        "weights": formats.identity(manifest.identity),
+        **_opened(run),
+    }
+
+
+def _opened(run: Run) -> dict[str, Mapping[str, Any]]:
+    """Return what a run's conditions open, by a word for errors and by name."""
+    manifest = run.manifest
+    radios = {name: (each.model, each.parameters) for name, each in manifest.channels.items()}
+    kept = {}
+    for folder, by_name in manifest.kept.items():
+        for name, record in by_name.items():
+            kept[f"{folder} {name}"] = record
+    return {
+        "radio": radios,
+        "network": manifest.networks,
+        "schedule": manifest.schedules,
+        "file": kept,
     }
 
 
 def different(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
     """Return the names under which two `setup`s differ, joined by commas; empty if none does.
 
-    Of radios only those count that both runs have.
+    Of what conditions open, only what both runs have counts.
     """
-    names = [name for name in one if name != "radio" and one[name] != other[name]]
-    radios = one["radio"].keys() & other["radio"].keys()
-    if any(one["radio"][name] != other["radio"][name] for name in radios):
-        names.append("radio")
+    names = []
+    for name, value in one.items():
+        there = other[name]
+        if name in OPENED:
+            common = value.keys() & there.keys()
+            value = {key: value[key] for key in common}
+            there = {key: there[key] for key in common}
+        if value != there:
+            names.append(name)
     return ", ".join(names)

@@ -209,9 +209,6 @@ def _shared_settings(run: Run) -> Any:
         manifest.conditions,
         manifest.seeds,
         settings,
-        manifest.networks,
-        manifest.schedules,
-        manifest.kept,
     )
 
 

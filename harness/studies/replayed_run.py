@@ -3,6 +3,7 @@ and no model is asked what the run has.
 """
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -445,6 +446,17 @@ class _Nearest:
 
     def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
         return self._stored.call_of_agents(scenes, at, intents)
+
+
+def name_apart(runs: Sequence[ReplayedRun]) -> None:
+    """Give runs of one name, which is that of their model, the names of their folders as well."""
+    total = Counter(run.name for run in runs)
+    of_folders = Counter((run.name, run.run.path.name) for run in runs)
+    for number, run in enumerate(runs, 1):
+        is_alone = of_folders[run.name, run.run.path.name] == 1
+        if total[run.name] > 1:
+            folder = run.run.path.name if is_alone else f"{run.run.path.name} ({number})"
+            run.name = f"{run.name} · {folder}"
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:

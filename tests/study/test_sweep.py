@@ -14,9 +14,10 @@ from harness.coordination.named_points import POINTS, named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
+from harness.runs.folder import read
 from harness.studies import replayed_run
 from harness.studies.axes import AXES, Setting, axis_of, grid
-from harness.studies.replayed_run import ReplayedRun
+from harness.studies.replayed_run import ReplayedRun, name_apart
 from harness.studies.study import Study, write_study
 from harness.studies.sweep import run_sweep, settings
 
@@ -46,6 +47,23 @@ def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
         (summary.value == at) & (summary.metric == metric) & (summary.interval == "episodes")
     ]
     return float(rows["mean"].item())
+
+
+@pytest.mark.slow
+def test_runs_of_one_name_are_named_by_their_folders_as_well(
+    done: Evaluated, tmp_path: Path
+) -> None:
+    """What is of one name is one source in a study's tables."""
+    runs = [ReplayedRun(done.out) for _ in range(3)]
+    runs[2].run.manifest.model["name"] = "another"
+    runs[2].name = str(runs[2].run.manifest.variant)
+    name_apart(runs)
+    plain = str(read(done.out).manifest.variant)
+    assert [run.name for run in runs] == [
+        f"{plain} · run (1)",
+        f"{plain} · run (2)",
+        plain.replace("proxy", "another"),
+    ]
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from harness.core.statistics import Estimate, mean_of
 from harness.evaluate.dry_run import lacking
 from harness.evaluate.walk import Decided
 from harness.report.suite import MEAN
+from harness.runs.alike import different, setup
 from harness.runs.estimates import over_episodes
 from harness.runs.headline import BALANCED, IN_WORDS, SUCCESS
 from harness.runs.metric_names import LATENCY
@@ -332,8 +333,8 @@ def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> l
         panels: the conditions, and the settings varied in them, that are to be played.
 
     Raises:
-        UserError: two runs of a model are on the same family (scenario), or a model cannot play
-            messages that hold intents.
+        UserError: two runs of a model are on the same family (scenario) or differ in what is asked
+            and timed, or a model cannot play messages that hold intents.
     """
     by_model: dict[str, dict[str, ReplayedRun]] = {}
     for runs in given:
@@ -349,6 +350,12 @@ def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> l
                     f"{printable(run.run.path)} and {printable(other)} are both "
                     f"{printable(name)} on {printable(family)}; give one of them"
                 )
+            first = next(iter(by_family.values()), run)
+            if unlike := different(_setup(first), _setup(run)):
+                raise UserError(
+                    f"{printable(run.run.path)} and {printable(first.run.path)} are both "
+                    f"{printable(name)}, and differ in {unlike}; give runs of one evaluation"
+                )
             by_family[family] = run
     points = [setting.point for setting in distinct(panels)]
     models = []
@@ -358,6 +365,11 @@ def models(given: Sequence[Sequence[ReplayedRun]], panels: Sequence[Panel]) -> l
             raise UserError(f"{printable(name)}: {left_out[INTENT]}")
         models.append(Model(name, by_family, left_out))
     return models
+
+
+def _setup(run: ReplayedRun) -> dict[str, Any]:
+    """Return what runs of one model must have alike; each family may have a prompt of its own."""
+    return {**setup(run.run), "prompt": ""}
 
 
 def _unable(

@@ -97,7 +97,7 @@ def compare(
     """
     from harness.coordination.schedules import SCHEDULES
     from harness.extensions.schedules.study import in_order, run_schedules, schedule_study
-    from harness.studies.replayed_run import ReplayedRun
+    from harness.studies.replayed_run import ReplayedRun, name_apart
 
     names = list(dict.fromkeys(schedule or in_order(SCHEDULES.usable())))
     for name in names:
@@ -112,6 +112,7 @@ def compare(
     with bar("schedules", quiet=as_json or quiet, grows=True) as progress:
         cards = options.cards(model)
         replayed = [ReplayedRun(run, latency, progress, models=cards) for run in runs]
+        name_apart(replayed)
         tuned = [ReplayedRun(run, latency, progress, models=cards) for run in tune]
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_in(runs[0], "schedules")

@@ -1,5 +1,6 @@
 """`harness view` and `harness run history`: the runs in a folder, in a browser, and by date."""
 
+from collections import Counter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Thread
@@ -120,6 +121,7 @@ def history(
     for group in groups:
         of = f": {names[group.metric]}" if len(names) > 1 else ""
         typer.echo(f"\n{printable(f'{group.of}, {group.condition}', WIDTH - len(of))}{of}")
+        variants = Counter(line.run.manifest.variant for line in group.lines)
         for line in group.lines:
             value = n = DASH
             if score := line.score:
@@ -128,6 +130,8 @@ def history(
             typer.echo(
                 f"{line.date.astimezone():%Y-%m-%d %H:%M} {who:<{VARIANT}} {value:<22} n {n:>4}"
             )
+            if variants[line.run.manifest.variant] > 1:
+                typer.echo(f"{'':17}{printable(line.name, WIDTH - 17)}")
     for name, error in wrong.items():
         typer.echo()
         echo_wrong(name, error)

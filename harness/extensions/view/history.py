@@ -19,7 +19,7 @@ from harness.runs.headline import headline_of
 from harness.runs.listing import runs as listed
 from harness.runs.metric_names import ALL
 from harness.runs.metrics import entry
-from harness.runs.records import Score
+from harness.runs.records import ClosedLoop, Score
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,8 @@ def history(
             except UserError as error:
                 wrong(listing.name, error)
                 continue
-            lines.setdefault(repr(run.manifest.world.pinned), []).append(
-                Line(listing.name, listing.date, run, None)
-            )
+            line = Line(listing.name, listing.date, run, None)
+            lines.setdefault(repr(_alike(run)), []).append(line)
     if not lines:
         raise UserError(f"no finished runs in {printable(folder)}; `harness eval` makes one")
     runs = [line.run for of in lines.values() for line in of]
@@ -105,6 +104,12 @@ def history(
         if dataset in (None, _scenes(of[0].run))
     ]
     return sorted(groups, key=lambda group: group.lines[-1].date, reverse=True)
+
+
+def _alike(run: Run) -> object:
+    """Return what runs of a group have alike: their scenes, and what vehicles hear in beacons."""
+    world = run.manifest.world
+    return world.pinned, world.scenario if isinstance(world, ClosedLoop) else None
 
 
 def _scenes(run: Run) -> str:

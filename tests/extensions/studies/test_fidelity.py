@@ -1,5 +1,6 @@
 """Frozen against closed, on four layouts that were frozen and driven."""
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 from former import DRIVE
+from run_on_disk import configure
 from typer.main import get_command
 
 from harness.cli import app
@@ -112,6 +114,19 @@ def test_the_command_writes_a_page_and_says_the_largest_difference(
 def test_what_cannot_be_compared_is_one_line(
     runs: list[Path], harness: Callable[..., Said]
 ) -> None:
+    stated = json.loads((runs[1] / "run.json").read_text())
+    for name, changed in (
+        ("latency", {"latency": {**stated["latency"], "ego_s": 1.9}}),
+        ("weights", {"identity": {**stated["identity"], "file_sha256": "0" * 64}}),
+        (
+            "radio",
+            {"channels": {**stated["channels"], "6g": {**stated["channels"]["6g"], "model": "x"}}},
+        ),
+    ):
+        shutil.copytree(runs[1], name)
+        configure(Path(name), **changed)
+        with pytest.raises(UserError, match=f"and {name} differ in {name}; give runs that differ"):
+            fidelity([runs[0], Path(name)])
     for folders, said in (
         (runs[:1], "no run on live episodes"),
         (runs[1:2], "no run on frozen scenes"),
