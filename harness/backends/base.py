@@ -59,47 +59,61 @@ class Request:
     which read no messages.
     """
 
-    id: str  # unique in a run, `<scene>/<viewer>`; a repair turn has the suffix `AGAIN`
-    role: Role  # which prompt of the version was rendered, and which schema the answer has
-    # `{"role": "system" | "user" | "assistant", "content": text}`
+    # unique in a run: scene id, slash, vehicle id; a second question after an answer that could not
+    # be parsed ends in `AGAIN`
+    id: str
+    # who is asked, and for what: `ego`, `helper`, or `merge` (the ego again, with the messages that
+    # it heard)
+    role: Role
+    # the chat to answer: dicts `{"role": "system" | "user" | "assistant", "content": text}`
     messages: tuple[Mapping[str, str], ...]
-    actions: tuple[str, ...]  # meta-action names, in the environment's order
+    # names of what the ego can do next, such as `SLOWER`, in the environment's order
+    actions: tuple[str, ...]
     max_tokens: int  # most tokens the answer may have
-    form: str = "distribution"  # what the prompt asks for (`Prompt.form`)
+    # what the prompt asks for: `distribution`, a probability for each action, or one action with a
+    # confidence (`maneuver` of the ego, `recommendation` of a helper)
+    form: str = "distribution"
     # How the model answers. `json`: it writes freely. `constrained`: it fills in numbers and
     # choices of a fixed text. `readout`: it is asked for one letter, and the letters' probabilities
     # are the answer. `decision`: it is asked the `question`, by a read-out unless it is a decision
     # model.
     answer: AnswerMode = "json"
-    # of a decision, what `messages` ask; its options are the actions
+    # the typed question that `messages` ask, in answer mode `decision`; its options are the actions
     question: Question | None = None
-    # Of a read-out over cyclic orders, the chat with each further order of the actions behind the
-    # letters.
+    # In a read-out (one letter stands for each action), the same chat once for each further order
+    # of the actions behind the letters, so that a liking of a letter can be averaged out.
     orders: tuple[tuple[Mapping[str, str], ...], ...] = ()
-    # Of a read-out, its chats with the list of actions reversed, `messages` and `orders`, which are
-    # asked as a request of their own (`harness.evaluate.flip`); empty if that is not asked.
+    # In a read-out, the chats of `messages` and `orders` with the list of actions reversed; they
+    # are asked as a request of their own, to see whether the answer changes. Empty if that is not
+    # asked.
     flips: tuple[tuple[Mapping[str, str], ...], ...] = ()
-    extension: str = ""  # further members of its answer (`Shape.extension`)
-    placeholders: tuple[str, ...] = ()  # of its prompt (`Shape.placeholders`)
-    # what is done where probabilities of `json` do not sum to 1: fail, or divide
+    # JSON Schemas, by name and as JSON text, of what the answer has beside the decision; empty for
+    # nothing
+    extension: str = ""
+    # texts that the prompt shows in place of values, such as `max 12 words`; they are no answer
+    placeholders: tuple[str, ...] = ()
+    # what becomes of a `json` answer whose probabilities do not sum to 1: `refuse` fails it,
+    # `divide` divides them by their sum
     sums: Sums = "refuse"
     # whether the model is asked to think first (if its template can switch that)
     thinking: bool = False
     reasons_first: bool = False  # whether the prompt asks for reasons before the answer
-    # of softmax(logits / temperature), of which tokens are drawn; 0: the likeliest
+    # sampling temperature T: tokens are drawn from softmax(logits / T); 0 takes the likeliest
     temperature: float = 0.0
-    sample: int = 0  # number of the answer among several to one question, which seeds its draws
-    # whether the time is measured; a server then streams, which shows the first token
+    # number of this answer among several to one question, from 0; it seeds the draws
+    sample: int = 0
+    # whether its time is measured; a server is then asked to stream, to see the first token
     timed: bool = False
-    agent: int = 0  # which of the run's agents is asked: 0 is the ego's
+    # index of the model that is asked among those of the run: 0 is the ego's, helpers' follow
+    agent: int = 0
     # the picture before the text of the last user message; None if there is none
     image: Image | None = None
-    # The viewer's own scene graph, for backends without a language model; it holds nothing that the
-    # prompt's author could not see.
+    # what the vehicle that is asked knows of the scene, for rules in place of a language model; it
+    # holds nothing that the prompt's author could not see
     view: "SceneGraph | None" = None
-    # the same with everything in view, if the card is `privileged`
+    # the same with every vehicle in view, only for a rule whose card says `privileged`
     truth: "SceneGraph | None" = None
-    # scenario of the view; only backends that read the view read it
+    # the kind of traffic situation, for backends that read `view`
     scenario: "Scenario | None" = None
 
     @property
@@ -114,9 +128,9 @@ class Request:
 
     @property
     def bare(self) -> bool:
-        """Return whether its answer is probabilities alone, without text of the model.
+        """Return whether the answer is probabilities alone, without text of the model.
 
-        It is so in the answer modes `readout` and `decision`.
+        It is so in the answer modes `readout` (a letter) and `decision` (a typed question).
         """
         return self.answer in BARE
 
@@ -130,9 +144,9 @@ class Request:
         return self.answer == "constrained" or self.sums == "divide"
 
     def alike(self, **changes: Any) -> "Request":
-        """Return a copy with other values in some fields, given by name.
+        """Return a copy of this question with other values in some fields, given by name.
 
-        It does what `dataclasses.replace` does and takes a third of the time.
+        It does what `dataclasses.replace` does, in a third of the time.
         """
         request = object.__new__(Request)
         vars(request).update(vars(self), **changes)
@@ -146,10 +160,10 @@ class Request:
 def by_scenario(
     requests: Sequence[Request], answer: Callable[[Sequence[Request]], Sequence[T]]
 ) -> list[T]:
-    """Return the answers to requests, in order, asked separately for each scenario.
+    """Return the answers to requests of several scenarios, in order, one call for each scenario.
 
-    A scenario is the kind of traffic situation of a request's scene. `answer` is called once for
-    each: it gets all its requests, and returns their answers in the same order.
+    It is for rules that work on scenes of one scenario (kind of traffic situation) at a time.
+    `answer` gets all requests of a scenario, and returns their answers in the same order.
     """
     places: dict[int, list[int]] = {}
     for n, request in enumerate(requests):
@@ -224,10 +238,10 @@ OF_LETTERS = ("label_mass", "letter_share", "follows_letter", "flipped")
 
 
 def failed(request: Request, error: str, prompt_tokens: int | None = None) -> Completion:
-    """Return the completion of a request that got no answer: its text is empty.
+    """Return the completion that stands for an answer which never came; its text is empty.
 
-    `error` says in one sentence why; `prompt_tokens` is the number of tokens that were read, None
-    if unknown.
+    It answers `request`. `error` says in one sentence why there is none; `prompt_tokens` is the
+    number of tokens that were read, None if unknown.
     """
     return Completion(request.id, "", prompt_tokens, None, "error", None, 1, error)
 
@@ -246,10 +260,16 @@ def per_token_s(seconds: float, first_token_s: float | None, tokens: int | None)
 
 
 class Backend(Protocol):
-    """Describe what answers requests: a model in this process, a server, or a rule."""
+    """Describe what answers requests: a model in this process, a server, or a rule.
+
+    Code that asks vehicles' models knows them by this interface alone.
+    """
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        """Return a completion for each request, in the same order; `error` says why one failed."""
+        """Return a completion, the model's answer, for each request, in the same order.
+
+        If one failed, its `error` says why.
+        """
         ...
 
     def identity(self) -> dict[str, Any]:
@@ -263,10 +283,11 @@ class Backend(Protocol):
 
 
 def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
-    """Return whether two identities, as `Backend.identity` returns them, are of one model.
+    """Return whether stored answers and the open backend are of one model.
 
-    `stored` is that of an earlier run and `now` that of the open backend. What servers state now
-    and did not state in `stored` is not compared.
+    `stored` is the identity that an earlier run recorded, and `now` that of the open backend, as
+    `Backend.identity` returns them: what decides answers, by name. What a server states only now is
+    not compared.
     """
     return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
 
@@ -302,9 +323,10 @@ class Rendering(Backend, Protocol):
 
 
 def window(backend: Backend) -> int:
-    """Return how many requests a backend can answer at once, in several calls of `complete`.
+    """Return how many requests may be under way at a backend, over several concurrent calls.
 
-    It is 0 if only one call may run at a time.
+    It is for callers that send further requests before the first are answered. It is 0 if only one
+    call of `complete` may run at a time.
     """
     return getattr(backend, "window", 0)
 
@@ -312,8 +334,8 @@ def window(backend: Backend) -> int:
 def forget(backend: Backend) -> None:
     """Let a backend drop what its engine keeps of earlier prompts, as if it was just opened.
 
-    What is kept saves time, but moves probabilities by rounding. Does nothing for backends that
-    keep nothing.
+    An engine keeps computed beginnings of prompts to save time, which moves probabilities by
+    rounding. Does nothing for backends that keep nothing.
     """
     forgets: Callable[[], None] | None = getattr(backend, "forget", None)
     if forgets:
@@ -336,7 +358,7 @@ class Served:
 def served(backend: Backend) -> list[Served]:
     """Return which server gave each answer since the last call of this function.
 
-    It is empty for a model in this process, which has no servers.
+    It is for a run's record. The list is empty for a model in this process, which has no servers.
     """
     taken: Callable[[], list[Served]] | None = getattr(backend, "served", None)
     return taken() if taken else []
@@ -345,21 +367,22 @@ def served(backend: Backend) -> list[Served]:
 def doubt(backend: Backend) -> str | None:
     """Return a sentence on why cached answers may come from other weights; None if they cannot.
 
-    A cached answer is one that was stored in an earlier run of the same model by name; a server may
-    not tell which weights it has.
+    Cached answers were stored by an earlier run under the model's name. A server that does not
+    state a digest of its weights may have got others since.
     """
     return getattr(backend, "doubt", None)
 
 
 def several(backend: Backend) -> Sequence[str]:
-    """Return the addresses of a backend's servers if any of them may answer; else empty."""
+    """Return the addresses of a model's servers if more than one may answer; else empty."""
     return getattr(backend, "several", ())
 
 
 class Timed(Backend, Protocol):
-    """Describe a backend of answers stored by an earlier run, whose times are not measured again.
+    """Describe a backend that replays answers of an earlier run, whose times are known from there.
 
-    `latency` says how long an answer took there.
+    `latency()` returns the record of how many seconds answers took in that run, so that nothing is
+    measured again.
     """
 
     def latency(self) -> "Latency": ...

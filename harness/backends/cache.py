@@ -125,9 +125,9 @@ class CompletionFile:
         self.path = path
 
     def find(self, keys: Sequence[str]) -> dict[str, Completion]:
-        """Return those of the completions under `keys` that are stored, by key.
+        """Return those of the answers under `keys` that are stored, by key.
 
-        They have no seconds, and an empty request id.
+        The seconds that they took are unknown then, and their request id is empty.
         """
         rows: list[tuple[str, str]] = []
         with self._open() as file:
@@ -143,7 +143,10 @@ class CompletionFile:
             raise sqlite3.DatabaseError(f"an answer is damaged: {error}") from None
 
     def add(self, completions: Mapping[str, Completion]) -> None:
-        """Store completions by key; one that is stored already stays."""
+        """Store answers by key, as the function `key` makes it.
+
+        One that is stored already stays.
+        """
         rows = []
         for place, completion in completions.items():
             answer = {name: getattr(completion, name) for name in _KEPT}

@@ -71,8 +71,9 @@ class Latency:
     `basis` says in words where the number comes from.
     """
 
-    # `card` means `inference_s`, `paper` the paper's 145 ms if no time is declared; `cited` means
-    # the paper's too, unless the card's is asked for: its makers' computer is not the car's
+    # `card` means `inference_s`; `paper` means the 145 ms of the paper, if no time is declared;
+    # `cited` too means those 145 ms unless the card's time is asked for, since the time was
+    # measured on a computer that is not a car's
     source: LatencySource
     inference_s: Seconds | None  # declared or cited seconds of one answer; None for the paper's
     # where the number comes from: "cited: ...", "declared: ...", or "measured: machine, date"
@@ -142,15 +143,18 @@ class Card:
     none, or unknown.
     """
 
-    # stem of its file, `<stem>:<engine>`, name of a directory or file, hub id, or `replay:<run>`
+    # what is typed after `--model` to get it: the name of its file without `.toml`, that with
+    # `:<engine>`, the name of a directory or file, a hub id, or `replay:<run>`
     name: str
     engine: str  # name of the program that runs it, such as `transformers`
     description: str  # one line for people
     latency: Latency  # the declared time of one answer
-    # Directory (absolute, or relative to the cards), GGUF file or hub id; the run's directory for
-    # `replay`; the server's name of the model for `openai`; None without a model.
+    # Where the model is: a directory (absolute, or relative to the cards' folder), a GGUF file or a
+    # hub id; the run's directory for engine `replay`, the server's name of the model for `openai`.
+    # None without a model.
     weights: str | None = None
-    file: str | None = None  # GGUF file in `weights`, unless `weights` is the file itself
+    # name of the GGUF file inside `weights`; None if `weights` is the file itself
+    file: str | None = None
     revision: str | None = None  # branch, tag or commit on the hub; None means its default branch
     sha256: Sha256 | None = None  # of the GGUF file or model.safetensors, checked on loading
     # whether the hub gives the weights only to those who have accepted their licence
@@ -162,10 +166,11 @@ class Card:
     context_tokens: Count | None = None
     # `switch` if its template can turn it on and off, `always` if never off
     thinking: Thinking = "none"
-    # whether it sees behind the occlusion: an upper reference, never a contestant
+    # whether it is shown what is hidden from the vehicle: an upper bound to compare with, no
+    # contestant
     privileged: bool = False
     licence: str | None = None  # SPDX id of the weights' licence, or its name if it has no id
-    # of an answer, if the model needs another limit than its prompt's
+    # most tokens of an answer, if the model needs another limit than its prompt's; None for that
     max_new_tokens: Count | None = None
     # most tokens of a thought, in addition to the answer's, if asked to think
     thinking_tokens: Count = 2048
@@ -186,9 +191,9 @@ class Card:
 
     @property
     def slow_s(self) -> float:
-        """Return the seconds that some answers take longer than its latency, by `failures`.
+        """Return the seconds that some answers of a rule take longer than its latency.
 
-        It is 0 without any.
+        The card's `failures` declare it, to test late answers; it is 0 without any.
         """
         return self.failures.slow_s if self.failures else 0.0
 
@@ -197,10 +202,10 @@ class Card:
         return f"model {printable(self.name)!r}"
 
     def at(self, urls: tuple[str, ...]) -> "Card":
-        """Return this card, which describes a model, with other addresses of its servers.
+        """Return a copy of this card whose model is asked at other addresses of its servers.
 
-        `urls` are base URLs such as `http://host:8000/v1`. It is unchanged if it has no server or
-        `urls` is empty. Raises ValueError if one is not a base URL, or is named twice.
+        `urls` are base URLs such as `http://host:8000/v1`. The card is unchanged if it has no
+        server or `urls` is empty. Raises ValueError if one is not a base URL, or is named twice.
         """
         return (
             replace(self, server=replace(self.server, base_url=urls))

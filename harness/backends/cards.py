@@ -52,18 +52,19 @@ _SERVER_PLACE = ("base_url", "key_env", "timeout_s", "retries")
 
 
 def names() -> list[str]:
-    """Return the sorted names of all files of model cards, the project's and those that ship.
+    """Return the sorted names of all model cards: those of the user's project and those that ship.
 
-    A model card is a TOML file that describes a model; its name is without `.toml`.
+    A model card is a TOML file that describes a model; its name is the file's, without `.toml`.
     """
     return resources.names("models")
 
 
 def each_engine(stem: str) -> list[Card]:
-    """Return the model cards in the file `models/<stem>.toml`, one for each engine that it lists.
+    """Return the model's descriptions in `models/<stem>.toml`, one for each engine that it lists.
 
-    A model card describes a model on one engine, the program that runs it; the default engine's is
-    first. Raises UserError for a mistake in the file.
+    Such a file is a model card. `stem` is its name without `.toml`. An engine is the program that
+    runs the model; the default one's description is first. Raises UserError for a mistake in the
+    file.
     """
     return read_cards(resources.find("models", f"{stem}.toml"))
 

@@ -53,7 +53,10 @@ class Tokenizer(Protocol):
         ...
 
     def candidates(self, letters: str) -> Sequence[int]:
-        """Return ids of all tokens whose text may be one of these letters, and perhaps more."""
+        """Return ids of all tokens whose text may be one of these letters, and perhaps others.
+
+        They are then looked at one by one.
+        """
         ...
 
 
@@ -140,7 +143,7 @@ class Chat:
 
     @cached_property
     def turn_end(self) -> int | None:
-        """Return the id of the token that the template writes after an answer, or None."""
+        """Return the id of the token that ends an answer in the chat template; None without one."""
         with suppress(UserError):
             text = self._apply(
                 self._template_messages(_TURN), thinking=False, add_generation_prompt=False
@@ -162,8 +165,8 @@ class Chat:
         """Return the prompt of chat messages, as the model reads it up to its answer.
 
         `messages` are dicts with `role` and `content`; `thinking` says whether the model is asked
-        to think first. A picture stands as `image_token`. Raises UserError if the template refuses
-        the messages, or leaves out a text of them.
+        to think first. A picture stands in the text as `image_token`. Raises UserError if the
+        template refuses the messages, or leaves out a text of them.
         """
         template_messages = self._template_messages(with_system(messages, self.system))
         try:

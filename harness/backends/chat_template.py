@@ -23,7 +23,10 @@ _LONGEST_FORM = 100  # characters of a form of dates
 
 
 class Refused(UserError):
-    """Report that a chat template does not take some messages."""
+    """Report that a model's chat template raises an error on some messages.
+
+    Such is a system message where the template allows none.
+    """
 
 
 class ChatTemplate:

@@ -80,9 +80,11 @@ class Decoding:
         self._letters: dict[str, list[list[int]]] = {}
 
     def room(self, request: Request) -> int:
-        """Return the most tokens that the answer to a request can take after its prompt.
+        """Return the most tokens that the answer to a request can take, to see whether it fits.
 
-        Raises UserError if the tokenizer or `max_tokens` leaves no room for this answer mode.
+        The tokens of the prompt are not counted, which share the context with it. Raises UserError
+        if the tokenizer or `max_tokens` leaves no room for this answer mode (free text,
+        constrained, or letters).
         """
         if request.answer == "constrained":
             return self._skeleton(request).most_tokens

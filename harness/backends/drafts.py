@@ -13,11 +13,11 @@ MOST = 8  # most tokens of a guess
 
 
 class Drafts:
-    """Remember which token followed which ones in a batch's answers, to guess how others go on.
+    """Guess how answers go on, from which token followed which ones in other answers of the batch.
 
-    The model then checks several guessed tokens at a time, which is faster than writing them. For
-    what came before, tokens with digits count as equal. A token is guessed only where all answers
-    went on alike.
+    The model then checks several guessed tokens in one pass, which is faster than writing them one
+    by one. For what came before, tokens with digits count as equal. A token is guessed only where
+    all answers went on alike.
     """
 
     def __init__(self, chat: Chat) -> None:
@@ -36,9 +36,10 @@ class Drafts:
             self._next[place] = None
 
     def after(self, kind: Hashable, tokens: Sequence[int], most: int) -> list[int]:
-        """Return up to `most` guessed token ids after the answer so far, `tokens`; none if unknown.
+        """Return up to `most` guessed token ids that may follow an answer so far; none if unknown.
 
-        `kind` tells answers of different forms apart, such as that of the ego and of helpers.
+        `tokens` are the answer's token ids. `kind` tells answers of different forms apart, such as
+        that of the ego and of helpers.
         """
         guess: list[int] = []
         while len(guess) < min(most, MOST):

@@ -41,7 +41,8 @@ def open(card: Card, **_: Any) -> "DriverBackend":
 class DriverBackend:
     """Answer requests by a rule-based driver: the action that it takes has all of the probability.
 
-    The driver `uniform` gives each action the same.
+    Such a driver, like `cruise` or `brake`, decides for a car without a model, and is what models
+    are compared with. The driver `uniform` gives each action the same probability.
     """
 
     def __init__(self, driver: str) -> None:

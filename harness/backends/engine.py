@@ -55,10 +55,10 @@ class Session(Protocol):
         return [0] * len(guesses)
 
     def ends(self, chunks: Sequence[Sequence[Sequence[int]]], tokens: Sequence[int]) -> Floats:
-        """Return log-probabilities of the K ids `tokens` after each of C chunks of each sequence.
+        """Return log-probabilities of K token ids after each of C continuations, `(n, C, K)`.
 
-        A chunk is a list of token ids that would follow the sequence. The shape is `(n, C, K)`.
-        Each sequence has equally many chunks, none empty. The session can only be closed
+        The ids are `tokens`. `chunks` has for each of the n sequences C lists of token ids that
+        would follow it; each sequence has equally many, none empty. The session can only be closed
         afterwards.
         """
         ...
@@ -103,7 +103,10 @@ class Engine(Protocol):
         ...
 
     def forget(self) -> None:
-        """Drop what is kept of earlier prompts, such as their KV cache; no session may be open."""
+        """Drop what is kept of earlier prompts, such as their keys and values.
+
+        No session may be open.
+        """
         ...
 
     def identity(self) -> dict[str, Any]: ...
@@ -124,7 +127,10 @@ def check_logits(largest: Sequence[float]) -> None:
 
 
 def common_length(sequences: Sequence[list[int]]) -> int:
-    """Return how many tokens one or more sequences have in common at their beginning."""
+    """Return how many tokens some sequences have in common at their beginning.
+
+    Each is a list of token ids; there must be at least one.
+    """
     first, last = min(sequences), max(sequences)  # all that sort between these two begin as both do
     return next(
         (i for i, (a, b) in enumerate(zip(first, last, strict=False)) if a != b), len(first)
@@ -132,15 +138,18 @@ def common_length(sequences: Sequence[list[int]]) -> int:
 
 
 def common_beginning(sequences: Sequence[list[int]]) -> list[int]:
-    """Return the tokens that one or more sequences have in common at their beginning."""
+    """Return the token ids that some sequences have in common at their beginning.
+
+    Each is a list of token ids; there must be at least one.
+    """
     return sequences[0][: common_length(sequences)]
 
 
 def group_by_beginning(sequences: Sequence[list[int]]) -> Iterator[list[int]]:
-    """Yield groups of token sequences that share long beginnings, to be read together.
+    """Yield groups of token sequences with long common beginnings, which are then read only once.
 
     A group is a list of indices into `sequences`, lists of token ids; each index is in one group. A
-    group of its own is made only where that saves reading `LEAST_SAVED` tokens.
+    group of its own is made only where that saves reading at least `LEAST_SAVED` tokens.
     """
     order = sorted(range(len(sequences)), key=sequences.__getitem__)
     shared = [common_length([sequences[a], sequences[b]]) for a, b in pairwise(order)]

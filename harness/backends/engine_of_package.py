@@ -30,9 +30,10 @@ UNSTATED = object()
 
 
 class EngineOfPackage:
-    """Stand before a backend that another package adds: check and copy what it answers and states.
+    """Guard the backend of an engine that another package adds: check and copy what it returns.
 
-    A wrong answer becomes a one-line UserError. All other attributes are passed on to that backend.
+    That is its answers and what it states of itself. What is malformed becomes a one-line
+    UserError. All other attributes are passed on to that backend.
     """
 
     def __init__(self, backend: Backend, card: "Card", can: "Capabilities") -> None:

@@ -84,8 +84,8 @@ class LanguageModel:
     def next_log_probs(self, requests: Sequence[Request], vocabulary: int) -> Floats:
         """Return log-probabilities of the first token after each of n prompts, `(n, V)`.
 
-        The prompts are those of the requests, and V is `vocabulary`: the values are of the token
-        ids 0 to V - 1.
+        They are what training compares a model by. The prompts are those of the requests, and V is
+        `vocabulary`: the values are of the token ids 0 to V - 1.
         """
         with closing(self.engine.begin([self.tokens(request) for request in requests])) as session:
             return session.log_probs(range(vocabulary))

@@ -44,9 +44,9 @@ class Packaged:
 
     @property
     def place(self) -> Path:
-        """Return the path where the file lies once it is fetched, in the cache folder.
+        """Return where the file lies in the cache folder once it is fetched.
 
-        Equal files of one name share it.
+        Equal files of one name share the path.
         """
         return kept.folder() / "weights" / self.sha256[:16] / self.file.rpartition("/")[2]
 

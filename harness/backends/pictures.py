@@ -27,9 +27,10 @@ def locate_picture(token: int) -> tuple[int, int]:
 
 
 def pictures_in(tokens: Iterable[int]) -> list[int]:
-    """Return the numbers of the pictures whose first token id is among `tokens`, in order.
+    """Return the numbers of the pictures that begin among some token ids, in order.
 
-    A picture's number is the one that its negative token ids hold (`locate_picture`).
+    Negative ids stand for pictures. `tokens` are the ids of a prompt or a piece of it. A picture's
+    number is the one that `locate_picture` reads in its ids.
     """
     located = (locate_picture(token) for token in tokens if token < 0)
     return [number for number, place in located if place == 0]
@@ -85,6 +86,9 @@ class Pictures(Generic[T]):
         return encodings
 
     def forget(self, tokens: Iterable[int]) -> None:
-        """Drop the encodings of the pictures that some of the token ids `tokens` stand for."""
+        """Drop the encodings of pictures that some token ids stand for, after a prompt was read.
+
+        `tokens` are the ids; those of a picture are negative.
+        """
         for number in {locate_picture(token)[0] for token in tokens if token < 0}:
             self._encoded.pop(number, None)

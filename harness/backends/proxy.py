@@ -71,7 +71,10 @@ class Proxy:
 
 
 def answers(requests: Sequence[Request]) -> list[str]:
-    """Return the answers of the rule `proxy` to requests, in order, before any is spoilt."""
+    """Return the texts that the rule `proxy` answers to requests, in order, before any is spoilt.
+
+    The rule stands in for a model in tests.
+    """
     return by_scenario(requests, _answers)
 
 

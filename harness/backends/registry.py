@@ -189,7 +189,7 @@ def capabilities(engine: str) -> Capabilities:
 
 
 def reads_prompts(engine: str) -> bool:
-    """Return whether an engine's models read prompts; true for one that is not installed."""
+    """Return whether an engine's models read prompts, unlike rules; true for one not installed."""
     entry = ENGINES.get(engine)
     return entry is None or entry.capabilities.language_model
 
@@ -245,24 +245,30 @@ def _opened_in(
 
 
 def import_object(place: str) -> Any:
-    """Return the object that `module:name` names, after importing its module."""
+    """Return the object at a place `module:name`, after importing its module.
+
+    Engines are named so, to be imported only when they are used.
+    """
     module, _, name = place.partition(":")
     return getattr(import_module(module), name)
 
 
 def engine_answer(card: "Card", place: str) -> Any:
-    """Return what a function of an engine returns for a model card, such as the path of weights.
+    """Call a function of an engine with a model card, and return its result.
 
-    A model card is the TOML file that describes a model, and an engine the program that runs it.
-
-    `place` is where the function is, `module:name`, as the engine's registration has it.
+    Such is the path of the model's weights. A model card is the TOML file that describes a model,
+    and an engine the program that runs it. `place` is where the function is, `module:name`, as the
+    engine's registration has it.
     """
     with worded(f"engine {printable(card.engine)}", built_in=card.engine in BUILT_IN):
         return import_object(place)(card)
 
 
 def missing_package(engine: str) -> str | None:
-    """Return the first package that an engine needs and that is not installed, or None."""
+    """Return the first package that an engine needs and that is not installed, or None.
+
+    `engine` is its name.
+    """
     packages = registration(engine).packages
     return next(
         (package for module, package in packages.items() if find_spec(module) is None), None

@@ -195,8 +195,8 @@ class Replay:
 class LacksAnswer(UserError):
     """Report that a run has no answer to a question which its own record says was asked.
 
-    `question` is the id of the request; `otherwise` counts answers of the run that differ from what
-    the rule-based model here gives, from which they are said to come.
+    `question` is the id of the request. `otherwise` counts the run's answers that differ from what
+    a rule in place of a model answers here, if the run says that this rule gave them.
     """
 
     def __init__(self, run: Path, question: str) -> None:
@@ -205,11 +205,10 @@ class LacksAnswer(UserError):
 
 
 class Kept(Replay):
-    """Answer requests from a finished run, and never open a model.
+    """Answer requests from a finished run that may be a stranger's, and never open a model.
 
-    So a run that may be a stranger's opens nothing: a missing answer raises UserError. A delay that
-    the run states of an answer is not taken, since only rules declare delays, and rules are asked
-    again.
+    A missing answer raises UserError. A delay that the run states of an answer is not believed:
+    only rules in place of models declare delays, and these are asked again.
     """
 
     def _completion(self, request: Request, answer: Answer) -> Completion:

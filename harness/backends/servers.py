@@ -95,11 +95,17 @@ class Fields:
 
     @property
     def changed(self) -> Mapping[str, str | bool]:
-        """Return the fields that are left out (false) or renamed, by their usual name."""
+        """Return the request fields that a server is sent otherwise, by their usual name.
+
+        The value is false for one that is left out, else the name under which it is sent.
+        """
         return {name: alias for name, alias in vars(self).items() if alias is not True}
 
     def applied(self, body: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a request's JSON body with fields left out and renamed as stated here."""
+        """Return a request's JSON body in which fields are left out or renamed for a server.
+
+        `body` has them under their usual names.
+        """
         sent = {name: vars(self).get(name, True) for name in body}
         return {
             name if alias is True else alias: body[name]
@@ -193,11 +199,12 @@ class Server:
             )
 
     def key(self) -> str | None:
-        """Return the server's key; None if its variable is not set.
+        """Return the API key to send to the model's server; None if no variable has one.
 
-        A model card (a model's TOML file) may come from others, so it may not have any variable
-        sent to its server. Raises UserError if the variable's name is not that of a key of models,
-        and the user does not list it.
+        The file that describes the model names the environment variable, and may come from a
+        stranger, who could have a secret of the user's sent to his server. So UserError is raised
+        unless the variable's name is that of a model's key, such as `OPENAI_API_KEY`, or the user
+        lists it in `SWARMDRIVE_KEYS`.
         """
         if not self.key_env or not (key := os.environ.get(self.key_env, "").strip()):
             return None
@@ -239,7 +246,7 @@ def readable(variable: str) -> bool:
 
 
 def meant(address: str) -> str | None:
-    """Return the base URL that is meant by an address without `http://`; None if unclear.
+    """Return the base URL that a user may mean by an address without `http://`; None if unclear.
 
     It is for the advice in an error message.
     """

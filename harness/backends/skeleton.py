@@ -56,9 +56,10 @@ class Point:
 
 
 def expand(schema: Mapping[str, Any], branches: Sequence[Branch]) -> list[Branch]:
-    """Return the ways to write a value of a JSON schema, after which the answer goes on.
+    """Return the ways to write a value of a JSON Schema in a constrained answer.
 
-    Each is a branch: fixed text, and the point after it at which the model decides. `branches` are
+    A constrained answer is JSON whose fixed text is given, so that the model only fills in values.
+    A way is a branch: fixed text, and the point after it at which the model decides. `branches` are
     the ways in which the answer goes on after the value. Fixed texts begin and end only beside
     letters and digits, where tokenizers split as well.
     """
@@ -110,10 +111,10 @@ def start(shape: Shape) -> Point:
 
 
 def filled(shape: Shape, place: int) -> str:
-    """Return an example of a constrained answer, as JSON text.
+    """Return an example of a constrained answer, as JSON text, such as to count its tokens.
 
-    `shape` says what it must look like. Where the model would choose, the text has the option at
-    index `place`; texts that the model would write are empty.
+    `shape` says what it must look like. Where the model would choose, the text has the option of
+    the index `place`; texts that the model would write are empty.
     """
     text, point = "", Branch("", start(shape)).then
     while point:
@@ -153,9 +154,10 @@ class Filled(NamedTuple):
 
 
 class Leg(NamedTuple):
-    """Hold one option at a point of a constrained answer, with the fixed text that follows it.
+    """Pair an option that the model may choose in a constrained answer with the text after it.
 
-    `text` is both texts, `tokens` their token ids, and `branch` what follows the option.
+    `text` is the option with the fixed text that follows, `tokens` are the token ids of both, and
+    `branch` is that fixed text with the next point at which the model decides.
     """
 
     text: str  # the option and the branch's fixed text
@@ -222,9 +224,9 @@ class Skeleton:
         return longest[self._start]
 
     def walk(self) -> Generator[Ask, int, Filled]:
-        """Yield each choice of the model in a constrained answer, and return the finished answer.
+        """Go through one constrained answer: yield each choice of the model, return the answer.
 
-        Each choice wants the chosen token id sent to the generator.
+        It is a generator: it wants the chosen token id sent for each choice that it yields.
         """
         text, count, before = "", 0, "\n"
         forced: list[int] = []

@@ -10,11 +10,11 @@ from harness.backends.card import Card
 
 
 class Swarm:
-    """Send each request to the backend of its agent (`Request.agent`), where a run has several.
+    """Send each request to the model of the agent that it is for, in a run with several models.
 
-    An agent is one of the models (with prompt and answer mode) that vehicles of a run ask; the
-    ego's has index 0, those of helpers follow. `backends` are the agents', in this order; several
-    agents may share one backend.
+    An agent is one of the models (with prompt and answer mode) that vehicles of a run ask;
+    `Request.agent` is its index: the ego's is 0, those of helpers follow. `backends` are the
+    agents', in this order; several agents may share one backend.
     """
 
     def __init__(self, backends: Sequence[Backend]) -> None:

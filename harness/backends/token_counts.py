@@ -25,10 +25,10 @@ def too_few(
 ) -> str | None:
     """Return which stated token count is too small for its text, as a phrase; None if none is.
 
-    Latency and energy are computed from these counts. `text` is the answer to `request`, `can` says
-    what the engine can do, and the counts are those of prompt and answer, None if unknown. The text
-    of an answer by letters' probabilities is not the model's own, so its tokens are not held
-    against it; nor are those of a server's prompt, which it may have cut.
+    It guards latency and energy, which are computed from these counts. `text` is the answer to
+    `request`, `can` says what the engine can do, and the counts are those of prompt and answer,
+    None if unknown. The text of an answer by letters' probabilities is not the model's own, so its
+    tokens are not held against it; nor are those of a server's prompt, which it may have cut.
     """
     of_prompt = sum(len(message["content"]) for message in request.messages)
     of_text = 0 if request.bare or not can.language_model else len(text)

@@ -59,7 +59,10 @@ def tokenizer(source: Path) -> Any:
 
 
 def whole(loaded: Any) -> Any:
-    """Return `loaded`, a `tokenizers.Tokenizer`, set neither to cut texts off nor to pad."""
+    """Set a tokenizer neither to cut texts off nor to pad them, and return it.
+
+    `loaded` is a `tokenizers.Tokenizer`.
+    """
     loaded.no_truncation()
     loaded.no_padding()
     return loaded

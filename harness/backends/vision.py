@@ -54,10 +54,9 @@ class Vision:
         return (width // square) * (height // square)
 
     def difference(self, tokens: int) -> str | None:
-        """Return an error message if an image processor makes too few or too many tokens.
+        """Return an error message if an image processor makes another number of tokens than this.
 
-        `tokens` is the number that it makes of a picture; None is returned if this record expects
-        as many.
+        `tokens` is the number that it makes of a picture; None is returned if they are equal.
         """
         if tokens == self.tokens:
             return None

@@ -137,10 +137,10 @@ def check_digest(card: Card, file: Path) -> Path:
 
 
 def contradictions(card: Card) -> Iterator[str]:
-    """Yield a line for each fact that a model card states otherwise than its weights do.
+    """Yield a line for each fact that a model card states otherwise than the model's own files do.
 
     The facts are the licence, and a context length above that of the weights. A model card is a
-    TOML file that describes a model; what it states is used. Raises UserError if the weights are
+    TOML file that describes a model; a run uses what it states. Raises UserError if the weights are
     not found.
     """
     where = locate(card)

@@ -94,7 +94,7 @@ class Sparrow:
         return replace(completion, seconds=seconds, first_token_s=seconds)
 
     def rendered(self, requests: Sequence[Request]) -> list[str]:
-        """Return for each request the state and the question that the model gets, as JSON."""
+        """Return for each request what the model reads, as JSON: the scene and the question."""
         from harness.backends.decisions.wires import asked_of, questions
 
         return [
@@ -103,7 +103,10 @@ class Sparrow:
         ]
 
     def identity(self) -> dict[str, Any]:
-        """Return the package's version, and the model's name and SHA-256 digest."""
+        """Return what decides the answers: the package's version, the model's name and digest.
+
+        The digest is the SHA-256 of its weights; values are by name.
+        """
         ours = {"engine": "sparrow", "answers": BUILT_IN["sparrow"].answers}
         package = version("sparrow-decider")
         return {

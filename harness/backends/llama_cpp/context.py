@@ -45,9 +45,9 @@ class LlamaContext:
         self._ends: dict[int, list[int]] = {}  # the position after each token
 
     def fork(self, source: int, copy: int, length: int) -> None:
-        """Make sequence `copy` of the first `length` computed tokens of sequence `source`.
+        """Make a sequence a copy of another's first `length` tokens, as computed.
 
-        Both are the sequences' numbers.
+        `source` and `copy` are the numbers of the two sequences.
         """
         if length:  # llama.cpp can only copy a whole sequence, so the copy is cut afterwards
             c.llama_memory_seq_cp(self._memory(), source, copy, -1, -1)

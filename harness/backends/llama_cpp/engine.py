@@ -172,7 +172,7 @@ class LlamaEngine:
         self._beginnings.append(beginning)
 
     def peek(self, chunks: dict[int, Sequence[int]]) -> Logits:
-        """Return the logits after further tokens of some sequences, which then drop these tokens.
+        """Return the logits that some sequences would have after further tokens, which are dropped.
 
         `chunks` has the token ids by the sequence's number; the logits are `(n, vocabulary)`, in
         that order.

@@ -26,7 +26,10 @@ def keep_errors(level: int, text: bytes, _: Any) -> None:
 
 
 def last_error() -> str:
-    """Return the first error logged since the last call, as one line, and forget the others."""
+    """Return llama.cpp's first error message since the last call, as one line.
+
+    Later ones are dropped, since the first names the cause.
+    """
     reason = (
         printable(_errors[0].partition("\n")[0], 200) if _errors else "llama.cpp does not say why"
     )

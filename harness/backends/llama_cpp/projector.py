@@ -56,7 +56,10 @@ class Run(NamedTuple):
 
 
 def text_run(ids: Sequence[int]) -> Run:
-    """Return the `Run` of a text's token ids, of one position each."""
+    """Return a text's token ids as a `Run`, which llama.cpp reads in one call.
+
+    Each token takes one position.
+    """
     return Run(np.array(ids, dtype=np.int32), np.arange(len(ids), dtype=np.int32)[None], len(ids))
 
 
@@ -134,7 +137,7 @@ class Projector:
         return tokens
 
     def run(self, token: int) -> Run:
-        """Return the encoded part of a picture that begins with a negative token id.
+        """Return the part of an encoded picture that begins with a negative token id.
 
         Raises LookupError if the picture is no longer alive.
         """

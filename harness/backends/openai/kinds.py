@@ -24,17 +24,18 @@ class ServerKind:
     path = ""  # where it tells that it is one; empty if nowhere
 
     def is_one(self, payload: Mapping[str, Any]) -> bool:
-        """Return whether a server is of this kind.
+        """Return whether a server runs this program, by what it answered at a path that tells it.
 
-        `payload` is the decoded JSON object that the server returns for `path`.
+        `payload` is the decoded JSON object that the server returned for this kind's `path`.
         """
         return False
 
     async def states(self, model: str, ask: Ask) -> Statement:
         """Return the server's version, None if unknown, and a dict of what it states of a model.
 
-        `model` is the model's name there. `ask` requests a path of the server, given the path
-        beside `/v1` and JSON to post (None for a GET), and returns its reply.
+        The dict has facts by dotted names, such as a digest of the weights. `model` is the model's
+        name there. `ask` requests a path of the server, given the path beside `/v1` and JSON to
+        post (None for a GET), and returns its reply.
         """
         return None, {}
 
@@ -171,7 +172,7 @@ async def kind_of(ask: Ask) -> Kind:
 
 
 def fields_of(reply: Reply) -> dict[str, Any]:
-    """Return a reply's JSON object; an empty dict if its payload is none."""
+    """Return the JSON object of a server's reply; an empty dict if it is no object."""
     return reply.payload if isinstance(reply.payload, dict) else {}
 
 
@@ -193,7 +194,7 @@ def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
 
 
 def as_text(value: Any) -> str:
-    """Return a text as it is, and any other value as JSON text."""
+    """Return what a server states as text: a text as it is, any other value as JSON."""
     with suppress(RecursionError):
         return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return "nested too deeply"

@@ -49,10 +49,10 @@ class PromptCheck:
                     self._asked.add(request.role)
 
     def fault(self, request: Request, tokens: int | None) -> str | None:
-        """Return why a server may have cut a prompt, by its token count; None if it has not.
+        """Return a sentence if a server seems to have cut a prompt, by its token count; else None.
 
-        `tokens` is how many prompt tokens it states for `request`. Some servers cut long prompts to
-        their context in silence, as Ollama does.
+        `tokens` is how many prompt tokens it states for `request`. Some servers, such as Ollama,
+        cut long prompts to their context without saying so.
         """
         if (
             tokens is None

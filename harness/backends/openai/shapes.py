@@ -210,8 +210,8 @@ def answering_model(payload: Any) -> str | None:
 def tokens_in(value: Any, characters: int = 0) -> int | None:
     """Return a token count that a server states, or None if it cannot be one.
 
-    `value` is what it states of a text of so many characters, 0 if unknown. None if it is no whole
-    number, or too small or large for the text: latency and energy are computed from it.
+    `value` is what it states of a text of `characters` characters, 0 if unknown. None if it is no
+    whole number, or too small or large for such a text: latency and energy are computed from it.
     """
     is_count = type(value) is int and least_tokens(characters) <= value <= MOST_TOKENS
     return value if is_count else None

@@ -61,13 +61,13 @@ class Model(NamedTuple):
 
     @property
     def tells_weights(self) -> bool:
-        """Return whether it states a digest or size, which differ for other weights."""
+        """Return whether the server states a digest or size, which differ for other weights."""
         return any(name.rpartition(".")[2] in _WEIGHTS for name in self.states)
 
     def covers(self, earlier: "Model") -> bool:
-        """Return whether it states all that `earlier`, an earlier statement on the same model, did.
+        """Return whether it states all that an earlier statement on the same model, `earlier`, did.
 
-        A server that is still loading states less.
+        It tells a model that was replaced from a server that is still loading, which states less.
         """
         lists = earlier.listed is None or self.listed is not None
         tells_version = earlier.version is None or self.version is not None

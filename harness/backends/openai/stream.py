@@ -20,7 +20,7 @@ _CUT_OFF = "the stream ends before the answer does"
 
 
 class Stream:
-    """Assemble one streamed chat completion from the bytes of a server's reply.
+    """Assemble a model's streamed answer, a chat completion, from the bytes of a server's reply.
 
     The bytes are server-sent events.
     """
@@ -42,7 +42,7 @@ class Stream:
         self._last_at_s: float | None = None
 
     def take(self, data: bytes, at_s: float) -> None:
-        """Add bytes of the reply, cut anywhere.
+        """Add bytes of a server's streamed reply as they come, cut anywhere.
 
         `at_s` is when they came, in seconds of `time.perf_counter`.
         """
@@ -106,7 +106,7 @@ class Stream:
         return None if self._first_at_s == self._last_at_s else self._first_at_s
 
     def payload(self) -> dict[str, Any]:
-        """Return the completion as the JSON value that a server sends without streaming.
+        """Return the streamed answer as the JSON value that a server sends without streaming.
 
         It is complete once `fault` is None.
         """

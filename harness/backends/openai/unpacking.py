@@ -26,9 +26,10 @@ class Unpacker:
             )
 
     def take(self, data: bytes, most: int) -> bytes:
-        """Unpack further bytes of the reply, and return at most `most` bytes of what they hold.
+        """Unpack further bytes of a compressed reply, and return what they hold.
 
-        Raises Packed if they are damaged.
+        `data` are the bytes as they came; at most `most` bytes are returned. Raises Packed if they
+        are damaged.
         """
         if self._zlib is None:
             return data

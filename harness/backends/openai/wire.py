@@ -37,8 +37,9 @@ class Wire(NamedTuple):
     def misfit(self, states: Mapping[str, Fact]) -> str | None:
         """Return why this API does not suit a model; None if it does, or nothing is known.
 
-        `states` has what the model's server states of it, by dotted names. A decision model writes
-        no text, and other models answer no typed questions.
+        `states` has what the model's server states of it, by dotted names. A decision model, which
+        only gives options probabilities, writes no text, and other models answer no typed
+        questions.
         """
         outputs = str(
             states.get("architecture.output_modalities", states.get("output_modalities", ""))

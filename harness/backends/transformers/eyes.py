@@ -66,7 +66,7 @@ class Processor:
         return inputs
 
     def measured(self, pixels: Pixels) -> tuple[int, Any]:
-        """Return the number of tokens of a picture of this shape, and its grid of patches.
+        """Return how many tokens a picture of this shape becomes, and its grid of patches.
 
         `pixels` is RGB, (height, width, 3). The grid is the processor's `image_grid_thw`, `(1, 3)`:
         patches in time, height and width; None if the model has none.

@@ -48,7 +48,7 @@ NOTHING = Prefix([], [])
 
 
 class Prefixes:
-    """Keep the keys and values of a few recently read beginnings of prompts.
+    """Keep the keys and values of a few recently read beginnings of prompts, to read them once.
 
     At most `MOST_TOKENS` tokens in total; the least recently used is dropped first.
     """
@@ -59,8 +59,8 @@ class Prefixes:
     def longest(self, ids: list[int], but: Sequence[int] = ()) -> Prefix:
         """Return the longest kept beginning of the token ids `ids`, a prompt.
 
-        It is empty if that is shorter than `LEAST_TOKENS`. `but` is a whole prompt that is ignored
-        although it was read before.
+        It is empty if that is shorter than `LEAST_TOKENS`. `but` is a whole prompt that does not
+        count, although it was read before.
         """
         kept = [prefix for prefix in self._kept if prefix.ids != list(but)]
         shared = [common_length([prefix.ids, ids]) for prefix in kept]

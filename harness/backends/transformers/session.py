@@ -244,7 +244,10 @@ class Rows:
         return Rows(self._reader, deepcopy(self._cache), self._mask, self._logits, self._places)
 
     def layers(self) -> list[tuple[Any, Any]]:
-        """Return each layer's keys and values, `(n, heads, tokens, dim)`, which stay valid."""
+        """Return each layer's keys and values of the n sequences, to keep them for later.
+
+        Each is an array `(n, heads, tokens, dim)` that stays valid.
+        """
         return [(layer.keys, layer.values) for layer in self._cache.layers]
 
     def argmax(self, among: Sequence[Sequence[int] | None]) -> list[int]:
