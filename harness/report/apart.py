@@ -39,11 +39,12 @@ def apart(thing: T, built_in: bool) -> T:
 def said_of(
     registry: Plugins[Callable[[Any], Iterable[str]]], name: str, thing: Manifest | Run | SuiteRun
 ) -> list[str]:
-    """Return the sentences that a plug-in of a registry has on a run, suite or manifest, `thing`.
+    """Return the sentences that one plug-in has to say about a run, suite or manifest.
 
-    `registry` has functions by name, which take such a thing and return texts; `name` is the one to
-    call. A package's gets a copy. A suite is a run on each of several scenarios. Raises UserError
-    if it fails, or returns anything but texts.
+    `registry` has functions by name, which take such a `thing` and return texts; `name` is the one
+    to call. A package's function gets a copy, so that it can change nothing. A suite is a run on
+    each of several scenarios, a manifest the settings and origin of a run. Raises UserError if the
+    function fails, or returns anything but texts.
     """
     copied = apart(thing, registry.is_ours(name))
     return registry.ask(name, lambda of: texts(of(copied)))

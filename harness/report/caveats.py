@@ -37,10 +37,10 @@ _FAILED = {
 
 
 def stopped(run: Run) -> Iterator[str]:
-    """Yield when a run that might stop early was looked at, and which of its intervals hold.
+    """Yield a sentence on a run that might stop early: when it was tested, which intervals hold.
 
-    At a look, after some of its layouts (start situations), a rule says whether these are enough.
-    It yields nothing for other runs.
+    Such a run is tested after some of its layouts (start situations, one an episode): a rule says
+    whether these are enough. Nothing is yielded for other runs.
     """
     record = run.manifest.world.interim_looks
     if record is not None and (rule := run.manifest.stopping_rule):
@@ -80,16 +80,16 @@ def causes(run: Run) -> Iterator[str]:
 
 
 def unanswered(run: Run) -> Iterator[str]:
-    """Yield the engine's errors if unanswered requests leave a run without a valid result.
+    """Yield the errors of a run whose model left so many questions unanswered that it is invalid.
 
-    The engine is what runs the model; too many questions to the ego or to helpers got an error.
+    They are the messages of the engine, which runs the model.
     """
     if (tallied := tally(run)).missing:
         yield f"{tallied}: the model could not be asked, so that this is no result."
 
 
 def few(run: Run) -> Iterator[str]:
-    """Yield a warning that the interval of a share is wide, for fewer than `FEW` episodes."""
+    """Yield a warning on a run of fewer than `FEW` episodes: the interval of success is wide."""
     n = len(run.grid.episodes)
     if n < FEW:
         reach = f"{98 / n**0.5:.0f} points to either side"
@@ -117,10 +117,11 @@ def saturated(run: Run) -> Iterator[str]:
 
 
 def earlier_gains(run: Run) -> Iterator[str]:
-    """Yield a sentence if a run of an earlier version of the harness has wider intervals of gains.
+    """Yield a sentence if a run's intervals of gains are wider than they would be today.
 
-    A gain is a condition's success less that of the condition without a radio. A condition is a
-    named set of settings of channel, asking and fusion.
+    A gain is a condition's success less that of the condition without a radio; earlier versions of
+    the harness computed its interval otherwise. A condition is a named set of settings of the
+    radio, of asking helpers and of fusing their messages.
     """
     gains = [score for score in run.scores if score.metric in GAINS.values()]
     if any(score.interval == pinned.KIND for score in gains):
@@ -175,10 +176,7 @@ def lost_messages(run: Run) -> Iterator[str]:
 
 
 def retried(run: Run) -> Iterator[str]:
-    """Yield how many requests to the engine failed and were repeated.
-
-    The engine is what runs the model.
-    """
+    """Yield a sentence on how many requests to the model failed and were repeated."""
     if retries := run.manifest.retries:
         yield f"The engine had errors: {retries} attempts were repeated."
 
@@ -186,7 +184,8 @@ def retried(run: Run) -> Iterator[str]:
 def controls(run: Run) -> Iterator[str]:
     """Yield the conditions that are controls: helpers' messages are replaced, to test cooperation.
 
-    A condition is a named set of settings of channel, asking and fusion.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     for kind in more_parts().values():
         for control, words in kind.controls.items():
@@ -195,10 +194,11 @@ def controls(run: Run) -> Iterator[str]:
 
 
 def lagging(run: Run) -> Iterator[str]:
-    """Yield the conditions whose decisions mostly take longer than the dataset's lag.
+    """Yield a warning on conditions whose decisions mostly take longer than the outcomes are for.
 
-    A condition is a named set of settings of channel, asking and fusion. The lag is the time from a
-    decision to its action for which the dataset knows the outcome.
+    Recorded scenes know the outcome of an action that begins a fixed time after the decision, the
+    lag. A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     if off := doubts.lagging(_off_lag(run)):
         yield (
@@ -222,11 +222,12 @@ def unmeasured(run: Run) -> Iterator[str]:
 
 
 def doubted(*runs: Run) -> set[str]:
-    """Return the names of the conditions of some runs that have a warning.
+    """Return the names of the conditions of some runs that a page warns about.
 
-    A condition is a named set of settings of channel, asking and fusion. A warning have controls
-    (helpers' messages are replaced), conditions with another lag from decision to action than the
-    dataset's, and radios outside the range for which their channel model was validated.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages. A warning have controls (something replaces what helpers say), conditions with another
+    lag from decision to action than the dataset's, and radios outside the range for which their
+    channel model was validated.
     """
     names = set[str]()
     for run in runs:
@@ -249,7 +250,7 @@ def _channels(manifest: Manifest) -> dict[str, doubts.Channel]:
 
 
 def of_extensions(run: Run) -> Iterator[str]:
-    """Yield the sentences that extensions have on a run; for one that fails, its error message."""
+    """Yield the warnings that extensions have on a run; for one that fails, its error message."""
     for name in CAVEATS:
         try:
             yield from said_of(CAVEATS, name, run.manifest)
@@ -276,10 +277,11 @@ def by_letter(run: Run) -> Iterator[str]:
 
 
 def unheard(run: Run) -> Iterator[str]:
-    """Yield the conditions under which messages arrive, but all after the decision window.
+    """Yield a warning on conditions under which messages arrive, but none in time to count.
 
-    A condition is a named set of settings of channel, asking and fusion; the window is the seconds
-    from a decision's start in which replies count.
+    In time is within the decision window, the seconds from a decision's start in which replies
+    count. A condition is a named set of settings of the radio, of asking helpers and of fusing
+    their messages.
     """
     d = run.decisions
     delivered, on_time = d.of_messages("delivered") == 1.0, d.of_messages("on_time") == 1.0
@@ -294,10 +296,11 @@ def unheard(run: Run) -> Iterator[str]:
 
 
 def lost_at_once(run: Run) -> Iterator[str]:
-    """Yield how many episodes end in a collision before the ego's first action takes effect.
+    """Yield in how many episodes the ego collides before its first action takes effect.
 
-    These are episodes in which it is so under every condition and channel seed. A condition is a
-    named set of settings of channel, asking and fusion.
+    No answer could have saved these. They count if it is so under every condition and channel seed.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages; a channel seed is the seed of the radio channel's random draws.
     """
     world = run.manifest.world
     if isinstance(world, ClosedLoop):
@@ -319,7 +322,7 @@ def lost_at_once(run: Run) -> Iterator[str]:
 def moved_system(run: Run) -> Iterator[str]:
     """Yield a sentence on each model whose system text was put into the first user turn.
 
-    Its chat template has no system role.
+    The system text is the prompt's instruction; the model's chat template has no place for it.
     """
     models = [agent["model"] for agent in (run.manifest.agent(0), *run.manifest.helpers)]
     for name in dict.fromkeys(str(model["name"]) for model in models if model.get("system")):
@@ -332,7 +335,8 @@ def moved_system(run: Run) -> Iterator[str]:
 def beyond_sources(run: Run) -> Iterator[str]:
     """Yield each condition with radio parameters outside its channel model's validated range.
 
-    A condition is a named set of settings of channel, asking and fusion.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     for name, sentence in doubts.beyond(run.manifest.conditions, _channels(run.manifest)):
         yield f"{printable(name)}: {sentence}"

@@ -149,8 +149,9 @@ def _references(success: Mapping[str, float], y: Spec) -> Spec:
 def statuses(rows: Rows) -> Spec:
     """Return a chart of how answers were parsed: one stacked bar for each run and role.
 
-    `rows` have the run's name as `run`, and `role`, `status`, `count` and `share`
-    (`panels.statuses`).
+    Each of `rows` is a part of a bar: `run`, the run's name, `role`, who answered, `status`, the
+    outcome of parsing such as `strict` or `bad_sum`, `count`, the number of answers, and `share`,
+    of all in that role.
     """
     statuses: dict[str, dict[str, None]] = {verdict: {} for verdict in VERDICTS}
     for row in rows:
@@ -221,8 +222,8 @@ def stacked(
     """Return a chart of stacked bars: one for each run and value of the rows' field `by`.
 
     Rows have the run's name as `run`. A bar's segments are the values of the field `field`, in the
-    order and colours of `colours`, a colour by value; their lengths are the rows' field `amount`,
-    by default shares on a scale in percent. `what` is the axis title.
+    order and colours of `colours`, a colour by value. Their lengths are the rows' field `amount`,
+    by default shares, which are shown in percent. `what` is the axis title.
     """
     several_runs, order = len({row["run"] for row in rows}) > 1, list(colours)
     bars = []
@@ -470,8 +471,8 @@ def band(start: float, end: float, what: str, named: bool = False) -> Spec:
 def rules_at(field: str, at: Sequence[float], what: str = "") -> list[Spec]:
     """Return layers with a vertical line at each x in `at`; none if there are none.
 
-    `field` is the name of the field on the x axis. If `what` is given, a line is labelled with it
-    and its x, in ms.
+    They mark times such as the end of a decision window. `field` is the name of the field on the x
+    axis. If `what` is given, a line is labelled with it and its x, in ms.
     """
     if not at:
         return []

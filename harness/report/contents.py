@@ -17,7 +17,10 @@ EXAMPLES = 3  # of each status of answers
 
 
 def size(runs: Runs) -> str:
-    """Return a phrase with the numbers of episodes and channel seeds and the dataset's name."""
+    """Return a phrase on how many episodes and channel seeds runs have, and on which dataset.
+
+    A channel seed is the seed of the radio channel's random draws.
+    """
     episodes = _either(len(run.grid.episodes) for run in runs.runs)
     seeds = _either(len(run.grid.seeds) for run in runs.runs)
     source = runs.runs[0].source
@@ -30,10 +33,11 @@ def _either(counts: Iterable[int]) -> str:
 
 
 def summary(run: Run) -> list[dict[str, Any]]:
-    """Return the rows of a run's table of metrics: `name`, `meaning`, and `cells` by condition.
+    """Return the rows of a run's table of metrics, for its page.
 
-    A condition is a named set of settings of channel, asking and fusion. A cell has `value`,
-    `interval` and `n` as text; None where the metric has no value there.
+    A row has `name`, `meaning`, and `cells` by condition. A cell has `value`, `interval` and `n` as
+    text; None where the metric has no value there. A condition is a named set of settings of the
+    radio, of asking helpers and of fusing their messages.
     """
     metrics = dict.fromkeys(score.metric for score in run.scores if score.condition != "all")
     rows: list[dict[str, Any]] = []
@@ -54,8 +58,8 @@ def probabilities(runs: Runs) -> list[dict[str, Any]]:
 
     A row has `run` and `condition` by name, and `groups`: two sets of decisions, each with `n`, how
     many, and `scores`. These are the decisions where some action is safe (leaves success possible),
-    and those with exactly one such action. A condition is a named set of settings of channel,
-    asking and fusion.
+    and those with exactly one such action. A condition is a named set of settings of the radio, of
+    asking helpers and of fusing their messages.
     """
     lines = []
     for name, run in zip(runs.names, runs.runs, strict=True):
@@ -79,7 +83,8 @@ def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
     """Return the rows of the table of metrics on answers, which are the same under every condition.
 
     A row is a metric's label and one cell for each run; None where the run has no value. A
-    condition is a named set of settings of channel, asking and fusion.
+    condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     scores = [score for run in runs.runs for score in run.scores]
     metrics = dict.fromkeys(score.metric for score in scores if score.condition == "all")
@@ -91,10 +96,11 @@ def answers(runs: Runs) -> list[tuple[str, list[Any]]]:
 
 
 def examples(runs: Runs) -> list[dict[str, Any]]:
-    """Return the first `EXAMPLES` answers of each parse status but `strict`, over all runs.
+    """Return examples of answers that were not perfect: the first of each parse status.
 
-    An entry has `status`, such as `bad_sum`, and `answers`; each of these has the index of its
-    `run` and the `answer`'s record.
+    Up to `EXAMPLES` of each status but `strict` are taken, over all runs. An entry has `status`,
+    such as `bad_sum`, and `answers`; each of these has the index of its `run` and the `answer`'s
+    record.
     """
     by_status: dict[str, list[dict[str, Any]]] = {}
     for place, run in enumerate(runs.runs):
@@ -109,8 +115,8 @@ def examples(runs: Runs) -> list[dict[str, Any]]:
 def sweeps(run: Run) -> list[dict[str, str]]:
     """Return the charts of the sweeps in a run's folder: `name`, and `src`, the SVG as a data URI.
 
-    A sweep scores the run's stored answers under other settings. A link that leads out of the
-    folder is not followed.
+    A sweep scores the run's stored answers once more under other settings, such as packet losses. A
+    link that leads out of the folder is not followed.
     """
     folder = run.path.resolve()
     manifests = sorted(run.path.glob("*/sweep.json"))

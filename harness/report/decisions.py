@@ -24,7 +24,9 @@ ABSENT, UNREAD = "-", "?"
 
 
 class Decisions:
-    """Collect what a report shows of every single scene, ordered by episode, step and agent.
+    """Collect what a report page shows of every single scene, ordered by episode, step and agent.
+
+    A scene is one decision point; an agent is a vehicle that decides there.
 
     Attributes:
         ids: ids of the scenes that any of the runs has.
@@ -157,7 +159,10 @@ class Decisions:
         return {"said": "".join(letters), "sure": percents}
 
     def lacks(self) -> dict[str, str]:
-        """Return why some scenes lack `prompts` or `pictures` on the page, by that word."""
+        """Return why the page lacks the prompts or pictures of some scenes: sentences by word.
+
+        The words are `prompts` and `pictures`; what lacks nothing has none.
+        """
         lacks = {}
         if unknown := self._details.without_prompts():
             lacks["prompts"] = lacking(unknown[0]) or "they are not known"
@@ -168,9 +173,11 @@ class Decisions:
         return lacks
 
     def parts(self) -> list[Part]:
-        """Return all scenes in chunks of `AT_ONCE`, each to be compressed by any process.
+        """Return the page's details of all scenes as chunks of `AT_ONCE` scenes, not yet prepared.
 
-        A scene is one decision point; a chunk holds scenes' ids and what their details are made of.
+        Details of many scenes take long to prepare and compress, so each chunk can be given to a
+        process of its own (`Part.packed`). A scene is one decision point, with its world, answers
+        and decisions.
         """
         starts = range(0, len(self.ids), AT_ONCE)
         return [Part(self._details, self.ids[start : start + AT_ONCE]) for start in starts]
@@ -255,12 +262,13 @@ def failures(run: Run) -> dict[str, int]:
 
 
 def pick(run: Run, failed: dict[str, int], n: int) -> list[str]:
-    """Return the ids of up to n decision points to show, in order; the choice is deterministic.
+    """Return the ids of up to n scenes of a run that a page shows, those worth looking at first.
 
-    Up to a quarter each are points where a layout begins to fail (the keys of `failed`, as
-    `failures` returns them), points where conditions act differently, and points with an answer
-    that was repaired or failed to parse. The rest is evenly spaced. A layout is one start situation
-    of a scenario. A condition is a named set of settings of channel, asking and fusion.
+    Up to a quarter each are scenes where an episode begins to fail (the keys of `failed`, as
+    `failures` returns them), where conditions act differently, and with an answer that was repaired
+    or failed to parse; the rest is evenly spaced. The choice is always the same, and in order. A
+    condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     decisions = run.decisions
     action, seeds = decisions.codes("action", run.actions), decisions.whole("seed")

@@ -150,15 +150,17 @@ class Details:
     runs: Runs  # the runs
     replayed: Mapping[str, Scene]  # of closed-loop runs, the scenes that could be replayed
     framed: frozenset[str]  # scenes that have their cameras' pictures
-    # of a run, a function of a scene, a viewer's id and the messages heard that returns the chat
-    # messages; None where they are unknown
+    # takes a run and returns a function that makes its prompts again, or None where they are
+    # unknown; that function takes a scene, a viewer's id and the messages heard, and returns the
+    # chat messages
     prompts: Prompts
-    full: bool  # whether prompts that a rule was given, and did not read, are among them
-    # of each run, how answers change without one object or message, by scene
+    full: bool  # whether prompts that a rule was given, and did not read, are shown, too
+    # for each run, by scene id, how answers change without one object or message
+    # (`remarks.LeftOut`)
     left_out: Sequence[LeftOut]
 
     def of_scenes(self, ids: Sequence[str]) -> "Details":
-        """Return a copy with these scenes alone (by id), small enough to pickle."""
+        """Return a copy for some scenes alone, by id, small enough to send to a process."""
         scenes = set(ids)
         replayed = {name: scene for name, scene in self.replayed.items() if name in scenes}
         left_out = []
@@ -167,9 +169,9 @@ class Details:
         return replace(self, runs=self.runs.of_scenes(ids), replayed=replayed, left_out=left_out)
 
     def blocks(self, ids: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
-        """Yield the details of scenes as JSON values, `BLOCK` scenes at a time.
+        """Yield what the page shows of scenes as JSON values, `BLOCK` scenes at a time.
 
-        Raises UserError if a run does not fit its dataset.
+        `ids` says of which scenes. Raises UserError if a run does not fit its dataset.
         """
         forest, scenes = None, self.replayed
         if dataset := self.runs.dataset:
@@ -189,7 +191,7 @@ class Details:
         return [self.prompts(run) for run in self.runs.runs]
 
     def without_prompts(self) -> list[Run]:
-        """Return the runs whose prompts cannot be rendered again."""
+        """Return the runs whose prompts cannot be shown, as a prompt version is not to be found."""
         return [run for run, sent in zip(self.runs.runs, self._sent, strict=True) if sent is None]
 
     @cached_property
@@ -328,7 +330,7 @@ class Details:
 
 @dataclass(frozen=True)
 class Part:
-    """Hold a chunk of scenes, by id, whose details one process prepares and compresses.
+    """Hold a chunk of scenes whose details for a page one process prepares and compresses.
 
     `details` has what the page shows of scenes, `ids` says of which. It is pickled with no more of
     the runs than these scenes need.
@@ -341,7 +343,10 @@ class Part:
         return Part, (self.details.of_scenes(self.ids), self.ids)
 
     def packed(self) -> list[Markup]:
-        """Return the details of each block of `BLOCK` scenes as compressed JSON, in base64."""
+        """Return what the page shows of these scenes as compressed JSON, in base64.
+
+        There is one text for each block of `BLOCK` scenes.
+        """
         return [packed(block) for block in self.details.blocks(self.ids)]
 
 

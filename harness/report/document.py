@@ -40,9 +40,9 @@ class Table:
 
     @property
     def words(self) -> list[bool]:
-        """Return for each column whether some cell is longer than `LONGEST_NUMBER`.
+        """Return which columns hold sentences: for each, whether a cell is longer than a number.
 
-        Such a column holds sentences: it is left-aligned and wraps.
+        Such a cell is longer than `LONGEST_NUMBER`; the column is left-aligned and wraps.
         """
         columns = range(len(self.heads))
         longest = [0 for _ in columns]
@@ -86,7 +86,10 @@ class Section:
 
 
 def document(sections: Sequence[Section]) -> str:
-    """Return an HTML page with these sections; its title is that of the first."""
+    """Return an HTML page of these sections, one below the other.
+
+    Its title is that of the first.
+    """
     return environment().get_template("sections.html.j2").render(sections=sections)
 
 

@@ -37,9 +37,9 @@ LAST = (Kind.PACE, Kind.ORIGIN)  # what stands below them
 
 @dataclass(frozen=True)
 class Finding:
-    """Hold one sentence about a run, or about some of several runs, with its kind.
+    """Hold one sentence that pages and the terminal show about one or several runs.
 
-    `kind` says where pages and the terminal show it, `sentence` is plain text.
+    `kind`, such as a warning, says where it is shown; `sentence` is plain text.
     """
 
     kind: Kind  # says where pages and the terminal show it
@@ -122,7 +122,7 @@ def findings(run: Run | SuiteRun, *kinds: Kind) -> list[Finding]:
 
 
 def of_runs(runs: Runs, *kinds: Kind) -> list[Finding]:
-    """Return the sentences about runs shown side by side; only of `kinds` if given.
+    """Return the sentences that a page shows about several runs; only of `kinds` if given.
 
     `runs` are by the name that each is shown by. A sentence that is not true of all begins with the
     names of those it is true of.

@@ -29,7 +29,7 @@ BEST, CLOSE, WORSE = "best", "not told from the best", "worse"
 
 @dataclass(frozen=True)
 class Behind:
-    """Hold how far one run is behind the best one, over the episodes that both have.
+    """Hold how far one run's success is behind the best run's, over the episodes that both have.
 
     `change` is its success minus that of the best, with a 95 % interval; `p_value` is of no
     difference, corrected by Holm's method. Success is balanced (mean of that with a danger and
@@ -54,11 +54,11 @@ Mark = tuple[str, Behind | None]  # of a run under a condition: the mark, and ho
 class Line:
     """Hold the results of one run under one condition: a row of the report's main table.
 
-    `name` is the run's, and `condition` that of the condition, a set of settings of channel, asking
-    and fusion. `scores` has the run's scores by metric, None where unknown. `mark` says whether it
-    is the best run, not told from it, or worse, and `behind` how far it is behind, None for the
-    best. `headline` is the metric by which runs are read, balanced or plain success, and `tokens`
-    the median numbers of prompt and answer tokens.
+    `name` is the run's, and `condition` that of the condition, a set of settings of the radio, of
+    asking helpers and of fusing their messages. `scores` has the run's scores by metric, None where
+    unknown. `mark` says whether it is the best run, not told from it, or worse, and `behind` how
+    far it is behind, None for the best. `headline` is the metric by which runs are read, balanced
+    or plain success, and `tokens` the median numbers of prompt and answer tokens.
     """
 
     name: str  # the run's name on the page
@@ -66,18 +66,23 @@ class Line:
     prompt: str  # its prompt version
     answer: str  # its answer mode, such as `json`
     condition: str  # name of the condition
-    scores: Mapping[str, Score | None]  # metrics by name; None where the run has none
+    # the run's value of each metric with its interval, by the metric's name; None where it has none
+    scores: Mapping[str, Score | None]
     # medians of a prompt and an answer; None where not counted
     tokens: tuple[float | None, float | None]
-    mark: str  # `BEST` under its condition, `CLOSE` or `WORSE`; empty where no run is the best
+    # `BEST` for the best run under its condition, `CLOSE` for one that cannot be told from it,
+    # `WORSE`; empty where no run is the best
+    mark: str
     behind: Behind | None  # how it stands to the best; None for the best
-    headline: str  # the headline metric, by which the runs are read together
+    # name of the metric by which the runs are compared: balanced success, or plain where one lacks
+    # that
+    headline: str
 
     @property
     def success(self) -> Score | None:
-        """Return the score of the metric by which runs are read; None where the run has none.
+        """Return the run's success under this condition, with its interval; None where unknown.
 
-        It is balanced success if all runs have it, else plain.
+        It is balanced success if all runs of the page have it, else plain.
         """
         return self.scores[self.headline]
 
@@ -86,9 +91,9 @@ class Line:
 class Grid:
     """Hold success under one condition as a table, prompts across and models down.
 
-    `condition` is the condition's name, a named set of settings of channel, asking and fusion.
-    `prompts` are the heads of the columns. Each of `rows` is a model's name and, for each prompt,
-    the results of the runs with both: several if it was run again.
+    `condition` is the condition's name, a named set of settings of the radio, of asking helpers and
+    of fusing their messages. `prompts` are the heads of the columns. Each of `rows` is a model's
+    name and, for each prompt, the results of the runs with both: several if it was run again.
     """
 
     condition: str  # the condition's name
@@ -115,7 +120,7 @@ def lines(runs: Runs) -> list[Line]:
     """Return a row for each run and condition, by condition, then in the runs' order.
 
     A row has the run's scores, and how it stands to the best run under the condition. A condition
-    is a named set of settings of channel, asking and fusion.
+    is a named set of settings of the radio, of asking helpers and of fusing their messages.
     """
     lengths = [_tokens(run) for run in runs.runs]
     headline_metric = headline_of(*runs.runs)
@@ -160,7 +165,7 @@ def grids(results: Sequence[Line]) -> list[Grid]:
     """Return a table of models by prompts for each condition of these rows.
 
     Each of `results` is a run's scores under a condition. A condition is a named set of settings of
-    channel, asking and fusion.
+    the radio, of asking helpers and of fusing their messages.
     """
     modes = {line.answer for line in results}
     cells_of: dict[str, dict[tuple[str, str], list[Line]]] = {}  # by condition, model and prompt
@@ -207,8 +212,8 @@ def marked(
     """Return for each condition the marks of all runs: best, not told from the best, or worse.
 
     A mark comes with the comparison with the best run, or None for the best itself; p-values are
-    corrected by Holm's method for all pairs of runs. A condition is a named set of settings of
-    channel, asking and fusion.
+    corrected by Holm's method for all pairs of runs. A condition is a named set of settings of the
+    radio, of asking helpers and of fusing their messages.
 
     Args:
         conditions: for each condition the success (0 or 1) of each run, by episode's number and
@@ -273,7 +278,7 @@ def _behind(rule: Success, a: Floats, b: Floats) -> Behind:
 
 
 def uneven(runs: Runs) -> str | None:
-    """Return a sentence on the runs' numbers of episodes and seeds; None if all are the same."""
+    """Return a sentence on runs with different numbers of episodes or seeds; None if alike."""
     if len({(run.grid.episodes, run.grid.seeds) for run in runs.runs}) < 2:
         return None
     each = "; ".join(
@@ -287,10 +292,11 @@ def uneven(runs: Runs) -> str | None:
 
 
 def figures(results: Sequence[Line]) -> list[dict[str, str]]:
-    """Return the best run's success under each condition, as text.
+    """Return the best run's success under each condition as key figures for a page's top.
 
-    An entry has `what`, `value`, `interval` and `n`. Each of `results` is a run's scores under a
-    condition. A condition is a named set of settings of channel, asking and fusion.
+    An entry has texts at `what`, `value`, `interval` and `n`. Each of `results` is a run's scores
+    under a condition, a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     rows = []
     for line in results:
@@ -312,7 +318,7 @@ def shared(results: Sequence[Line]) -> set[str]:
     """Return the names of the conditions under which some run cannot be told from the best one.
 
     Each of `results` is a run's scores under a condition. A condition is a named set of settings of
-    channel, asking and fusion.
+    the radio, of asking helpers and of fusing their messages.
     """
     return {line.condition for line in results if line.mark == CLOSE}
 
@@ -326,7 +332,7 @@ def headline(results: Sequence[Line]) -> str:
 
     Success is balanced where all runs have that. Runs that cannot be told from the best are named,
     too. Each of `results` is a run's scores under a condition. A condition is a named set of
-    settings of channel, asking and fusion.
+    settings of the radio, of asking helpers and of fusing their messages.
     """
     outcomes = []
     for condition in dict.fromkeys(line.condition for line in results):

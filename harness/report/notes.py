@@ -52,7 +52,10 @@ def _milliseconds(seconds: float, ends: tuple[float, float] | None) -> str:
 
 
 def latency(run: Shown) -> Iterator[str]:
-    """Yield a line on the inference times, in ms, that decide, and where they come from."""
+    """Yield a line on the inference times, in ms, by which decisions are timed.
+
+    It says where they come from, too.
+    """
     yield f"latency: {latency_source(run.manifest.latency)}"
 
 
@@ -83,9 +86,9 @@ def latency_source(latency: Latency) -> str:
 
 
 def of_extensions(run: Shown) -> Iterator[str]:
-    """Yield the sentences that extensions add on the figures of a run or suite.
+    """Yield the sentences that extensions add on how to read the figures of a run or suite.
 
-    For an extension that fails, it is its error.
+    For an extension that fails, it is its error. A suite is a run on each of several scenarios.
     """
     for name in NOTES:
         try:
@@ -118,7 +121,10 @@ def cost(run: Shown) -> Iterator[str]:
 
 
 def cached(run: Shown) -> Iterator[str]:
-    """Yield a line on how many answers came from the completion cache, if any did."""
+    """Yield a line on how many answers an earlier run had stored, so that no model was asked.
+
+    It yields none without any.
+    """
     if n := run.manifest.cached_answers:
         yield f"{n} answers came from the cache (--no-cache asks the model again)"
 

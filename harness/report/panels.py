@@ -36,12 +36,12 @@ BUDGET = (200, 400)  # tokens of a prompt: the paper's
 class Panel:
     """Hold one chart of the report page: a Vega-Lite specification with its title and caption.
 
-    `id` is its name in the page, and `part` the part of the page in which it stands; `caption` says
-    how to read it.
+    `id` is its name in the page. `part` is the section of the page in which it stands: `overview`,
+    `probabilities`, `answers` or `communication`. `caption` says how to read it.
     """
 
     id: str  # its name in the page, and of the files it is saved as
-    part: Part  # the part of the page in which it stands
+    part: Part  # section of the page: `overview`, `probabilities`, `answers` or `communication`
     title: str  # what is drawn over what
     caption: str  # how to read it, and what it is conditional on
     spec: dict[str, Any]  # the chart, a Vega-Lite specification
@@ -49,26 +49,31 @@ class Panel:
 
 @dataclass(frozen=True)
 class AddedPanel:
-    """Describe a chart that a shipped extension adds to the report page, by `adds={"panels": ...}`.
+    """Describe a chart that a shipped extension adds to the report page.
 
-    `part` is the part of the page in which it stands; `title` and `caption` stand beside it. `rows`
-    returns a run's data for it, empty if there is nothing to draw, and `spec` the Vega-Lite
-    specification of all runs' rows.
+    The extension names it as a plug-in of kind `panels`. `part` is the section of the page, and
+    `title` and `caption` stand beside the chart. `rows` returns a run's data for it, empty if there
+    is nothing to draw, and `spec` the Vega-Lite specification of all runs' rows.
     """
 
-    part: Part  # the part of the page in which it stands
+    part: Part  # section of the page: `overview`, `probabilities`, `answers` or `communication`
     title: str  # what is drawn over what
     caption: str  # how to read it
-    # what is drawn of a run, dicts for Vega-Lite; nothing to draw if empty
+    # takes a run and returns the chart's data, dicts for Vega-Lite; empty if there is nothing to
+    # draw
     rows: Callable[[Run], Table]
-    spec: Callable[[Table], dict[str, Any]]  # of the rows of all runs, the Vega-Lite specification
+    # takes the rows of all runs and returns the Vega-Lite specification
+    spec: Callable[[Table], dict[str, Any]]
 
 
 PANELS = Shipped[AddedPanel]("swarmdrive.panels", AddedPanel, {})
 
 
 def panels(runs: Runs) -> Iterator[Panel]:
-    """Yield the charts of the runs, by the part of the page; one without any data is left out."""
+    """Yield the charts of the runs, one section of the page after the other.
+
+    A chart without any data is left out.
+    """
 
     def joined(table_of: Callable[[Run], Table]) -> Table:
         rows = []
@@ -206,10 +211,12 @@ def _references(runs: Runs, metric: str) -> dict[str, Score]:
 
 
 def success(run: Run, metric: str) -> Table:
-    """Return a row for each condition with success and latency: values, interval ends, n.
+    """Return the data of the chart of success over latency: a row for each condition of a run.
 
-    Latencies are in ms, success by the metric of this name is 0 to 1. A condition, a named set of
-    settings that the run scores, is left out if one of the two is unknown.
+    A row has `condition`; the mean `latency_ms` with the ends of its interval, `latency_low` and
+    `latency_high`; `success`, 0 to 1, by the metric of the name `metric`, with the ends `low` and
+    `high`; `n`, the number of episodes; and `interval`, what that is over. A condition, a named set
+    of settings that the run scores, is left out if one of the two is unknown.
     """
     rows = []
     for condition in run.conditions:
@@ -260,7 +267,8 @@ def reliability(run: Run) -> Table:
     probability. A row says how often the likeliest action was the only optimal one: `condition`,
     `certainty` (the bin's mean confidence), `share`, its interval's ends `low` and `high`, and `n`.
     Conditions with fewer than `LEAST` decisions that have exactly one optimal action are left out.
-    A condition is a named set of settings of channel, asking and fusion.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
@@ -290,7 +298,7 @@ def errors(run: Run) -> Table:
     The entropy says how unsure the ego's own answer is. After an unsafe decision success is no
     longer possible, though it was. Keys of a row are `condition`, `entropy_nats` (the bin's mean),
     `share`, its interval's ends `low` and `high`, and `n`. A condition is a named set of settings
-    of channel, asking and fusion.
+    of the radio, of asking helpers and of fusing their messages.
     """
     nats = run.decisions["entropy_nats"]
     bins = np.where(np.isnan(nats), -1, nats / ENTROPY_NATS).astype(int)
@@ -352,11 +360,11 @@ def tokens(run: Run) -> Table:
 
 
 def replies(run: Run) -> Table:
-    """Return the counts and shares of requested replies by condition: on time, late, lost.
+    """Return how many of the replies that were asked for came on time, late, or got lost.
 
     On time is within the decision window. A row has a `condition`, a `reply` (one of the three),
     its `count`, its `share` of the condition's `n` replies, and `n`. A condition is a named set of
-    settings of channel, asking and fusion.
+    settings of the radio, of asking helpers and of fusing their messages.
     """
     d = run.decisions
     delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
@@ -383,7 +391,7 @@ def arrivals(run: Run) -> Table:
 
     A row is a bin, with `condition`, its start `arrival_ms`, the `count` of replies and their
     `share` of those that arrived. Lost ones are not in it. A condition is a named set of settings
-    of channel, asking and fusion.
+    of the radio, of asking helpers and of fusing their messages.
     """
     d = run.decisions
     arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)

@@ -55,10 +55,10 @@ class Planned:
     """Hold the sample size for one condition: the layouts needed to find a difference.
 
     A layout is one drawn start situation, with one episode; a condition is a named set of settings
-    of channel, asking and fusion; a pilot is a run before the study. `layouts` is the number
-    needed, with an interval over other pilots, `finds` the smallest difference (0 to 1) that the
-    asked number of layouts finds, NaN if none; `cost` is what the needed layouts take, None without
-    pilots.
+    of the radio, of asking helpers and of fusing their messages; a pilot is a run before the study.
+    `layouts` is the number needed, with an interval over other pilots, `finds` the smallest
+    difference (0 to 1) that the asked number of layouts finds, NaN if none; `cost` is what the
+    needed layouts take, None without pilots.
     """
 
     condition: str  # the condition's name; empty for a stated rate
@@ -70,10 +70,11 @@ class Planned:
 
 @dataclass(frozen=True)
 class Plan:
-    """Hold the result of a power analysis of success, one row for each condition.
+    """Hold how many episodes a difference in success needs, one row for each condition.
 
-    `difference` says in words what is compared, `basis` what must hold for it. `layouts` is the
-    number of start situations (episodes) for which the smallest difference found is stated.
+    It is the result of a power analysis. `difference` says in words what is compared, `basis` what
+    must hold for it. `layouts` is the number of start situations (one an episode) for which the
+    smallest difference that is found is stated.
     """
 
     difference: str  # whose of what, in words
@@ -109,8 +110,8 @@ def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: in
     """Return the power analysis by the variance in pilot runs, one row for each condition.
 
     Of one pilot it is for the gain over the condition without a radio, of two for their difference.
-    A condition is a named set of settings of channel, asking and fusion. A layout is one start
-    situation of a scenario.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages. A layout is one start situation of a scenario.
 
     Args:
         pilots: folders of one or two runs made before the study.
@@ -208,9 +209,10 @@ def _sum(values: Iterable[float | None]) -> float | None:
 
 
 def as_mapping(plan: Plan, detect: float, power: float) -> dict[str, object]:
-    """Return a plan as plain values for JSON: differences from 0 to 1, unknown numbers as None.
+    """Return a power analysis as plain values for JSON: differences from 0 to 1, unknown as None.
 
-    `detect` is the difference to find and `power` the probability to find it, both 0 to 1.
+    `plan` is its result, `detect` the difference to find and `power` the probability to find it,
+    both 0 to 1.
     """
     conditions = []
     for row in plan.rows:

@@ -81,10 +81,11 @@ def meaning(name: str, exact: bool = True) -> str:
 
 
 def sentences(references: Mapping[str, Score], scenario: Scenario, exact: bool) -> str:
-    """Return a caption's sentences on the references: each one's success, best first, and meaning.
+    """Return a caption's sentences on reference drivers: each one's success, and what it does.
 
-    `references` are rules that need no model, by name. Empty without references. `exact`: whether
-    success was computed from decision trees, and not estimated from a run.
+    A reference driver is a rule without a model; `references` has the success of each by its name,
+    and the best is named first. Empty without references. `exact` says whether success was computed
+    from decision trees, which have all that actions lead to, and not estimated from a run.
     """
     if not references:
         return ""

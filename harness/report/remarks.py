@@ -28,9 +28,9 @@ LeftOut = Mapping[str, Sequence[Mapping[str, Any]]]
 
 @runtime_checkable
 class Remarks(Protocol):
-    """Describe what an extension offers as remarks on single decision points of a run's page.
+    """Describe what an extension says on a run's page about single scenes.
 
-    A decision point is one situation in which decisions are due.
+    A scene is one decision point: a situation in which decisions are due.
     """
 
     def sentences(self, runs: Runs) -> Iterable[Markup]:
@@ -42,12 +42,12 @@ class Remarks(Protocol):
         ...
 
     def left_out(self, run: Run) -> LeftOut:
-        """Return how answers and decisions change without one object or message, by decision point.
+        """Return how answers and decisions change if one object or message is left out.
 
-        Each decision point, by id, has a list of entries, dicts with `item`, what is left out;
-        `role`, `viewer`, `condition` and `seed`, whose answer or decision it is; `action`, the
-        likeliest with it; and, None without an answer, `instead`, the likeliest without it,
-        `change`, of that action's probability, and `shift`, of the distribution.
+        By scene id, a scene has a list of dicts: `item`, what is left out; `role`, `viewer`,
+        `condition` and `seed`, whose answer or decision it is; `action`, the likeliest with it;
+        and, None without an answer, `instead`, the likeliest without it, `change`, the difference
+        in that action's probability, and `shift`, how far the whole distribution moves.
         """
         ...
 
@@ -77,11 +77,11 @@ def sentences(runs: Runs) -> list[Markup]:
 
 
 def left_out(run: Run) -> LeftOut:
-    """Return what all extensions know of answers without one object or message, by decision point.
+    """Return what all extensions know of how answers change without one object or message.
 
-    Each decision point, by id, has a list of entries, one for an object or message
-    (`Remarks.left_out`). An extension that fails adds nothing. Raises UserError if a file of the
-    run is broken.
+    By scene id, each scene has a list of dicts, one for an object or message: who answered, the
+    likeliest action with it and without it, and by how much probabilities change. An extension that
+    fails adds nothing. Raises UserError if a file of the run is broken.
     """
     joined: dict[str, list[Mapping[str, Any]]] = {}
     for name in REMARKS:

@@ -38,20 +38,23 @@ class Runs:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Return the names of the meta-actions, in the order of every probability distribution."""
+        """Return the names of what the ego can do, the meta-actions of the runs.
+
+        Every probability distribution is in this order.
+        """
         return self.runs[0].actions
 
     @property
     def scenario(self) -> Scenario:
-        """Return the scenario of the runs' episodes, with the parameters it had then."""
+        """Return the scenario in which the runs' episodes play, with the parameters it had then."""
         if self.dataset is not None:
             return self.dataset.scenario
         return self.runs[0].manifest.scenario
 
     def of_scenes(self, ids: Collection[str]) -> "Runs":
-        """Return a copy with these scenes alone (by id) and their layouts' decision trees.
+        """Return a copy with some scenes alone, by id, and the decision trees of their episodes.
 
-        A layout is one start situation of a scenario.
+        A decision tree has every course that actions can lead to from one start situation.
         """
         runs = tuple(run.of_scenes(ids) for run in self.runs)
         layouts = {number for run in runs for number in run.grid.episodes}
@@ -61,7 +64,8 @@ class Runs:
     def conditions(self) -> tuple[str, ...]:
         """Return the names of all conditions of the runs, each once.
 
-        A condition is a named set of settings of channel, asking and fusion.
+        A condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         return tuple(dict.fromkeys(name for run in self.runs for name in run.conditions))
 

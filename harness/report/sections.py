@@ -20,7 +20,7 @@ SECTIONS: Plugins[Callable[[Run], Section | None]] = Plugins("swarmdrive.section
 
 
 def sections(runs: Runs) -> list[tuple[str, Markup]]:
-    """Return title and HTML of each page section that extensions write for these runs.
+    """Return title and HTML of each section that extensions add to a page about these runs.
 
     Every extension's function is called with each run. One that fails gets a section with its error
     message instead; the rest of the page is unaffected.

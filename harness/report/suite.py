@@ -37,31 +37,33 @@ MEAN = "mean over families"
 class Cell:
     """Hold the result of one family of scenes (one scenario's dataset) under one condition.
 
-    A condition is a named set of settings of channel, asking and fusion. `success` is balanced (the
-    mean of that with a danger and without) where dangers are known. `gain` is the success less that
-    of the condition without V2V, in which the ego hears nobody; `verdict` is `better` or `worse` if
-    that is significant. A danger is a vehicle that would meet an ego which keeps its speed.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages. `success` is balanced (the mean of that with a danger and without) where dangers are
+    known. `gain` is the success less that of the condition without V2V, in which the ego hears
+    nobody; `verdict` is `better` or `worse` if that is significant. A danger is a vehicle that
+    would meet an ego which keeps its speed.
     """
 
-    success: Score | None  # success rate, balanced where dangers are known
-    # success over that of the condition without a radio, paired; None where there is none
+    # share of episodes that succeed, balanced over episodes with a danger and without where known
+    success: Score | None
+    # that less the success of the same episodes without a radio; None where there is none
     gain: Score | None
-    # `better` or `worse` where the gain is not chance, its p at most 0.05 by Holm's method
+    # `better` or `worse` where the gain is not chance (p at most 0.05 by Holm's method); else empty
     verdict: str
 
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one row of the suite's table: the results of one family, or the mean over families.
+    """Hold one row of a suite's table: the results on one scenario, or the mean over scenarios.
 
     A suite is a run on each of several families, a family the scenes of one scenario; `name` is the
     family's and `run` its run, None for the mean. `drivers` has the success of reference drivers
     (rules without a model) by name, `cells` the result by condition.
     """
 
-    name: str  # the family's name
+    name: str  # name of the family: the scenes of one scenario
     run: Run | None  # its run; None for the mean
-    # success of each reference, which needs no model, in the same episodes
+    # success, in the same episodes, of each rule that needs no model, by its name
     drivers: Mapping[str, Score]
     cells: Mapping[str, Cell]  # by condition
 

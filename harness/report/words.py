@@ -47,10 +47,10 @@ def cell(score: Score | None) -> Markup:
 
 
 def headline(run: Run | SuiteRun) -> str:
-    """Return the result of a run or suite in one sentence: success at best and without V2V.
+    """Return the result of a run or suite in one sentence: success at best and without radio.
 
-    At best is under the condition (set of settings) with the most; without V2V the ego hears no
-    other vehicle. A suite is a run on each of several scenarios.
+    The best is of the condition (set of settings) with the most; without radio (V2V) the ego hears
+    no other vehicle. A suite is a run on each of several scenarios.
     """
     model = f"{run.manifest.variant.model}{run.manifest.variant.mix}"
     best, base = compared(run)
@@ -104,11 +104,11 @@ def judged(change: Estimate, p: float) -> str:
 
 
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
-    """Return the names of the best condition and of its baseline, by balanced or plain success.
+    """Return the names of the conditions that sum up a run: the best one and its baseline.
 
-    The baseline is the first condition without V2V, in which the ego hears nobody, else the worst;
-    an empty string where there is none. A condition is a named set of settings of channel, asking
-    and fusion.
+    Best is the most balanced or plain success. The baseline is the first condition without V2V, in
+    which the ego hears nobody, else the worst; an empty string where there is none. A condition is
+    a named set of settings of the radio, of asking helpers and of fusing their messages.
     """
     metric = headline_of(run)
     values = {}
@@ -151,10 +151,10 @@ def figures(run: Run) -> list[dict[str, str]]:
 
 
 def as_good_as(plain: Estimate, corrected: Estimate) -> str:
-    """Return a phrase on what covariate adjustment gains: as good as 1.3 times the layouts.
+    """Return a phrase on what a correction for difficulty gains: as good as 1.3 times the episodes.
 
-    `plain` is the mean as it is, `corrected` that adjusted for the difficulty of the layouts (start
-    situations of episodes).
+    `plain` is the mean as it is, `corrected` that by covariate adjustment for the difficulty of the
+    layouts (start situations of episodes), with a narrower interval.
     """
     return f"as good as {worth(plain, corrected):.1f} times as many layouts"
 
@@ -163,9 +163,10 @@ def adjusted(run: Run, condition: str, metric: str) -> tuple[Score, str] | None:
     """Return success adjusted for the layouts' difficulty, and a phrase on how much that gains.
 
     `metric` is the name of plain or balanced success, and `condition` that of a set of settings of
-    channel, asking and fusion. A layout is one drawn start situation, one for each episode; how
-    hard it is, is known before anybody is asked. None with fewer than `SHOWN_FROM` layouts, and for
-    a run whose intervals are valid at any stopping time, since this one is not.
+    the radio, of asking helpers and of fusing their messages. A layout is one drawn start
+    situation, one for each episode; how hard it is, is known before anybody is asked. None with
+    fewer than `SHOWN_FROM` layouts, and for a run whose intervals are valid at any stopping time,
+    since this one is not.
     """
     plain, better = run.score(condition, metric), run.score(condition, ADJUSTED[metric])
     if not plain or not better or plain.interval == ANY_TIME or plain.n < SHOWN_FROM:
@@ -177,8 +178,8 @@ def adjusted_lines(run: Run) -> Iterator[str]:
     """Yield a line on difficulty-adjusted success, and one on balanced success, by condition.
 
     It is adjusted for how hard the run's start situations are among all of its dataset. It yields
-    none where no condition has an adjusted score. A condition is a named set of settings of
-    channel, asking and fusion.
+    none where no condition has an adjusted score. A condition is a named set of settings of the
+    radio, of asking helpers and of fusing their messages.
     """
     for metric, words in IN_WORDS.items():
         cells = []
@@ -193,9 +194,10 @@ def adjusted_lines(run: Run) -> Iterator[str]:
 def p_values(run: Run | SuiteRun, base: str) -> dict[str, float]:
     """Return the p-value of each other condition's gain in success over the condition `base`.
 
-    For a suite, a run on each of several families (scenarios), the gain is the mean over these.
-    They are not corrected for multiplicity; 1 where the gain has no interval. A condition is a
-    named set of settings of channel, asking and fusion.
+    A gain is the difference in success over the same episodes. For a suite, a run on each of
+    several families (scenarios), it is the mean over these. P-values are not corrected for
+    multiplicity; 1 where the gain has no interval. A condition is a named set of settings of the
+    radio, of asking helpers and of fusing their messages.
     """
     played = plays(_runs(run), headline_of(run))
     p_values = {}

@@ -44,7 +44,8 @@ class DecisionFlip:
     seeds: tuple[int, ...]  # channel seeds with which they do
     a: str  # action that A takes
     b: str  # action that B takes
-    # the run whose action alone gave success away; None where neither, both or unknown
+    # the run, `A` or `B`, whose action alone made success impossible; None where neither, both or
+    # unknown
     lost_by: str | None
 
 
@@ -55,7 +56,8 @@ class Difference:
     `a` and `b` are its means in runs A and B, `change` is B - A with its 95 % interval. The
     p-values are of no difference: `p_value` as computed, `p_corrected` corrected for multiple
     testing, which only primary metrics (those that a comparison is judged by) are; None where there
-    is none. A condition is a named set of settings of channel, asking and fusion.
+    is none. A condition is a named set of settings of the radio, of asking helpers and of fusing
+    their messages.
     """
 
     metric: str  # the metric's name
@@ -71,7 +73,7 @@ class Difference:
 
     @property
     def primary(self) -> bool:
-        """Return whether a comparison is judged by the metric, corrected for multiple testing."""
+        """Return whether comparisons are judged by this metric, with a corrected p-value."""
         return entry(self.metric).primary
 
 
@@ -93,17 +95,18 @@ class Flip:
 class InCondition:
     """Hold what differs between runs A and B in one condition: metrics, episodes and decisions.
 
-    A condition is a named set of settings of channel, asking and fusion. `gained` are episodes that
-    fail in A and succeed in B, `lost` the reverse; `decisions` counts those in both runs, and
-    `flips` are those of them with another action.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages. `gained` are episodes that fail in A and succeed in B, `lost` the reverse; `decisions`
+    counts those in both runs, and `flips` are those of them with another action.
     """
 
     condition: str  # the condition's name
     differences: tuple[Difference, ...]  # one for each metric that both runs know
-    gained: tuple[Flip, ...]  # episodes from failure to success
-    lost: tuple[Flip, ...]  # episodes from success to failure
+    gained: tuple[Flip, ...]  # episodes that fail in A and succeed in B
+    lost: tuple[Flip, ...]  # episodes that succeed in A and fail in B
     decisions: int  # how many decisions both runs have
-    flips: tuple[DecisionFlip, ...]  # those with another action; what B's gave away first
+    # decisions in which both take another action; first those by which B alone gave success away
+    flips: tuple[DecisionFlip, ...]
 
 
 @dataclass(frozen=True)
@@ -118,7 +121,9 @@ class AnswersFlipped:
     role: str  # of who answered: `ego`, `helper` or `merge`
     a: str  # verdict in A: `strict`, `recovered` or `failed`
     b: str  # verdict in B
-    requests: tuple[str, ...]  # ids; first where B gave success away, then where A did
+    # ids of the requests whose answers these are; first those where B gave success away, then where
+    # A did
+    requests: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -153,7 +158,10 @@ class AnswersHeld:
 
     @property
     def verdicts(self) -> int:
-        """Return how many answers to the same question have another parse verdict."""
+        """Return how many answers to the same question are parsed with another outcome in B.
+
+        The outcome is `strict`, `recovered` (after repairs) or `failed`.
+        """
         return sum(len(set(answer.verdicts)) > 1 for answer in self.changed)
 
 
@@ -162,11 +170,11 @@ class Comparison:
     """Hold everything that differs between run A and run B, as `compare` finds it.
 
     `pair` are the runs, and `conditions` has what differs in each condition, a named set of
-    settings of channel, asking and fusion. `settings` has the name of each that differs, with A's
-    value and B's. `answers` has the answers that changed their parse verdict (how they could be
-    read), of the `answers_in_both` by role, and `held` those to the same question that changed at
-    all. `prompts` is what differs between the prompts: None for nothing, a sentence if it is not
-    known.
+    settings of the radio, of asking helpers and of fusing their messages. `settings` has the name
+    of each that differs, with A's value and B's. `answers` has the answers that changed their parse
+    verdict (how they could be read), of the `answers_in_both` by role, and `held` those to the same
+    question that changed at all. `prompts` is what differs between the prompts: None for nothing, a
+    sentence if it is not known.
     """
 
     pair: Pair  # the two runs
@@ -181,9 +189,10 @@ class Comparison:
 
 
 def compare(pair: Pair) -> Comparison:
-    """Return what differs from run A to B: settings, prompts, metrics, episodes and answers.
+    """Return all that differs from run A to run B: settings, prompts, metrics and episodes.
 
-    `pair` has both runs, on the same scenes.
+    Answers are compared, too. `pair` has both runs, on the same scenes. The result is what the
+    command `harness compare` shows.
     """
     conditions = [_in_condition(pair, name) for name in pair.conditions]
     answers = _answers_of_both(pair, conditions)

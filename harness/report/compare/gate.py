@@ -48,7 +48,8 @@ class Verdict:
     """Hold the result of a gate, a test that a comparison may fail.
 
     `gate` is its text, and `failed` has each condition in which it failed with the value that did
-    it; empty if it passed. A condition is a named set of settings of channel, asking and fusion.
+    it; empty if it passed. A condition is a named set of settings of the radio, of asking helpers
+    and of fusing their messages.
     """
 
     gate: str  # its text, as it was typed
@@ -103,7 +104,8 @@ def gate(
 def judge(gate: Gate, comparison: Comparison) -> Verdict:
     """Return in which conditions of a comparison a gate, a test of a difference, fails.
 
-    A condition is a named set of settings of channel, asking and fusion.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
 
     Raises:
         UserError: the gate's condition is not compared, or the difference is unknown there.

@@ -75,13 +75,14 @@ class Side:
     def ends(self) -> Mapping[tuple[str, int, int], Episode]:
         """Return the record of each episode, by its condition's name, channel seed and number.
 
-        A condition is a named set of settings of channel, asking and fusion.
+        A condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         return {(e.condition, e.seed, e.episode): e for e in self.run.episodes}
 
     @property
     def prompts(self) -> list[dict[str, Any]]:
-        """Return what the manifest records of the prompts of the ego and of the first helper.
+        """Return what the run's record states of the prompts of the ego and of the first helper.
 
         A record has the keys `version`, `sha256` and `released`; if the ego's model answers for
         helpers, its prompt comes twice.
@@ -94,8 +95,8 @@ class Pair:
     """Hold two runs that can be compared, and the conditions, seeds and episodes they share.
 
     `a` is the run that is compared with, `b` the one that is judged. `conditions` are names of sets
-    of settings of channel, asking and fusion, `seeds` channel seeds, and `episodes` episodes'
-    numbers, ascending.
+    of settings of the radio, of asking helpers and of fusing their messages, `seeds` channel seeds,
+    and `episodes` episodes' numbers, ascending.
     """
 
     a: Side  # the one that is the base
@@ -105,10 +106,11 @@ class Pair:
     episodes: tuple[int, ...]  # numbers of the episodes that both have, ascending
 
     def values(self, side: Side, metric: str, condition: str) -> Floats:
-        """Return a metric of a run in the E shared episodes and S shared seeds, (E, S).
+        """Return a metric of one run under one condition, by E episodes and S seeds, (E, S).
 
-        NaN where unknown. `side` is the run, A or B; `metric` and `condition` are names. A
-        condition is a named set of settings of channel, asking and fusion.
+        They are the episodes and seeds that both runs have; NaN where unknown. `side` is the run, A
+        or B; `metric` and `condition` are names. A condition is a named set of settings of the
+        radio, of asking helpers and of fusing their messages.
         """
         grid = side.run.grid
         seeds = [grid.seeds.index(seed) for seed in self.seeds]
@@ -118,10 +120,11 @@ class Pair:
 
     @cached_property
     def pool(self) -> Pool | None:
-        """Return all layouts that both runs' episodes were sampled from, with their difficulty.
+        """Return how hard the shared episodes are among all that they were sampled from.
 
-        A layout is one drawn start situation of a scenario, one for each episode. None if there are
-        no more of them than the shared episodes, or if the runs disagree on them.
+        It corrects a difference of success for harder or easier episodes. How hard one is, is known
+        from the success of rules that need no model. None if there are no more episodes than the
+        shared ones, or if the runs disagree on them.
         """
         a = {layout.episode: layout for layout in self.a.run.layouts}
         b = {layout.episode: layout for layout in self.b.run.layouts}
@@ -132,12 +135,12 @@ class Pair:
         return Pool.of(layouts, self.episodes) if len(layouts) > len(self.episodes) else None
 
     def judged(self, side: Side, condition: str) -> Judged:
-        """Return the shared decisions with exactly one optimal action, for calibration metrics.
+        """Return how sure and how right the shared decisions are, for metrics of calibration.
 
-        An action is optimal if success is still possible after it, where it is possible at all. The
-        decisions are those of the run `side` under one condition. `Judged.episode` holds each one's
-        index in `self.episodes`. A condition is a named set of settings of channel, asking and
-        fusion.
+        They are the decisions of the run `side` under one condition with exactly one optimal
+        action: one after which success is still possible, where it is possible at all.
+        `Judged.episode` holds each one's index in `self.episodes`. A condition is a named set of
+        settings of the radio, of asking helpers and of fusing their messages.
         """
         rows, place = self._rows(side, condition)
         policy = side.run.decisions.of_actions("fused")[rows]
@@ -145,10 +148,11 @@ class Pair:
         return Judged.of(policy, safe == 1.0, place)
 
     def latencies(self, side: Side, condition: str) -> list[Decided]:
-        """Return the latencies of the n shared decisions of each seed, as a pair of arrays (n,).
+        """Return how long the shared decisions of a run take, for each channel seed.
 
-        The arrays are a decision's index in `episodes` and its latency, ms. `side` is the run, and
-        `condition` the name of a set of settings of channel, asking and fusion.
+        An item is a pair of arrays (n,): each decision's episode, as an index in `episodes`, and
+        its latency, ms. `side` is the run, and `condition` the name of a set of settings of the
+        radio, of asking helpers and of fusing their messages.
         """
         rows, place = self._rows(side, condition)
         seed = side.run.decisions["seed"][rows]
@@ -170,7 +174,8 @@ class Pair:
 def pair(a: Path, b: Path) -> Pair:
     """Read two run folders, `a` and `b`, and pair the runs for a comparison.
 
-    A condition is a named set of settings of channel, asking and fusion.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
 
     Raises:
         UserError: a folder is no finished run or contradicts itself, or the two runs differ in

@@ -198,7 +198,10 @@ def junit_of_none(gates: Sequence[str], reason: str) -> str:
 
 
 def code(text: str) -> str:
-    """Return a text as an inline code span in Markdown, with a fence longer than its backticks."""
+    """Return a text as code in a line of Markdown, so that nothing in it is formatted.
+
+    The fence is longer than any row of backticks in the text.
+    """
     text = printable(text, WHOLE)
     longest = max((len(ticks) for ticks in re.findall("`+", text)), default=0)
     fence = "`" * (1 + longest)

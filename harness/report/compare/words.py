@@ -106,7 +106,7 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
     others, exploratory ones, it is the most significant, so that there are `SHOWN` in all: those
     with a preferred direction come first, percentiles of latency last. If one of them is over
     decisions with one optimal action alone, the number of these is added. A condition is a named
-    set of settings of channel, asking and fusion.
+    set of settings of the radio, of asking helpers and of fusing their messages.
     """
 
     def order(d: Difference) -> tuple[bool, float]:
@@ -128,9 +128,10 @@ def first(c: InCondition) -> tuple[list[Difference], list[Difference]]:
 
 
 def rest(c: InCondition) -> list[Difference]:
-    """Return a condition's differences in the metrics that are not shown first (by `first`).
+    """Return a condition's differences in the metrics that a page shows last.
 
-    A condition is a named set of settings of channel, asking and fusion.
+    They are those that `first` leaves out: exploratory ones that are less significant. A condition
+    is a named set of settings of the radio, of asking helpers and of fusing their messages.
     """
     primary, striking = first(c)
     return [d for d in c.differences if d not in (*primary, *striking)]
@@ -140,7 +141,8 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
     """Return for each condition a sentence on the change of success, and its verdict.
 
     Success is balanced if both runs have that. The verdict is `better`, `worse` or empty. A
-    condition is a named set of settings of channel, asking and fusion.
+    condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     outcomes = []
     for condition in comparison.conditions:
@@ -162,7 +164,7 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
 
 
 def who(side: Side) -> str:
-    """Return a run's model, prompt version and answer mode as text."""
+    """Return who answered in a run as text: its model, prompt version and answer mode."""
     variant = side.run.manifest.variant
     return f"{variant.model} · prompt {variant.prompt} · {variant.answer}{variant.mix}"
 
@@ -192,9 +194,10 @@ def paces(pair: Pair) -> list[str]:
 
 
 def caveats(pair: Pair) -> list[str]:
-    """Return the warnings about both runs; one of a single run begins with its letter, A or B.
+    """Return the warnings on two compared runs; one about a single run begins with `A` or `B`.
 
-    If a run might stop early, the differences of success by its rule are added.
+    If a run might stop early, the differences of success with intervals that allow for it are
+    added.
     """
     warnings = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
     return [*(finding.sentence for finding in warnings), *_by_stopping_rule(pair)]
@@ -217,7 +220,7 @@ def _by_stopping_rule(pair: Pair) -> Iterator[str]:
 
 
 def paired(pair: Pair) -> str:
-    """Return a phrase on the shared episodes and seeds, and on what only one of the runs has."""
+    """Return a phrase on how many episodes and seeds two runs share, and what only one has."""
     text = f"{crossed(len(pair.episodes), len(pair.seeds))} of {where(pair.a.run)}"
     for name, side in (("A", pair.a), ("B", pair.b)):
         conditions = [c for c in side.run.conditions if c not in pair.conditions]
@@ -230,7 +233,7 @@ def paired(pair: Pair) -> str:
 
 
 def differing(comparison: Comparison) -> str:
-    """Return a phrase with the kinds of settings in which the runs differ, such as `model`."""
+    """Return a phrase with the kinds of settings in which runs differ, such as `model, prompt`."""
     kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in comparison.settings))
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
@@ -239,7 +242,7 @@ def success(c: InCondition, pair: Pair) -> str:
     """Return a sentence on how many episodes × seeds changed to success, how many to failure.
 
     `c` is what differs in one condition, and `pair` has the runs. A condition is a named set of
-    settings of channel, asking and fusion.
+    settings of the radio, of asking helpers and of fusing their messages.
     """
     gained = sum(len(flip.seeds) for flip in c.gained)
     lost = sum(len(flip.seeds) for flip in c.lost)
@@ -252,7 +255,7 @@ def adjusted(c: InCondition) -> Iterator[str]:
 
     A layout is one drawn start situation, one for each episode. `c` is what differs in the
     condition. It yields nothing for fewer than `SHOWN_FROM` layouts. A condition is a named set of
-    settings of channel, asking and fusion.
+    settings of the radio, of asking helpers and of fusing their messages.
     """
     changes = {d.metric: d.change for d in c.differences}
     for metric, name in IN_WORDS.items():
@@ -293,7 +296,7 @@ def both_ways(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
     Lost are the episodes that succeed in A alone, gained those that succeed in B alone. Each text
     has up to `most` of them and how they failed; one without episodes is left out. A condition is a
-    named set of settings of channel, asking and fusion.
+    named set of settings of the radio, of asking helpers and of fusing their messages.
     """
     ways = (("lost", c.lost), ("gained", c.gained))
     return [(way, _flips(some, pair, most)) for way, some in ways if some]
@@ -312,7 +315,7 @@ def decisions(c: InCondition, pair: Pair) -> str:
     """Return a sentence on how many decisions differ, and how many made success impossible.
 
     `c` is what differs in one condition, and `pair` has the runs. A condition is a named set of
-    settings of channel, asking and fusion.
+    settings of the radio, of asking helpers and of fusing their messages.
     """
     count = dict.fromkeys(LOST_BY, 0)
     for flip in c.flips:
@@ -324,10 +327,11 @@ def decisions(c: InCondition, pair: Pair) -> str:
 
 
 def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
-    """Return the differing decisions that made success impossible in one run alone.
+    """Return texts on differing decisions by which one run alone made success impossible.
 
-    `c` is what differs in one condition. An item is a phrase that names the run and a text with up
-    to `most` decisions. A condition is a named set of settings of channel, asking and fusion.
+    `c` is what differs in one condition. An item is a phrase that names the run, and a text with up
+    to `most` decisions. A condition is a named set of settings of the radio, of asking helpers and
+    of fusing their messages.
     """
     rows = []
     for run in ("B", "A"):
@@ -339,7 +343,10 @@ def given_away(c: InCondition, pair: Pair, most: int) -> list[tuple[str, str]]:
 
 
 def decision_flip(flip: DecisionFlip, pair: Pair) -> str:
-    """Return a scene's id with both runs' actions, and the seeds if it is not all of them."""
+    """Return a scene's id with the actions that the two runs take there.
+
+    The seeds are added if it is not all of them.
+    """
     return f"{flip.scene} {flip.a} → {flip.b}{_seeds(flip.seeds, pair)}"
 
 
@@ -406,7 +413,7 @@ def answers_flipped(comparison: Comparison, most: int) -> list[tuple[str, str]]:
 
 
 def answers_held(held: AnswersHeld) -> str:
-    """Return a phrase on how many answers to the same questions changed."""
+    """Return a phrase on how many answers to the same questions differ between two runs."""
     if not (held.same or held.other):
         return "the runs have no question in common"
     if not held.same:

@@ -101,7 +101,7 @@ def named(
 
 
 def scale_m(view: View) -> int:
-    """Return the length of a picture's scale bar, m."""
+    """Return how long the scale bar of a picture of this view is, m: a round number."""
     return 20 if view.width_m > 100 else 10
 
 

@@ -54,8 +54,8 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 def conditions(names: Iterable[str]) -> dict[str, str]:
     """Return a colour, a hex code, for each condition by its name.
 
-    A condition is a named set of settings of channel, asking and fusion. Those of the paper keep
-    their own colour.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages. Those of the paper keep their own colour.
     """
     chosen: dict[str, str] = {}
     for name in dict.fromkeys(names):

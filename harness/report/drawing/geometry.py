@@ -24,9 +24,9 @@ NEAR_M = VIEW_M - MARGIN_M
 
 
 def north_up(points: Floats) -> Floats:
-    """Return points (..., 2), m east and south, as m east and north.
+    """Return points of the simulator, m east and south, as pictures have them, m east and north.
 
-    The frame of `harness.world.road`, in which they are given, has y to the south.
+    Both are (..., 2). In the simulator, as on a screen, y points to the south.
     """
     return points * [1.0, -1.0]
 
@@ -95,7 +95,7 @@ class View:
 
     @property
     def edges(self) -> Floats:
-        """Return the south-west and the north-east corner, (2, 2), m."""
+        """Return the south-west and the north-east corner of the view, (2, 2), m."""
         start = np.array([self.west_m, self.south_m])
         return np.array([start, start + np.array([self.width_m, self.height_m])])
 
@@ -105,9 +105,9 @@ class View:
         return self.width_m / (2 * VIEW_M)
 
     def holds(self, points: Floats, margin_m: float = 0.0) -> bool:
-        """Return whether all points (..., 2), m east and north, are in the view.
+        """Return whether all of some points are in the picture's view, `margin_m` from its edge.
 
-        They must be `margin_m` from its edge at least.
+        They are (..., 2), m east and north.
         """
         low, high = self.edges
         return bool(np.all((points >= low + margin_m) & (points <= high - margin_m)))

@@ -66,9 +66,9 @@ class Labels:
     """Collect the labels of one picture and place them together, so that they cover nothing.
 
     Attributes:
-        axes: the axes to draw on; data coordinates are metres.
+        axes: the Matplotlib axes to draw on; data coordinates are metres.
         pt_per_m: points on paper for a metre.
-        size_pt: font size.
+        size_pt: font size, points.
         view: the rectangle that labels stay within.
     """
 
@@ -80,20 +80,21 @@ class Labels:
         self._waiting: list[tuple[Floats, float, str, bool, str, Floats]] = []
 
     def block(self, points: Floats) -> None:
-        """Forbid labels in the bounding box of points (n, 2), m."""
+        """Forbid labels to cover the bounding box of some points, (n, 2), m."""
         self._taken.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def discourage(self, points: Floats) -> None:
-        """Keep labels off the bounding box of points (n, 2), m, if there is free space nearby.
+        """Have labels cover the bounding box of some points only if all else is full.
 
-        `block` keeps them off altogether.
+        The points are (n, 2), m.
         """
         self._unloved.append(np.array([points.min(axis=0), points.max(axis=0)]))
 
     def free(self, boxes: Sequence[Floats]) -> Floats:
-        """Return the box that covers the least so far, the first of equals, and keep others off it.
+        """Choose the place for a box, such as a legend, that covers the least of what is drawn.
 
-        `boxes` are the candidates, each two opposite corners (2, 2), m, and all of one size.
+        `boxes` are the candidates, each two opposite corners (2, 2), m, all of one size; the first
+        of equals is taken. Labels that are placed later keep off it.
         """
         half = (boxes[0][1] - boxes[0][0]) / 2
         taken = covered(np.array([box.mean(axis=0) for box in boxes]), half, self._taken)
@@ -109,10 +110,10 @@ class Labels:
         colour: str = INK,
         toward: Floats = NOWHERE,
     ) -> None:
-        """Add a label, `text`, for an object at `at` (2,) with radius `radius_m`, both m.
+        """Add a label, `text`, for an object of a radius around a place; `place` draws it later.
 
-        `place` draws it. `toward` (2,) is the preferred direction from the object to the label;
-        zero for none. `colour` and `bold` are of the text.
+        `at` is the place, (2,), and `radius_m` the radius, both m. `toward` (2,) is the preferred
+        direction from the object to the label; zero for none. `colour` and `bold` are of the text.
         """
         self._waiting.append((at, radius_m, text, bold, colour, toward))
 
