@@ -100,7 +100,7 @@ AXES = {
 
 
 def axis_of(name: str) -> Axis:
-    """Return the axis, what a sweep can vary, of this name.
+    """Return what a sweep can vary, an axis, by the name that a user types after `--over`.
 
     That is one of `AXES`, or else a setting of operating points or radio channels, in the setting's
     own unit. Raises UserError if there is none.
@@ -155,9 +155,10 @@ def grid(axis: Axis, text: str | None = None) -> tuple[Value, ...]:
 
 
 def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
-    """Return the default values of an axis, what a sweep varies, that an operating point allows.
+    """Return those of an axis's default values that an operating point allows.
 
-    Raises UserError if the axis has no default grid.
+    An axis is what a sweep varies, such as packet loss; an operating point is a set of settings,
+    some of which exclude values. Raises UserError if the axis has no default values.
     """
     return tuple(value for value in grid(axis) if not axis.worded or _allows(axis, point, value))
 
@@ -223,16 +224,18 @@ class Setting:
     condition: str  # name of the operating point that it is a change of
     point: OperatingPoint  # the operating point
     vehicles: int  # how many, the ego included
-    variable: str = ""  # what varies in the panel; empty where conditions are compared
-    # its value there; where axes are crossed, one of each
+    # name of the axis that varies in the panel, such as `loss`; empty where conditions are compared
+    variable: str = ""
+    # the axis's value at this point, in its unit; where axes are crossed, one of each; None where
+    # conditions are compared
     value: Value | tuple[Value, ...] | None = None
 
     @property
     def place(self) -> dict[str, Value | None]:
-        """Return what identifies the grid point in a table: `condition`, `variable` and `value`.
+        """Return what identifies a point of a sweep's grid in a table, values by column.
 
-        A grid point is an operating point with a number of vehicles. If several axes are crossed,
-        there is one more column for each of them.
+        The columns are `condition`, the name of the varied settings, `variable`, what varies, and
+        `value`. If several axes are crossed, there is one more column for each of them.
         """
         place = {"condition": self.condition, "variable": self.variable}
         if not isinstance(self.value, tuple):
@@ -243,10 +246,11 @@ class Setting:
 
 
 def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tuple[Value, ...]]:
-    """Return all combinations of the values of several axes, one tuple for each.
+    """Return all combinations of the values of several axes, one tuple of values for each.
 
-    An axis is what a sweep varies. `grids` has the values of each, in the order of `axes`, and so
-    has each tuple one. Raises UserError if there are more than `MOST_POINTS`.
+    An axis is what a sweep varies, such as packet loss. `grids` has the values of each, in the
+    order of `axes`, and so has each tuple one. Raises UserError if there are more than
+    `MOST_POINTS`.
     """
     values = list(product(*grids))
     if len(values) > MOST_POINTS:
@@ -258,10 +262,11 @@ def crossed(axes: Sequence[Axis], grids: Sequence[Sequence[Value]]) -> list[tupl
 
 
 def described(panels: Mapping[str, Sequence[Setting]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the grid points of all panels with every setting, as plain values for a manifest.
+    """Return all points of a sweep with every setting, as plain values for its manifest.
 
-    A panel is a named set of grid points, operating points with a number of vehicles. The result
-    has by the panel's name a dict for each.
+    `panels` has, by name, the points that are shown together, each an operating point (set of
+    settings) with a number of vehicles. The result has, by that name, a dict of settings for each
+    point.
     """
     rows: dict[str, list[dict[str, Any]]] = {}
     for name, settings in panels.items():

@@ -38,9 +38,11 @@ def rank(
 ) -> dict[str, dict[str, Estimate]]:
     """Drive a dataset's episodes with each reference driver, and compare with its frozen success.
 
-    A reference driver is a rule that decides without a model. It returns by driver the estimates of
-    `compared`: success in frozen scenes and in closed loop, their difference, and the share of
-    episodes that end alike. `progress` is called with the number of episodes just driven.
+    It checks whether both worlds agree. A reference driver is a rule that decides without a model.
+    Returned are by driver's name the estimates of `compared`, by theirs: success in frozen
+    (recorded) scenes and in closed loop (simulated), their difference, and the share of episodes
+    that end alike. `workers` are processes or a cluster, and `progress` is called with the number
+    of episodes just driven.
     """
     from harness.world.reference import drive_apart
 

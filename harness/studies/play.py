@@ -66,11 +66,12 @@ class WalkResult:
     """
 
     episodes: Ints  # their numbers, (E,)
-    # each of `ENDS`, and success by danger where that is known, (S, E); NaN where an episode was
-    # left out
+    # how each episode ended, by metric: 1 or 0 for each of `ENDS`, such as success, and for success
+    # with and without a danger where that is known, (S, E); NaN where an episode was left out
     ends: Mapping[str, Floats]
-    columns: Mapping[str, Floats]  # what was read of the decisions by name, (n, ...)
-    places: Ints  # the episode of each decision, counted row by row in (S, E), (n,)
+    # values of n decisions, by name of what was read of each, such as `latency_ms`, (n, ...)
+    columns: Mapping[str, Floats]
+    places: Ints  # index of each decision's episode in the flattened (S, E) array, row by row, (n,)
 
 
 @runtime_checkable
@@ -83,7 +84,7 @@ class Source(Protocol):
     """
 
     name: str  # what figures call it
-    episodes: int  # how many a seed plays
+    episodes: int  # how many episodes it plays with each channel seed
     same_episodes: bool  # whether every seed plays the same episodes
 
     def manifest(self) -> dict[str, Any]:
@@ -96,11 +97,11 @@ class Source(Protocol):
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int]
     ) -> Iterator[Iterable[WalkResult]]:
-        """Yield the results of each grid point of `settings`, in parts of some episodes.
+        """Yield the results at each point of a sweep's grid, in parts of some episodes each.
 
-        A grid point is an operating point with a number of vehicles, those nearest to the ego.
-        `seeds` are channel seeds, and all grid points have the same draws of the channel. A grid
-        point's parts must be consumed before the next grid point.
+        `settings` are these points: an operating point (set of settings) with a number of vehicles,
+        those nearest to the ego. `seeds` are those of the radio channel, and all points have the
+        same draws of it. A point's parts must be consumed before the next point.
         """
         ...
 
@@ -109,10 +110,10 @@ SOURCES = Shipped[Source]("swarmdrive.sources", Source, {})  # of none but exten
 
 
 def metric_columns(part: Decided[Any]) -> dict[str, Floats]:
-    """Return the columns of n decisions that a study's metrics need, by name, (n,) each.
+    """Return what a study's metrics need of n decisions, as columns by name, (n,) each.
 
-    The names are `COLUMNS`, such as `latency_ms` and `messages`; `part` is the decisions of some
-    episodes at one operating point.
+    The names are `COLUMNS`, such as `latency_ms` and `messages`. `part` is the decisions of some
+    episodes under one set of settings.
     """
     every = columns(part)
     return {name: every[name] for name in COLUMNS}
@@ -127,17 +128,16 @@ def walk_through(
     ties: str,
     read: Read = metric_columns,
 ) -> Iterator[tuple[dict[str, Floats], Ints]]:
-    """Yield for each operating point the columns of its n decisions, and each one's episode.
+    """Play a world under several sets of settings; yield for each what n decisions came to.
 
-    An operating point is everything a decision depends on besides scene and model. The columns are
-    (n, ...) by name. The episode is an index, (n,), into the (S, E) episodes of all channel seeds,
-    counted row by row.
+    An item is the columns of the n decisions by name, (n, ...), and the episode of each, (n,): an
+    index into the (S, E) episodes of all seeds, counted row by row.
 
     Args:
         world: where decisions come from and lead to, such as recorded scenes.
-        points: the operating points.
+        points: the operating points: all that a decision depends on besides scene and model.
         ask: returns what vehicles intend in scenes: their probabilities of actions.
-        seeds: channel seeds, S of them.
+        seeds: S seeds of the radio channel's random draws.
         episodes: numbers of the E episodes, ascending, (E,).
         ties: which of equally likely actions is taken, `drawn` or `first`.
         read: returns columns of n decisions, (n,), or (n, H) for H messages; they are rounded, and
@@ -195,11 +195,12 @@ def play(
     seeds: Sequence[int],
     progress: Callable[[int], None],
 ) -> PanelResult:
-    """Compute the results of a source at every grid point, with every channel seed.
+    """Score a source of answers at every point of a grid, with every channel seed.
 
-    A source is such as a run, and a grid point an operating point with a number of vehicles. The
-    same seed gives the same draws at all of them. `panel` is the name of this set of grid points in
-    tables; `progress` is called with 1 after each of them.
+    A source is such as a run, and each of `settings` a point: an operating point (set of settings)
+    with a number of vehicles. The same seed gives the same random draws of the radio channel at all
+    of them. `panel` is the name of this set of points in tables; `progress` is called with 1 after
+    each. Returns tables of means and of episodes.
     """
     import pandas as pd
 
@@ -261,10 +262,10 @@ def _part(walked: WalkResult, seeds: int) -> _Part:
 
 
 def by_episode(walked: WalkResult, names: Sequence[str]) -> dict[str, Floats]:
-    """Return metrics that are means over an episode's decisions, by name, each (S, E).
+    """Return a study's metrics of decisions, averaged over each episode, by name, (S, E) each.
 
-    `walked` has the decisions of S channel seeds and E episodes, and `names` are those of metrics.
-    A value is NaN where an episode was left out.
+    `walked` has the decisions of S seeds of the channel's draws and E episodes; `names` are those
+    of the metrics. A value is NaN where an episode was left out.
     """
     success = walked.ends["success_rate"]
 
@@ -291,12 +292,12 @@ def _estimates(
 
 
 def over_own_episodes(name: str, values: Floats) -> Estimate:
-    """Return the mean of a metric's values, (S, E), with Student's t interval over S seeds.
+    """Return a metric's mean with an interval over seeds that have different episodes.
 
-    `name` is the metric's. It is for seeds that have different episodes, E each. A stratified share
-    of E episodes is exact but for rounding to whole ones, so that seeds may agree to the last
-    episode and be wrong by the same. Half an episode, the largest standard deviation that rounding
-    can have, is the least that the means of a yes or no count as having.
+    `values` are (S, E), over S seeds and the E episodes of each; `name` is the metric's. The
+    interval is Student's t over the means of seeds. Episodes that are drawn in fixed shares make
+    these means too alike, down to the rounding of the shares; so the means of a yes or no count as
+    having a standard deviation of at least half an episode.
     """
     estimate = seed_interval(known_mean(values, axis=1))
     if name not in ENDS or estimate.n < 2:
@@ -309,9 +310,9 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
 
 
 def joined(parts: Sequence[PanelResult]) -> PanelResult:
-    """Return the tables of several panels or sources, concatenated.
+    """Put the tables of several sources and panels together, one after another.
 
-    A panel is a named set of operating points, and a source such as a run.
+    A source is such as a run, and a panel a named set of settings that a sweep scores.
     """
     import pandas as pd
 

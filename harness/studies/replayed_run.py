@@ -257,7 +257,7 @@ class ReplayedRun:
 
     @property
     def answers(self) -> Mapping[str, Answer]:
-        """Return the answers that are stored, by request id; nothing is asked."""
+        """Return the answers that the run has stored, by request id; nothing is asked."""
         return self._asker.answers
 
     def answered(self, requests: Sequence[Request]) -> Mapping[str, Answer]:
@@ -271,7 +271,7 @@ class ReplayedRun:
 
     @property
     def caveats(self) -> tuple[str, ...]:
-        """Return sentences on requests that got no answer here, and on episodes left out."""
+        """Return warnings on the results: requests without an answer, episodes left out."""
         counts, name, n = self._asker.tally.counts(), printable(self.name), len(self.left_out)
         lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
         left_out = (
@@ -281,7 +281,7 @@ class ReplayedRun:
         return tuple(filter(None, (lost, left_out if n else "")))
 
     def settle(self) -> None:
-        """Raise Unanswered if too many of the requests made here got no answer."""
+        """Raise Unanswered if results are invalid, as too many requests made here got no answer."""
         self._asker.settle()
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
@@ -460,10 +460,10 @@ def name_apart(runs: Sequence[ReplayedRun]) -> None:
 
 
 def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
-    """Return how success is averaged over the episodes of each run, the same way for all.
+    """Return for each run how its success is averaged over episodes, the same way for all.
 
-    It is balanced, the mean over layouts (start situations) with a danger (a vehicle that the ego
-    would meet) and without, if it can be so for all of them, else plain.
+    It is balanced, the mean over episodes with a danger (a vehicle that the ego would meet) and
+    without, if it can be so for all of them, else plain.
     """
     rules = alike([Success(run.dataset.dangerous) for run in runs])
     return dict(zip(runs, rules, strict=True))

@@ -71,7 +71,10 @@ def p_cell(p: float | None) -> str:
 
 
 def ends(e: Estimate) -> dict[str, Any]:
-    """Return an estimate as columns of a table's row: `value`, `ci_low`, `ci_high` and `n`."""
+    """Return an estimate as cells of a table's row: `value`, `ci_low`, `ci_high` and `n`.
+
+    The `ci_` ones are the ends of its confidence interval.
+    """
     return {"value": e.value, "ci_low": e.low, "ci_high": e.high, "n": e.n}
 
 
@@ -118,9 +121,9 @@ def write_study(study: Study, out: Path) -> Path:
 
 
 def undrawn(study: Study) -> UserError | None:
-    """Return the error that keeps a study's figures from being drawn; None if they can be.
+    """Return the error for a study whose figures cannot be drawn; None if they can be.
 
-    It is that Matplotlib, which draws them, is not installed.
+    Matplotlib, which draws them, is not installed then.
     """
     if study.figures is dict:
         return None
@@ -175,11 +178,12 @@ def refuse_taken(out: Path, kind: str) -> None:
 
 
 def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
-    """Raise UserError if a folder holds a run, another kind of study, or one with other settings.
+    """Raise UserError unless a study may go on in a folder: its own kind and settings, or none.
 
     `kind` is the kind of study that is to be written to `out`, and `manifest` what its
-    `<kind>.json` must state; of sources, only name and latency count. Keys that the study there
-    does not state, since its version of the program had none, are ignored.
+    `<kind>.json` must state; of the runs that it scores, only name and latency count. Keys that the
+    study there does not state, since its version of the program had none, are ignored. A run there
+    is refused, too.
     """
     refuse_taken(out, kind)
     try:
@@ -241,10 +245,11 @@ class Cells:
     def part(
         self, key: Sequence[Any], compute: Callable[[], Mapping[str, Any]]
     ) -> Mapping[str, Any]:
-        """Return the stored part with this key, or compute and store it.
+        """Return the stored result with this key, or compute and store it.
 
-        A part is what the study computes at once, by name; `key` are the settings that tell it from
-        the others. Its values are plain, or arrays with two axes, which are restored exactly.
+        A part is what a study computes at once, such as one point of its grid: a dict of values by
+        name, plain or arrays with two axes, which are restored exactly. `key` are the settings that
+        tell it from the others, and `compute` is called, without arguments, to make it.
         """
         there = self._cells.get(tuple(key))
         if there is not None:

@@ -57,9 +57,9 @@ def settings(
     grids: Sequence[Sequence[Value] | None],
     conditions: Sequence[str],
 ) -> tuple[Setting, ...]:
-    """Return the grid points of one axis, or of several crossed, for each condition.
+    """Return the points of a sweep's grid over one axis, or several crossed, for each condition.
 
-    `sources` are the runs and models that are swept. A condition is an operating point by its name;
+    `sources` are the runs and models that are swept. A condition is a set of settings by its name;
     `axes` are what varies, such as packet loss, and `grids` has the values of each. A grid of None
     stands for the axis's default values that the condition allows.
 
@@ -103,11 +103,12 @@ def settings(
 
 
 def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
-    """Return an operating point by name: the runs' own, one of the paper's, or a change of either.
+    """Return a set of settings by the name that a user types: of the runs, or of the paper.
 
-    An operating point is everything a decision depends on besides scene and model; a change is
-    typed such as `6g:max_helpers=1`. Raises UserError if there is none, it has no channel, or it
-    differs between the runs.
+    It may also be a change of one, typed such as `6g:max_helpers=1`. Such a set, an operating
+    point, is everything a decision depends on besides scene and model; the paper is the one that
+    this harness follows. Raises UserError if there is none, it has no channel, or it differs
+    between the runs.
     """
     points = {run.points[name] for run in runs if name in run.points}
     if len(points) > 1:
@@ -123,12 +124,12 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
 
 
 def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:
-    """Return the grid points of the paper's panels, by the panel's name.
+    """Return the points of the sweeps that the repeated paper shows, by the name of the sweep.
 
-    A panel is a set of grid points, operating points with a number of vehicles. The panels are the
-    runs' `conditions` (operating points, by name), and sweeps of the number of vehicles, of packet
-    loss and of the entropy threshold tau. In the sweep of vehicles, packet loss grows with their
-    density.
+    They are the runs' `conditions` (sets of settings, by name), and sweeps of the number of
+    vehicles, of packet loss and of tau, the entropy above which the ego asks. In the sweep of
+    vehicles, packet loss grows with their density. A point is such settings with a number of
+    vehicles.
     """
     vehicles = min(run.vehicles for run in runs)
     points = {name: point for run in runs for name, point in run.points.items()}
@@ -337,10 +338,10 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
 
 
 def in_a_sentence(table: Table) -> str:
-    """Return a phrase with the headline metric at both ends of an axis and where it is best.
+    """Return a phrase that sums up a sweep: success at both ends of what varies and at its best.
 
-    `table` is one of those that `tables` returns, and the axis what a sweep varies. For crossed
-    axes it is about the worst and the best combination of values.
+    `table` is one of those that `tables` returns. For crossed axes the phrase is about the worst
+    and the best combination of values.
     """
 
     def success(row: Sequence[str]) -> float:

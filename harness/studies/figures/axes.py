@@ -18,12 +18,12 @@ ROOM_IN = 0.5  # for names below a figure, in its height
 def paper_values(
     marks: "pd.DataFrame | None", panel: str, metric: str, **place: str
 ) -> "pd.DataFrame":
-    """Return the rows of the paper's values of a metric in a panel of its figures.
+    """Return the paper's values of a metric, to draw beside those of a run.
 
-    A panel is a set of operating points that are shown together. `marks` is the table of all of the
-    paper's values; None gives no rows. `place` selects rows by further columns, such as
-    `condition`. Columns are `value` (of what the panel varies), `low` and `high`, in the metric's
-    unit.
+    The paper is the one whose study this harness repeats. `marks` is the table of all of its
+    values; None gives no rows. `panel` names one of its sweeps, such as over packet loss; `place`
+    selects rows by further columns, such as `condition`. Columns are `value` (of what the panel
+    varies), `low` and `high`, in the metric's unit.
     """
     import pandas as pd
 
@@ -36,10 +36,11 @@ def paper_values(
 
 
 def cross(axes: Any, paper_rows: "pd.DataFrame", x: Any) -> None:
-    """Draw the paper's values at `x`: a cross for one value, an error bar for a range.
+    """Draw values of the paper that this harness repeats at `x`: a cross, or a bar for a range.
 
-    `axes` are Matplotlib's; `paper_rows` has the ends of each value in `low` and `high`. `x`, the
-    coordinate on the x axis, is one for all rows, or an array with one for each.
+    `axes` are Matplotlib's; `paper_rows` has the ends of each value in `low` and `high`, equal for
+    a single value. `x`, the coordinate on the x axis, is one for all rows, or an array with one for
+    each.
     """
     low, high = (paper_rows[end].to_numpy(dtype=float) for end in ("low", "high"))
     x, single = np.broadcast_to(x, low.shape), low == high
@@ -64,10 +65,10 @@ def lead_in(rows: "pd.DataFrame") -> str:
 
 
 def interval_of(rows: "pd.DataFrame") -> str:
-    """Return which kind of interval is drawn, by the name in a summary's column `interval`.
+    """Return which kind of interval a figure draws, by the name in a summary's column `interval`.
 
-    It is `episodes`, over episodes, if these rows of the summary have it, else `seed means`, over
-    channel seeds.
+    It is `episodes`, over episodes, if these `rows` of a study's summary have it, else
+    `seed means`, over seeds of the radio channel's random draws.
     """
     return "episodes" if (rows.interval == "episodes").any() else "seed means"
 

@@ -33,9 +33,9 @@ def operating_points(core: "pd.DataFrame", paper: "pd.DataFrame | None" = None) 
     """Draw bars of latency, success and messages of the operating points, with 95 % intervals.
 
     An operating point is everything a decision depends on besides scene and model. `core` has the
-    rows of a study's summary about them, one for each of them and each metric. `paper` has the
-    paper's values to draw beside them: `low` and `high` by `panel`, `condition`, `value` and
-    `metric`, equal for a single value; None to draw none.
+    rows of a study's summary about them, one for each of them and each metric. `paper` has values
+    of the paper that this harness repeats, to draw beside them: `low` and `high` by `panel` (the
+    paper's figure), `condition`, `value` and `metric`, equal for a single value; None to draw none.
     """
     figure = Figure(figsize=(7.2, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     latency, success, talk = drawn = figure.subplots(1, 3)
