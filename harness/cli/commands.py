@@ -70,10 +70,10 @@ OLD = {
 
 
 def commands() -> Mapping[str, str]:
-    """Return where the function of each command is, those of extensions included.
+    """Return the place of each command's function, those of extensions included.
 
-    The key is what is typed, such as `run ls`, and the value the function's place,
-    `module:function`.
+    The key is what is typed, such as `run ls`, and the value a text `module:function`, which is
+    imported once the command is typed.
     """
     return joined(COMMANDS, "commands")
 
@@ -84,17 +84,23 @@ def groups() -> Mapping[str, str]:
 
 
 def spellings() -> Mapping[str, str]:
-    """Return what is typed now for each renamed command, by its old spelling."""
+    """Return the present words of each renamed command, by its old spelling, which still works."""
     return joined(OLD, "spellings")
 
 
 def short() -> Mapping[str, str]:
-    """Return the command for each permanent short form, by that; only extensions have any."""
+    """Return the whole command that each permanent short form stands for, by the short form.
+
+    Only extensions have any.
+    """
     return joined({}, "short")
 
 
 def panels() -> Mapping[str, tuple[str, ...]]:
-    """Return the headings of the first help screen, with the commands or groups below each."""
+    """Return the headings of the first help screen, with the commands or groups below each.
+
+    A heading is a key; its value has the names in order.
+    """
     words = {panel: list(names) for panel, names in PANELS.items()}
     for extension in extensions().values():
         for word, panel in extension.panels.items():

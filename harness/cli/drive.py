@@ -155,7 +155,7 @@ def command(
 
 
 def deciding(scenario: str, agents: str) -> str:
-    """Return the name of a scenario with a setting of which vehicles decide for themselves.
+    """Return a scenario's name with a setting of which of its vehicles decide for themselves.
 
     `scenario` is its name without, and `agents` is `ego`, `all` or a share of the other vehicles,
     such as 0.5. Raises UserError for any other text, or a scenario in which only the ego has a
@@ -185,9 +185,9 @@ def deciding(scenario: str, agents: str) -> str:
 
 
 def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
-    """Print a closed-loop run's results as a table, or as JSON, or not if `quiet`.
+    """Print a driven run's results as a table, or as JSON if `as_json`; nothing if `quiet`.
 
-    `done` is the run, as it was just evaluated.
+    `done` is the run, as it was just evaluated in the simulator.
     """
     from harness.runs.folder import read
 

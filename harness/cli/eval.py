@@ -153,8 +153,8 @@ def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: st
 def show_counted(spec: "Spec", counted: dict[str, Any], times: int = 1) -> None:
     """Print what an evaluation would take, as a dry run counted it: requests, tokens and cost.
 
-    `spec` is the evaluation, and `counted` what `evaluate.dry_run.count` returned for it. The cost
-    is that of so many `times`, since repeats ask as often.
+    `spec` is the evaluation, and `counted` the dict that `evaluate.dry_run.count` made of it. The
+    cost is that of `times` such evaluations, since repeats ask as often.
     """
     repeated = f" × {times} repeats" if times > 1 else ""
     by_role, requests = counted["requests_by_role"], f"{counted['requests']} requests"

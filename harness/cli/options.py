@@ -191,10 +191,11 @@ def takes(
     help: Mapping[str, str] = {},
     without: Collection[str] = (),
 ) -> Callable[[Any], Any]:
-    """Return a decorator that gives a command the options of an evaluation.
+    """Return a decorator that gives a command all options of an evaluation.
 
-    The command's first parameter then gets a `Settings`. A first argument on the command line names
-    a file of settings, or a run's folder; options typed beside it win.
+    So `harness eval` and its like need not repeat them. The command's first parameter then gets a
+    `Settings`. A first argument on the command line names a file of settings, or a run's folder;
+    options typed beside it win.
 
     Args:
         world: what is evaluated, frozen (recorded) scenes or a closed loop.
@@ -293,9 +294,10 @@ def cards(models: "Sequence[str] | None") -> "list[Card]":
 
 
 def say_all(limit: int | None, datasets: "Iterable[Frozen]") -> None:
-    """Print a line on stderr for each dataset that has fewer episodes than --limit.
+    """Print a line on stderr for each dataset that has fewer episodes than `--limit` asks for.
 
-    `limit` is the number that was typed; None for no limit prints nothing.
+    `limit` is the number that was typed, None for no limit, which prints nothing; each of
+    `datasets` is the recorded scenes of an evaluation.
     """
     for dataset in datasets:
         if limit is not None and limit > (n := dataset.manifest.episodes):
@@ -419,10 +421,10 @@ def shard_of(text: str | None) -> "shards.Shard | None":
 
 
 def say_shard(shard: "shards.Shard", out: Path, what: str) -> None:
-    """Print that a shard is done, and the command that merges all of them.
+    """Print that one part of a run or dataset is done, and the command that merges all parts.
 
-    A shard is one of several parts of a run or dataset that are made apart; `out` is its folder,
-    and `what` says in words what it has.
+    Such a part is a shard, made apart from the others. `shard` says which of how many, `out` is its
+    folder, and `what` says in words what it has.
     """
     echo(
         f"wrote {printable(out)}: {what}, shard {shard}; merge all {shard.of} shards with "

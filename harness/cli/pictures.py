@@ -25,7 +25,7 @@ COLUMNS = 64  # of a picture in a terminal
 
 @dataclass(frozen=True)
 class PictureModel:
-    """Hold a model with vision that pictures of a prompt are drawn for, and its picture size.
+    """Describe the model with vision that a prompt's pictures are drawn for, and their size.
 
     `card` is its model card, the file that describes it, and `vision` how it takes pictures.
     `processor_tokens` is the number of tokens of a picture by its own image processor; None if not
@@ -39,7 +39,7 @@ class PictureModel:
 
     @property
     def picture(self) -> str:
-        """Return a line on the size of the model's pictures, in pixels and tokens."""
+        """Return a line for people on how large the model's pictures are, in pixels and tokens."""
         name, (width, height) = printable(self.card.name), self.vision.size_px
         return (
             f"{width} x {height} pixels, front above rear; {self.vision.tokens} tokens with {name}"

@@ -45,12 +45,12 @@ class Bar(Progress):
         self.changed()
 
     def more(self, count: int) -> None:
-        """Add a number of items to the total."""
+        """Add a number of items, which are still to do, to the bar's total."""
         self.total += count
         self.changed()
 
     def say(self, text: str) -> None:
-        """Print a line above the bar."""
+        """Print a line of text above the progress bar."""
         self.write(text)
 
 
@@ -108,10 +108,11 @@ def _lines(progress: Bar) -> Iterator[None]:
 
 
 def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> str:
-    """Return a line such as `asking proxy 812/1206 58.0/s 0:00:07 left`.
+    """Return a progress bar as a line of text: `asking proxy 812/1206 58.0/s 0:00:07 left`.
 
-    `marks` are pairs of a time in s and the number done by then, from which the speed is taken;
-    `took_s` is the time since the start.
+    It is for output that is no terminal. `progress` has what is counted. `marks` are pairs of a
+    time in s and the number done by then, from which the speed is taken; `took_s` is the time since
+    the start, s.
     """
     (since_s, before), (now_s, done) = marks[0], marks[-1]
     speed = (done - before) / (now_s - since_s)

@@ -39,12 +39,12 @@ class Column:
     95 % interval, else with its unit.
     """
 
-    head: str
-    metric: str
-    interval: bool = False
+    head: str  # title of the column
+    metric: str  # name of the metric, such as `success_rate`
+    interval: bool = False  # whether a score is shown with its 95 % interval, else with its unit
 
     def cell(self, score: "Score | None") -> str:
-        """Return a score of the column's metric as text; a dash for None."""
+        """Return a cell of the column as text, given a score of its metric; a dash for None."""
         if score is None or score.value is None:
             return "-"
         from harness.runs.estimates import written
@@ -132,7 +132,10 @@ def evaluate(
 
 
 def walked(dataset: "Dataset", run: "Evaluated") -> "Dataset":
-    """Return the part of a dataset, the first episodes, that a run evaluated: it may stop early."""
+    """Return the episodes of a dataset that a run evaluated, the first ones, as a dataset.
+
+    A run may stop early, once it has seen enough; then they are fewer than were asked for.
+    """
     numbers = dataset.episodes[: run.manifest.world.episodes]
     if len(numbers) == len(dataset.episodes):
         return dataset
@@ -184,19 +187,23 @@ def first_folder(name: str, usable: Callable[[Path], bool]) -> Path:
 
 @dataclass(frozen=True)
 class RunGroup:
-    """Describe several runs that are made in one folder, such as a suite's.
+    """Describe several runs that a command makes in one folder, such as one on each dataset.
 
-    `specs` has their evaluations by folder name, and `marker` is the file that marks the folder as
-    done. `what` names it in messages, and `others` are files of it that may be there before.
+    `specs` has their evaluations by folder name. `marker` is the file that is written once all are
+    done, `what` names the finished folder in messages, and `others` are files that may be there
+    before.
     """
 
     specs: "Mapping[str, Spec]"  # by the name of the run's own folder in it
-    what: str  # they are when all is done: `a finished suite`
-    marker: str  # the file that is written then
-    others: Sequence[str]  # files that are written before it
+    what: str  # words for the folder when all is done, such as `a finished suite`
+    marker: str  # name of the file that marks the folder as finished
+    others: Sequence[str]  # names of files that are written to the folder before that one
 
     def check(self, out: Path) -> None:
-        """Raise UserError unless the folder is new or empty, or these runs were stopped in it."""
+        """Raise UserError unless a group's runs can be made in a folder.
+
+        It must be new or empty, or these runs were stopped in it.
+        """
         from harness.evaluate.lifecycle import finished, unfinished
 
         if (out / self.marker).is_file():
@@ -217,7 +224,7 @@ class RunGroup:
             (finished if (out / name / "run.json").is_file() else unfinished)(spec, out / name)
 
     def goes_on(self, out: Path) -> bool:
-        """Return whether these runs were stopped in a folder, and no process works on them."""
+        """Return whether these runs were stopped in a folder, and no process works there now."""
         try:
             self.check(out)
         except UserError:
@@ -258,12 +265,13 @@ def show(
 ) -> None:
     """Print a run's table, a row for each condition, with its caveats and notes.
 
-    A condition is an operating point by its name.
+    A condition is a set of settings, by its name, that the run scores; caveats are what a reader
+    must know first.
 
     Args:
         done: the run as it was just evaluated.
         scenes: a phrase on its scenes.
-        columns: the table's; a run with balanced success has a table of that first.
+        columns: the table's columns; a run with balanced success has a table of that first.
         notes: sentences to print below.
         beside: rows of references without a model: scores by name and metric; None for none.
     """
@@ -310,11 +318,10 @@ def _scores_table(
 
 
 def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:
-    """Print success by the number of helpers that see the danger, if the layouts declare it.
+    """Print success by how many helpers see the danger at first, if the scenario declares it.
 
-    The danger is the vehicle that a cruising ego would meet, and a layout one drawn start
-    situation. `figures` holds scores by condition and metric, `conditions` the names of the
-    operating points to print.
+    The danger is the vehicle that would meet an ego which keeps its speed. `figures` holds scores
+    by condition and metric, `conditions` the names of the conditions (sets of settings) to print.
     """
     metrics = {}
     for name, metric in BY_WITNESSES.items():

@@ -120,9 +120,10 @@ DRIVES = Shipped[Drives]("swarmdrive.drives", Drives, {EGO: Drives(_check, _show
 
 
 def drives_of(scenario: "Scenario") -> Drives:
-    """Return how reference drivers, rules that decide without a model, drive a scenario.
+    """Return how reference drivers are driven through a scenario, and what is printed of it.
 
-    Raises UserError if several agents decide in it, and no extension says so for these.
+    A reference driver is a rule that decides without a model. Raises UserError if several agents
+    (vehicles) decide in the scenario, and no extension says how to drive these.
     """
     from harness.world.seats import agent_share
 
@@ -135,11 +136,12 @@ def drives_of(scenario: "Scenario") -> Drives:
 
 
 def ready_to_drive(name: str, episodes: int, seed: int, counted: str = "--episodes") -> "Scenario":
-    """Return the scenario of this name, if so many layouts from this seed can be driven together.
+    """Return the scenario of this name, once it is sure that its episodes can be driven.
 
-    A layout is a drawn start situation: `episodes` of them have the seeds from `seed` on. Raises
-    UserError if there is no such scenario, or the layouts are too many or serve different purposes.
-    `counted` is the option for their number, for the message.
+    Each episode has its own start situation, drawn by a layout seed: `seed`, `seed` + 1 and so on,
+    `episodes` of them. Raises UserError if there is no such scenario, or the seeds are too many or
+    serve different purposes, such as tuning and reporting. `counted` is the option for their
+    number, for the message.
     """
     from harness.core.seeds import LAST_EPISODE, LAST_SEED
     from harness.world import scenarios

@@ -238,9 +238,10 @@ class Group(TyperGroup):
 
 
 def respelt(args: list[str]) -> tuple[str, str]:
-    """Return the old or short spelling that arguments begin with, and the command it stands for.
+    """Return the old or short spelling of a command at the beginning of some words, and its own.
 
-    `args` are the words that were typed. Both are empty if there is none.
+    `args` are the words that were typed, the first result the spelling there, and the second the
+    command that it stands for. Both are empty if there is none.
     """
     spelt = [" ".join(args[:n]) for n in (2, 1)]
     for typed in spelt:
@@ -286,7 +287,7 @@ def _value(parameter: Any, by_typer: Callable[[Any, Any], Any], context: Any, va
 
 
 def plain(annotation: Any, value: Any) -> Any:
-    """Return a typed value converted to its annotation, the same as typer converts it.
+    """Return a typed value converted to its type without pydantic, as typer would convert it.
 
     `annotation` is that of the command's parameter. The result is `UNREAD` if typer itself must
     convert or refuse the value.

@@ -27,7 +27,10 @@ _FIELD = re.compile(r"((?:^    # .*\n)*)^    (\w+): [^#\n]+?(?:  # (.*))?$", re.
 
 
 def echo_wrong(name: str, error: UserError) -> None:
-    """Print the name of an entry in a list that cannot be used, such as a card, and the error."""
+    """Print that an entry of a list cannot be used: its name and the error.
+
+    Such is a file of the user's that describes a model and has a mistake.
+    """
     typer.echo(f"{printable(name)} · wrong\n  {error}")
 
 
