@@ -31,9 +31,10 @@ def summed(values: Floats, axis: int) -> Floats:
 
 
 def any_of(flags: Bools) -> Bools:
-    """Return whether any flag is true along the last axis, (..., n) to (...).
+    """Return whether any flag is true along the last axis, which is dropped.
 
-    Faster than `np.any` if n is small, such as the number of helpers.
+    It is `np.any` of `flags`, (..., n), with a result (...); faster if n is small, such as the
+    number of helpers.
     """
     first = np.zeros(flags.shape[:-1], dtype=bool)
     result: Bools = reduce(np.logical_or, [flags[..., k] for k in range(flags.shape[-1])], first)
@@ -41,9 +42,10 @@ def any_of(flags: Bools) -> Bools:
 
 
 def count_of(flags: Bools) -> Ints:
-    """Return how many flags are true along the last axis, (..., n) to (...).
+    """Return how many flags are true along the last axis, which is dropped.
 
-    Faster than `np.sum` if n is small, such as the number of helpers.
+    It is `np.sum` of `flags`, (..., n), with a result (...); faster if n is small, such as the
+    number of helpers.
     """
     none = np.zeros(flags.shape[:-1], dtype=np.int64)
     count: Ints = reduce(np.add, [flags[..., k] for k in range(flags.shape[-1])], none)
@@ -51,11 +53,11 @@ def count_of(flags: Bools) -> Ints:
 
 
 def read_only(value: T) -> T:
-    """Return arrays as views that cannot be written to.
+    """Return arrays as views that cannot be written to, to give to code of another package.
 
-    `value` is an array, or a frozen dataclass or a mapping whose values are arrays; the result is
-    of the same type. Give it to code of another package: code that writes to its arguments then
-    raises ValueError, and changes nothing.
+    Such code then raises ValueError where it writes to its arguments, and changes nothing. `value`
+    is an array, or a frozen dataclass or a mapping whose values are arrays; the result is of the
+    same type.
     """
     given: Any = value
     if isinstance(given, np.ndarray):
@@ -71,9 +73,10 @@ def read_only(value: T) -> T:
 
 
 def check_shape(name: str, values: Any, *allowed: tuple[int, ...]) -> None:
-    """Raise ValueError unless `values` is a NumPy array of one of the `allowed` shapes, unmasked.
+    """Raise ValueError unless what another package gave is an array of an allowed shape.
 
-    `name` names the values in the message.
+    It must be a NumPy array, unmasked, of one of the `allowed` shapes. `name` names the values in
+    the message.
     """
     if not isinstance(values, np.ndarray) or isinstance(values, np.ma.MaskedArray):
         raise ValueError(f"{name} of type {type(values).__name__}, not an array of numpy's")
@@ -107,7 +110,7 @@ def check_distributions(name: str, values: Floats, where: Bools) -> None:
 
 
 def check_shares(name: str, values: Floats, where: Bools) -> None:
-    """Raise ValueError unless all values where `where` is true are from 0 to 1, or NaN.
+    """Raise ValueError unless values are shares: from 0 to 1, or NaN, where `where` is true.
 
     Both arrays have the same shape, of any axes; `name` names the values in the message.
     """

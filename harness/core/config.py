@@ -55,7 +55,7 @@ Seconds = Annotated[
 
 
 def between(least: float, most: float) -> msgspec.Meta:
-    """Return the bounds `least` to `most`, both allowed, with which to annotate a field.
+    """Return an annotation for a number from a file: it must be from `least` to `most`.
 
     It is used as `Annotated[float, between(0, 1)]` in a dataclass that `convert` fills from a file;
     its description is what messages say is allowed.
@@ -151,7 +151,7 @@ def convert(table: Mapping[str, Any], kind: type[Record], where: str, **given: A
 
 
 def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
-    """Return a copy of a frozen dataclass with the fields in `settings` set from text.
+    """Return a copy of a frozen dataclass with some fields set from text that a user typed.
 
     `settings` has the text of each new value by the field's name; `where` names the record in
     messages. Raises UserError for an unknown field or a value that is not allowed.
@@ -173,7 +173,7 @@ def changed(record: Record, settings: Mapping[str, str], where: str) -> Record:
 def check(record: Any) -> None:
     """Raise UserError unless a dataclass's numbers and choices are what its annotations allow.
 
-    NaN is not allowed.
+    It is called when `record` was made in Python and not from a file. NaN is not allowed.
     """
     for name, hint in _fields(record.__class__).items():
         value = getattr(record, name)
@@ -188,18 +188,20 @@ def check(record: Any) -> None:
 
 
 def settable(record: Any) -> list[str]:
-    """Return the names of a dataclass's fields that `changed` can set from text.
+    """Return the names of a dataclass's fields that a user can set by a text.
 
-    These are the fields that hold a single number, boolean or text.
+    These are the fields of `record` that hold a single number, boolean or text; `changed` sets
+    them.
     """
     values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     return [name for name, value in values.items() if isinstance(value, str | bool | int | float)]
 
 
 def value_of(usual: object, text: str) -> object:
-    """Convert a text to the type of `usual`, the value that it replaces: bool, int, float or str.
+    """Convert a typed text to the type of the value that it replaces: bool, int, float or str.
 
-    A text that cannot be converted is returned unchanged, for a later type check to refuse.
+    `usual` is that value. A text that cannot be converted is returned unchanged, for a later type
+    check to refuse.
     """
     if isinstance(usual, bool):
         return {"true": True, "false": False}.get(text, text)
@@ -372,9 +374,10 @@ def _choices(hint: Any) -> list[str]:
 
 
 def description(hint: Any) -> str | None:
-    """Return the `description` of the first `msgspec.Meta` in a type annotation; None if none.
+    """Return what a type annotation allows, in words for messages, such as `seconds, 0 or more`.
 
-    It says what is allowed in words for messages, such as `seconds, 0 or more`.
+    It is the `description` of the first `msgspec.Meta` in the annotation `hint`; None if there is
+    none.
     """
     texts = (
         meta.description

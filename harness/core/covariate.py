@@ -35,10 +35,11 @@ def corrected(
 ) -> Estimate | None:
     """Return the mean of values (E,), corrected by control variates; None if it cannot be.
 
-    A layout is one drawn start situation of a scenario, from which one episode starts. A control
-    variate is a variable that correlates with the values and is known of more layouts than they
-    are. None is returned with fewer than `LEAST` values, without further layouts, or if the values
-    or all variables are constant.
+    The correction makes its interval narrower. A control variate is a variable that correlates with
+    the values and is known of more cases than they are. Here the cases are layouts, drawn start
+    situations of a scenario with one episode each, and the values are success in some of them. None
+    is returned with fewer than `LEAST` values, without further layouts, or if the values or all
+    variables are constant.
 
     Args:
         plain: the uncorrected mean of `values` with its interval.
@@ -71,11 +72,11 @@ def corrected(
 
 
 def worth(plain: Estimate, better: Estimate) -> float:
-    """Return how many times as many layouts the mean `plain` needs to be as precise as `better`.
+    """Return how many times as many episodes `plain` needs to be as precise as `better`.
 
-    Both are estimates of the same mean, over layouts (drawn start situations of episodes). The
-    result is the square of how many times as wide the interval of `plain` is: of its lower or its
-    upper half, whichever gives less; 1 if neither is known.
+    Both are estimates of the same mean over episodes; `better` is the one with control variates.
+    The result is the square of how many times as wide the interval of `plain` is: of its lower or
+    its upper half, whichever gives less; 1 if neither is known.
     """
     below = plain.value - plain.low, better.value - better.low
     above = plain.high - plain.value, better.high - better.value

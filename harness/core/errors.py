@@ -37,13 +37,16 @@ class UserError(Exception):
 
 
 class Unfinished(UserError):
-    """Report that some parts of the work could not be done, while all other parts are done."""
+    """Report that some parts of a command's work could not be done, while all others are done.
+
+    The same command does the rest later.
+    """
 
 
 class Unanswered(Unfinished):
-    """Report that the model could not be asked.
+    """Report that the model could not be asked, so that the work is to be continued later.
 
-    The message begins with that of its server or engine.
+    The message begins with that of its server or engine, which is the program that runs it.
     """
 
     code = 3
@@ -69,7 +72,7 @@ def _text_of(thing: object) -> str:
 
 
 def sayable(what: str, name: str, repair: str = "rename it") -> str:
-    """Return `name` unchanged, if terminals and tables can show it as it is.
+    """Return `name` unchanged, unless terminals and tables cannot show it as it is.
 
     Raises UserError if it has control characters, invalid UTF-8 or the separator ` · `. In the
     message `what` says what has this name, such as `file of channels`, and `repair` what to do.
@@ -121,7 +124,10 @@ def unknown(kind: str, name: str, known_names: Iterable[str], hint: str = "") ->
 
 
 def in_range(option: str, value: float, least: float, most: float) -> None:
-    """Raise UserError unless `least` <= `value` <= `most`; `option` names it in the message."""
+    """Raise UserError unless a number that a user typed is from `least` to `most`.
+
+    `option` names it in the message, and `value` is the number.
+    """
     if not least <= value <= most:
         given = f"{value:g}" if isinstance(value, float) else printable(value, 40)
         raise UserError(f"{option} {given} is out of range; give {least} to {most}")

@@ -89,13 +89,13 @@ class Setting:
     def table(self) -> str:
         """Return the name of the table that has this setting in a run's TOML file, such as `world`.
 
-        It is empty for a setting that follows no other one (`behind`).
+        It is empty for a setting that follows no setting of the core there (`behind` is empty).
         """
         beside = self.place or next(iter(self.behind), "")
         return beside.rpartition(".")[0]
 
     def path(self, name: str) -> str:
-        """Return where a run's TOML file has this setting, as table and key, such as `world.limit`.
+        """Return where a run's TOML file has this setting: table and key, such as `world.limit`.
 
         `name` is the setting's name, which is the key unless `place` states another.
         """
@@ -154,8 +154,9 @@ def extensions() -> Mapping[str, Extension]:
 def owner(command: str) -> str | None:
     """Return the name of the extension that a command or group of commands belongs to, or None.
 
-    `command` is what is typed after `harness`. The answer is read from package metadata, so it is
-    known even if the extension's folder is missing.
+    It is for messages on a command that is not installed. `command` is what is typed after
+    `harness`. The answer is read from package metadata, so it is known even if the extension's
+    folder is missing.
     """
     for name, entry in entries(COMMANDS).items():
         if f"{name} ".startswith(f"{command} "):
@@ -176,10 +177,10 @@ def from_python(name: str) -> Any:
 
 
 class OfExtension(NamedTuple):
-    """Name the extension that a setting belongs to, as package metadata states it.
+    """Name the extension that a setting belongs to, even if it is not installed here.
 
-    So it is known even if the extension is not installed. `idle` is the setting's value that does
-    nothing, as text, such as `0`; empty if there is none.
+    Package metadata states it. `idle` is the setting's value that does nothing, as text, such as
+    `0`; empty if there is none.
     """
 
     extension: str  # the extension's name
@@ -189,19 +190,19 @@ class OfExtension(NamedTuple):
 def setting_of_extension(name: str) -> OfExtension | None:
     """Return the extension that adds a setting of conditions, or None if none does.
 
-    A condition is a named set of settings (of radio channel, asking and fusion) that a run is
-    scored under; `name` is the setting's name. It is looked up in package metadata, so the
-    extension need not be installed.
+    A condition is a named set of settings that a run is scored under: of the radio, of asking
+    helpers and of fusing their messages. `name` is the setting's name. It is looked up in package
+    metadata, so the extension need not be installed.
     """
     entry = entries(SETTINGS).get(name)
     return _of_entry(entry) if entry else None
 
 
 def beside() -> dict[str, Setting]:
-    """Return the settings, by name, that shipped extensions add among the core's own settings.
+    """Return the settings that shipped extensions list among the core's own, by name.
 
-    They are listed between those of the core in files and help (`Setting.behind`). The settings of
-    other packages stand in a table of their own, and are not returned.
+    In files and help they stand between those of the core (`Setting.behind`). The settings of other
+    packages stand in a table of their own, and are not returned.
     """
     declared = entries(GROUP)
     settings: dict[str, Setting] = {}
@@ -278,9 +279,9 @@ def control_settings() -> dict[str, str]:
 
 
 def part_of(extension: str) -> str:
-    """Return words for a message: that something is part of this extension, not installed here.
+    """Return words for a message on what an extension has that is not installed here.
 
-    `extension` is the extension's name.
+    They say that it is part of `extension`, which is the extension's name.
     """
     return f"part of the extension {printable(extension)}, which is not installed"
 
@@ -300,7 +301,7 @@ def joined(core: Texts, kind: str) -> Mapping[str, Any]:
     """Return one of the core's tables, such as its commands, extended by what extensions add.
 
     `core` is that table, texts by name, and `kind` the field of `Extension` that has the additions,
-    such as `commands`. A name that the table has already is not replaced; a line on stderr says so,
+    such as `commands`. A name that the table has already keeps its value; a line on stderr says so,
     once.
     """
     return _joined(tuple(core.items()), kind, tuple(sys.path))
@@ -318,7 +319,7 @@ def taken(path: str, table: Iterable[str]) -> bool:
 
 
 def studies() -> Texts:
-    """Return every kind of study, such as `sweep`, with the name that lists give it.
+    """Return the name that lists give to each kind of study, by the kind, such as `sweep`.
 
     A study is an evaluation made of several runs, or of one run under several settings. Kinds that
     extensions add are there even where the extension is missing.
@@ -328,9 +329,10 @@ def studies() -> Texts:
 
 
 def added(group: str) -> Mapping[str, Any]:
-    """Return the plug-ins that extensions add to a group such as `swarmdrive.rules`, by name.
+    """Return the plug-ins that extensions add to a group, by name, each loaded at first use.
 
-    Each is an `Added`, which loads the plug-in as an entry point does.
+    A plug-in is what a package adds to the harness; a group has one kind of them, such as
+    `swarmdrive.rules`. Each is an `Added`, which stands in for an entry point.
     """
     if group == GROUP:
         return {}
@@ -343,9 +345,10 @@ def added(group: str) -> Mapping[str, Any]:
 
 
 def shipped(group: str) -> frozenset[str]:
-    """Return the names of a group's plug-ins that this distribution's own extensions add.
+    """Return the names of a group's plug-ins that the harness's own extensions add.
 
-    `group` is such as `swarmdrive.rules`.
+    A plug-in is what a package adds to the harness; `group` is the name of a group of entry points,
+    such as `swarmdrive.rules`.
     """
     return _shipped(group, tuple(sys.path))
 

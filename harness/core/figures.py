@@ -11,9 +11,9 @@ DASH = "–"
 
 
 class Bounded(Protocol):
-    """Describe a value with the two ends of its confidence interval, for functions that write it.
+    """Describe what has a `value` and the ends `low` and `high` of its confidence interval.
 
-    It has `value`, and the ends `low` and `high`, in the unit of the value; None or NaN where
+    Functions that write numbers take it. All three are in the unit of the value; None or NaN where
     unknown.
     """
 
@@ -26,7 +26,7 @@ class Bounded(Protocol):
 
 
 class Counted(Bounded, Protocol):
-    """Describe a value with its interval, and the number n behind it.
+    """Describe what has a value, its interval, and the number `n` behind it.
 
     n counts the episodes, decisions or seeds that the value is a mean of.
     """
@@ -101,9 +101,9 @@ def interval_of(bounded: Bounded, unit: Unit = PERCENT, sign: str = "") -> str:
 
 
 def within(low: float, high: float) -> str:
-    """Write a bound of a difference that its interval leaves: `±5.2 points`.
+    """Write how large a difference can be by its interval: `±5.2 points`.
 
-    `low` and `high` are the interval's ends, shares from -1 to 1; the farther from 0 is the bound.
+    `low` and `high` are the interval's ends, shares from -1 to 1; the farther from 0 is written.
     """
     return f"±{POINTS.text(max(abs(low), abs(high)))}"
 

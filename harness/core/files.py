@@ -43,9 +43,9 @@ def canonical_json(value: Any) -> str:
 
 
 def canonical_bytes(value: Any) -> bytes:
-    """Return `canonical_json` of a value in UTF-8.
+    """Return a value's JSON text with sorted keys and no spaces, as UTF-8 bytes.
 
-    Raises UnicodeEncodeError, a ValueError, on a lone surrogate.
+    Raises UnicodeEncodeError, a ValueError, on a lone surrogate, and ValueError on NaN.
     """
     return canonical_json(value).encode()
 
@@ -164,8 +164,8 @@ def neutral(cell: T) -> T | str:
 def refuse_bomb(archive: "ZipFile", packed: int, most: float = math.inf) -> None:
     """Raise BadZipFile if a ZIP archive states that it unpacks to too much; nothing is unpacked.
 
-    It is called before unpacking what somebody else may have made. The limit is the lesser of
-    `most` bytes and `MOST_TIMES` its size `packed` (bytes) plus 1 MB.
+    It is called before unpacking what somebody else may have made. `packed` is the archive's size,
+    and the limit is the lesser of `most` and `MOST_TIMES` its size plus 1 MB, all in bytes.
     """
     from zipfile import BadZipFile  # imported here, since few commands need it
 
@@ -190,15 +190,18 @@ def sha256_file(path: Path, kind: Kind = "weights") -> str:
 
 
 def digest(value: Any) -> str:
-    """Return the hex SHA-256 digest of a JSON value's canonical text."""
+    """Return the hex SHA-256 digest of a JSON value, the same for equal values.
+
+    It is that of the JSON text with sorted keys and no spaces.
+    """
     return sha256_bytes(canonical_bytes(value))
 
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Enter a context in which an OSError of a full or failing disk names the file `path`.
+    """Enter a context that adds the file's name to an error of a full or failing disk.
 
-    Python raises such an error of a write without a name.
+    Python raises an OSError of a write without a name; `path` is the file.
     """
     try:
         yield
@@ -299,9 +302,10 @@ def making(folder: Path) -> Iterator[Path]:
 
 
 def forget_halves(folder: Path, name: str = "*") -> None:
-    """Delete the temporary files and folders in `folder` that killed processes left.
+    """Delete the temporary files and folders in a folder that killed processes left.
 
-    Those of running processes are locked and stay. `name` is a glob pattern of the final names.
+    Those of running processes are locked and stay. `name` is a glob pattern of the names that the
+    files would have had in the end.
     """
     for part in folder.glob(f".{name}.[0-9]*.part"):
         with suppress(OSError), alone(part):
@@ -316,11 +320,12 @@ def write_whole(path: Path, data: str | bytes) -> None:
 
 @contextmanager
 def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
-    """Enter a context that holds an exclusive lock on a folder or file; a missing file is created.
+    """Enter a context in which no other process of this program works on a folder or file.
 
-    The lock of a killed process is released. On systems without such locks (Windows) nothing is
-    locked. Raises BlockingIOError if another process still holds it after `patience_s` seconds, and
-    OSError if the file is a link or cannot be opened.
+    It holds an exclusive lock; a missing file is created. The lock of a killed process is released.
+    On systems without such locks (Windows) nothing is locked. Raises BlockingIOError if another
+    process still holds it after `patience_s` seconds, and OSError if the file is a link or cannot
+    be opened.
     """
     try:
         import fcntl

@@ -24,9 +24,9 @@ STUDIES = {"sweep": "sweep"}
 
 
 def refuse_data(option: str, out: Path) -> None:
-    """Raise UserError if writing to the file `out` would destroy data of a run or a dataset.
+    """Raise UserError if a command's output file would replace data of a run or a dataset.
 
-    That is so if the file exists and is one that a run, a suite of runs or a dataset consists of,
+    That is so if `out` exists and is a file that a run, a suite of runs or a dataset consists of,
     such as `run.json`. `option` names the option that gave it.
     """
     is_source = SOURCES in out.absolute().parts[-5:]

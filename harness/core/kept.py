@@ -25,7 +25,7 @@ def folder() -> Path:
 
 
 def recall(name: str) -> bytes | None:
-    """Read the data stored under a file name in the cache folder; None if it cannot be read."""
+    """Read what `keep` stored under a file name in the cache folder; None if it cannot be read."""
     try:
         return bytes_of(folder() / name, "rows")
     except OSError:
@@ -33,7 +33,10 @@ def recall(name: str) -> bytes | None:
 
 
 def keep(name: str, data: bytes) -> None:
-    """Store data under a file name in the cache folder; do nothing if it cannot be written."""
+    """Store data that can be computed again under a file name in the cache folder.
+
+    Nothing is done if it cannot be written; `recall` reads it.
+    """
     with suppress(OSError):
         write_whole(folder() / name, data)
 

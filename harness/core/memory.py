@@ -7,10 +7,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Enter a context without the garbage collector, for code that creates many objects.
+    """Enter a context in which Python's garbage collector does not run, to create many objects.
 
     They must have no cycles. The collector would walk all objects whenever memory has grown by a
-    quarter, which took up to half of the time of code that reads JSON or rows.
+    quarter, which is much of the time of code that reads JSON or rows.
     """
     was_on = gc.isenabled()
     gc.disable()

@@ -14,10 +14,10 @@ LEAST = 1e-12  # below this p-value, levels of confidence are too near 1 to be t
 def p_value(interval: Callable[[float], Estimate]) -> float | None:
     """Return the two-sided p-value of a difference of 0, by inverting its confidence interval.
 
-    `interval` returns the difference's estimate with an interval at a level of confidence, from 0
-    to 1. The result is below 0.05 exactly if the 95 % interval excludes 0; for Student's t interval
-    it is that of the paired t test. None without an interval; `LEAST` for any smaller value, and 1
-    above 0.999.
+    `interval` takes a level of confidence, from 0 to 1, and returns the difference's estimate with
+    an interval at that level. The result is below 0.05 exactly if the 95 % interval excludes 0; for
+    Student's t interval it is that of the paired t test. None without an interval; `LEAST` for any
+    smaller value, and 1 above 0.999.
     """
     difference = interval(1 - LEVEL)
     if math.isnan(difference.low) or math.isnan(difference.high):

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 
 def generator(*key: object) -> np.random.Generator:
-    """Return the random generator of a key; equal keys give equal draws on every machine.
+    """Return a random generator that is the same for equal keys, on every machine.
 
-    `key` has any values with a stable `repr`, such as a purpose and seeds. They are joined by their
-    `repr`, so `1` and `"1"` differ.
+    So draws do not depend on their order. `key` has any values with a stable `repr`, such as a
+    purpose and seeds. They are joined by their `repr`, so `1` and `"1"` differ.
     """
     seed = hashlib.sha256("\x1f".join(map(repr, key)).encode()).digest()[:16]
     # The words of the digest as a whole number, which NumPy would take apart at thrice the cost.
@@ -23,5 +23,8 @@ def generator(*key: object) -> np.random.Generator:
 
 
 def uniforms(shape: tuple[int, ...], *key: object) -> NDArray[np.float64]:
-    """Return uniform draws in [0, 1) of this shape, always the same for a key (see `generator`)."""
+    """Return uniform draws in [0, 1) of this shape, the same for equal keys on every machine.
+
+    `key` has any values with a stable `repr`, such as a purpose and seeds.
+    """
     return generator(*key).random(shape)

@@ -2,7 +2,7 @@
 
 
 def pairs(text: str) -> dict[str, str]:
-    """Parse settings such as `loss=0.2,latency_s=0.01` into a dict of texts.
+    """Parse a text of settings, such as `loss=0.2,latency_s=0.01`, into a dict of texts by name.
 
     A missing value is an empty text.
     """

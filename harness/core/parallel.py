@@ -59,33 +59,33 @@ def workers_of(text: str) -> Workers:
 
 
 class Executor(Protocol):
-    """Run items on workers (processes, or nodes of a cluster), in any order.
+    """Describe what runs items of work on workers (processes, or nodes of a cluster), in any order.
 
     Each item that is given comes back once, as its result or `WorkerDied`.
     """
 
     def room(self) -> bool:
-        """Return whether another item can be submitted."""
+        """Return whether another item of work can be submitted now."""
         ...
 
     def give(self, place: int, item: Any) -> None:
-        """Submit an item; `place` is its index among all items."""
+        """Submit an item of work; `place` is its index among all items."""
         ...
 
     def take(self) -> "tuple[int, Any]":
-        """Wait until any item is done; return its index, and its result or `WorkerDied`.
+        """Wait until any item of work is done; return its index, and its result.
 
-        Raises what the work raised.
+        The result is `WorkerDied` if its worker died. Raises what the work raised.
         """
         ...
 
     def close(self) -> None:
-        """Stop all items that still run."""
+        """Stop all items of work that still run."""
         ...
 
 
 class WorkerDied:
-    """Stand in for the result of an item whose worker process died."""
+    """Stand in for the result of an item of work whose worker process died."""
 
 
 def each(
@@ -148,9 +148,10 @@ def each(
 
 
 def done(work: Callable[[Item], Result], item: Item) -> Result:
-    """Return `work(item)`, with two things refused that the code of a package may do there.
+    """Return `work(item)`, guarded from what code of a package may do in it.
 
-    It may neither end the program (that raises UserError) nor leave it in another working folder.
+    That code may neither end the program (UserError is raised) nor leave it in another working
+    folder.
     """
     with strangers():
         return work(item)
@@ -254,7 +255,7 @@ _shared: tuple[Flags, int] | None = None  # of a worker: which workers have work
 
 
 def share(total: int) -> int:
-    """Return this worker's share of `total`, such as of threads for a model, at least 1.
+    """Return how many of `total`, such as threads for a model, this worker may use, at least 1.
 
     All workers of this machine that still have work divide it; outside a worker, and on a cluster,
     it is all.

@@ -20,11 +20,12 @@ COMMAND = "command"  # key of a value that is a command line
 
 
 def nameless(value: Any, key: str = "") -> Any:
-    """Return a JSON value with file names in place of absolute paths, to be given to others.
+    """Return a JSON value with file names in place of absolute paths, to give it to others.
 
-    URLs lose user, password and query. A path with spaces is found only if it is a whole text, or a
-    word of a command line. `key` is the key under which a dict has `value`: `command` says that it
-    is a command line; empty for a value outside of dicts.
+    So it does not tell where the user keeps files. URLs lose user, password and query. A path with
+    spaces is found only if it is a whole text, or a word of a command line. `key` is the key under
+    which a dict has `value`: `command` says that it is a command line; empty for a value outside of
+    dicts.
     """
     if isinstance(value, str):
         return _command(value) if key == COMMAND else text(value)
@@ -36,7 +37,10 @@ def nameless(value: Any, key: str = "") -> Any:
 
 
 def text(value: str) -> str:
-    """Return a text with file names in place of absolute paths; URLs lose user and password."""
+    """Return a text without what tells where its user keeps files, to give it to others.
+
+    File names stand in place of absolute paths; URLs lose user and password.
+    """
     if _WHOLE.fullmatch(value) and not _ADDRESS.match(value):
         return name(value)
     return _PATH.sub(lambda match: address(match[0]) if match["address"] else name(match[0]), value)
@@ -51,7 +55,10 @@ def name(path: str) -> str:
 
 
 def address(url: str) -> str:
-    """Return a URL without user, password, query and fragment; of a `file:` URL, its name."""
+    """Return a URL without user, password, query and fragment, to show it to others.
+
+    Of a `file:` URL it is the file's name.
+    """
     try:
         parts = urlsplit(url)
         host = parts.netloc.rpartition("@")[2]

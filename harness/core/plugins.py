@@ -22,10 +22,10 @@ LOADING_S = 3.0  # after which a line says which package a command waits for
 
 
 def entries(group: str) -> Mapping[str, Any]:
-    """Return all installed packages' entry points of a group, such as `swarmdrive.rules`, by name.
+    """Return what all installed packages add to a group of plug-ins, by name.
 
-    Each is an `importlib.metadata.EntryPoint`. If two have one name, this distribution's is taken,
-    or else the first, and a line on stderr says so.
+    Each is an `importlib.metadata.EntryPoint`, and a group such as `swarmdrive.rules`. If two have
+    one name, this distribution's is taken, or else the first, and a line on stderr says so.
     """
     return _entries(group, tuple(sys.path))
 
@@ -181,35 +181,35 @@ def line_or_none(answer: Any, what: str) -> str | None:
 
 
 class Failed(UserError):
-    """Report which plug-in of a package failed, and why, where a list shows one line for each.
+    """Report which plug-in of a package failed, and why, for a list with a line for each.
 
-    The message begins with the plug-in's name.
+    The message begins with the plug-in's name. A plug-in is what a package adds to the harness.
     """
 
 
 def of_type(kind: type) -> Allowed:
-    """Return a rule that the value of a plug-in's attribute is of one type.
+    """Return a rule for an attribute of packages' plug-ins: its value is of one type.
 
-    A rule is a pair: a test of a value, and words for what it allows. Rules are given in
-    `Plugins.stated`.
+    A rule is a pair: a test of a value, and words for what it allows. Subclasses of `Plugins` list
+    rules in `stated`.
     """
     return lambda value: isinstance(value, kind), kind.__name__
 
 
 def one_of(*values: object) -> Allowed:
-    """Return a rule that the value of a plug-in's attribute is one of these.
+    """Return a rule for an attribute of packages' plug-ins: its value is one of these.
 
-    A rule is a pair: a test of a value, and words for what it allows. Rules are given in
-    `Plugins.stated`.
+    A rule is a pair: a test of a value, and words for what it allows. Subclasses of `Plugins` list
+    rules in `stated`.
     """
     return values.__contains__, ", ".join(map(str, values))
 
 
 def tuple_of(each: Allowed) -> Allowed:
-    """Return a rule that a plug-in's attribute is a tuple of which each item fits the rule `each`.
+    """Return a rule for an attribute of packages' plug-ins: a tuple whose items fit a rule.
 
-    A rule is a pair: a test of a value, and words for what it allows. Rules are given in
-    `Plugins.stated`.
+    A rule is a pair: a test of a value, and words for what it allows; `each` is that of the items.
+    Subclasses of `Plugins` list rules in `stated`.
     """
     fits, words = each
     return lambda value: isinstance(value, tuple) and all(map(fits, value)), f"a tuple of {words}"
@@ -245,7 +245,7 @@ class Plugins(Mapping[str, T], Generic[T]):
         return name in self.built_in or name in shipped(self.group)
 
     def of_package(self, name: str) -> str:
-        """Return words for a plug-in in messages, with the package that adds it.
+        """Return words for a plug-in in messages: its name, and the package that adds it.
 
         `name` is the plug-in's, which must be one that an entry point or an extension adds.
         """
@@ -334,7 +334,7 @@ class Shipped(Plugins[T]):
 
 
 class ChosenBySettings(Protocol):
-    """Describe a plug-in that a run uses if it has certain settings of an extension."""
+    """Describe a plug-in that a run uses only if its settings of an extension say so."""
 
     @property
     def chosen_by(self) -> tuple[str, ...]:
@@ -354,12 +354,12 @@ Chosen = TypeVar("Chosen", bound=ChosenBySettings)
 
 
 class ShippedChoices(Shipped[Chosen]):
-    """Hold plug-ins that ship, of which a run uses the one that its settings choose, or none."""
+    """Hold plug-ins of shipped extensions of which a run uses one or none, as its settings say."""
 
     def chosen(self, settings: Mapping[str, Any]) -> Chosen | None:
-        """Return what the plug-in that a run's settings choose opens; None if they choose none.
+        """Return what does a plug-in's work in a run, opened; None if its settings choose none.
 
-        `settings` has the run's settings of extensions, values by name.
+        `settings` has the run's settings of extensions, values by name; they choose the plug-in.
         """
         for each in self.values():
             if opened := each.opened(settings):
@@ -371,7 +371,10 @@ class ShippedChoices(Shipped[Chosen]):
         return {name for each in self.values() for name in each.chosen_by}
 
     def without(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a run's settings of extensions, by name, without those that choose a plug-in."""
+        """Return a run's settings of extensions without those that choose one of these plug-ins.
+
+        Both are values by name.
+        """
         choosing = self.settings()
         return {name: value for name, value in settings.items() if name not in choosing}
 

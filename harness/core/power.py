@@ -20,12 +20,13 @@ HALVINGS = 60  # of a bracket: to the rounding of a number
 
 @dataclass(frozen=True)
 class Spread:
-    """Hold how much a paired difference of success varies between episodes, in each of H strata.
+    """Hold how much a difference of success varies between episodes, for a power analysis.
 
-    Strata are groups of episodes that are averaged apart, such as those with a danger (a vehicle in
-    the ego's way) and those without. `shares`, (H,), has the share of all episodes that is in each,
-    and `variances`, (..., H), the variance of one episode's difference of success there. The mean
-    over strata is unweighted, as in `statistics.paired_difference`.
+    The difference is paired: of the same episode in two runs or settings. Strata are groups of
+    episodes that are averaged apart, such as those with a danger (a vehicle in the ego's way) and
+    those without; there are H. `shares`, (H,), has the share of all episodes that is in each, and
+    `variances`, (..., H), the variance of one episode's difference of success there. The mean over
+    strata is unweighted.
     """
 
     shares: Floats  # share of all episodes that is in each stratum, (H,); they sum to 1

@@ -78,9 +78,9 @@ def run(program: Callable[[], object]) -> None:
 
 
 def give_up() -> None:
-    """Shorten the wait at exit, after something hung that exit handlers may hang on as well.
+    """Shorten the wait at the program's exit, after something hung that may hang there again.
 
-    Packages' `atexit` functions then have `GIVEN_UP_S` instead of `LEAVE_S` to finish.
+    Packages' `atexit` functions then have `GIVEN_UP_S` seconds instead of `LEAVE_S` to finish.
     """
     global LEAVE_S
     LEAVE_S = min(LEAVE_S, GIVEN_UP_S)

@@ -4,7 +4,7 @@
 class Progress:
     """Receive counts of work that is done and still to do; this base class shows nothing.
 
-    It is called with the number of things just done.
+    Subclasses show a bar. It is called with the number of things just done.
     """
 
     def __call__(self, done: int) -> None:
@@ -14,4 +14,4 @@ class Progress:
         """Add `count` to the number of things that there are to do."""
 
     def say(self, text: str) -> None:
-        """Show a line of text."""
+        """Show a line of text beside the counts, as above a bar."""

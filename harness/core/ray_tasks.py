@@ -36,10 +36,10 @@ COUNT_S = 2.0  # cores are counted again after this time, since nodes come and g
 
 
 class Tasks:
-    """Run items as tasks on a Ray cluster, which chooses the nodes: an `Executor`.
+    """Run items of work as tasks on a Ray cluster, which chooses the nodes: an `Executor`.
 
-    Ray does not retry a task, so that `each` can count deaths of workers. The first item of every
-    further node is run again on the first node, and must give the same result.
+    Ray does not retry a task, so that the caller can count deaths of workers. The first item of
+    every further node is run again on the first node, and must give the same result.
     """
 
     def __init__(

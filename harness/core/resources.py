@@ -29,7 +29,7 @@ def root() -> Path:
 
 
 def folder(kind: str) -> Path:
-    """Return the folder of shipped files of one kind, such as `prompts` or `channels`."""
+    """Return the folder of the files of one kind that ship, such as `prompts` or `channels`."""
     return root() / kind
 
 
@@ -52,7 +52,10 @@ def names(kind: str) -> list[str]:
 
 
 def each(names: Iterable[str], load: Callable[[str], T]) -> dict[str, T | UserError]:
-    """Load every name with `load`; return, by name, what it returned or the UserError it raised."""
+    """Load every name with `load`, such as for a list, and keep errors beside what could be loaded.
+
+    The result has, by name, what `load` returned or the UserError that it raised.
+    """
     loaded: dict[str, T | UserError] = {}
     for name in names:
         try:
@@ -83,10 +86,10 @@ def find(kind: str, name: str) -> Path:
 
 
 def card_to_copy(model: str) -> str | None:
-    """Return a sentence on a model whose model card no longer ships: where to copy the card from.
+    """Return a sentence on where to copy a model card from that no longer ships; None for others.
 
     A model card is a TOML file that describes a model. `model` is what was typed, a name with
-    options behind `:`. None for all other names.
+    options behind `:`.
     """
     page = root() / "docs" / "model-cards.md"
     name, _, _ = model.partition(":")

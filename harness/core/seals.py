@@ -29,11 +29,12 @@ KEY, KEY_BYTES = "seal.key", 32
 
 
 def seal(content: Mapping[str, bytes], place: str) -> str | None:
-    """Return the seal of files: a digest that only this user's key on this machine makes.
+    """Return a digest of files that only this user's key on this machine makes, their seal.
 
-    A seal shows later that the files are as this user's program wrote them. `content` has the
-    files' bytes by name; `place` is a text that names what they belong to, and is sealed with them.
-    None if there is no key, which is where the cache folder cannot be written.
+    A seal shows later that files in a folder, which anybody may have written, are as this user's
+    program wrote them. `content` has the files' bytes by name; `place` is a text that names what
+    they belong to, and is sealed with them. None if there is no key, which is where the cache
+    folder cannot be written.
     """
     key = _key()
     if key is None:

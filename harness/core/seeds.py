@@ -18,7 +18,7 @@ LAST_EPISODE, LAST_SEED = 99_999, 2**31 - 1
 
 
 def purpose(first: int, count: int) -> Purpose:
-    """Return the purpose (`tune`, `train` or `report`) of a range of `count` layout seeds.
+    """Return what a range of `count` layout seeds is for: `tune`, `train` or `report`.
 
     A layout seed is a number that fixes a drawn start situation of a scenario; each range of them
     has one purpose, so that no situation is tuned or trained on and then reported. `first` is the
@@ -45,9 +45,10 @@ def seeds_text(first: int, count: int) -> str:
 
 
 def purposes(first: int, count: int) -> list[Purpose]:
-    """Return all purposes (`tune`, `train`, `report`) of a range of `count` layout seeds.
+    """Return what a range of layout seeds is for: some of `tune`, `train` and `report`.
 
-    `first` is the first of them; each seed fixes a drawn start situation of a scenario (`purpose`).
+    A layout seed fixes a drawn start situation of a scenario, and has one purpose, so that nothing
+    is tuned on and then reported. `first` is the first of `count` seeds.
     """
     names = list(FIRST)
     ends = [*list(FIRST.values())[1:], first + count]

@@ -45,9 +45,10 @@ class Shard:
         return f"{self.number}/{self.of}"
 
     def part(self, items: Sequence[T]) -> Sequence[T]:
-        """Return this shard's contiguous slice of the items of a whole work, in their order.
+        """Return this shard's slice of the items of a whole work, in their order.
 
-        Raises UserError if there are more shards than items.
+        A shard is one of several parts of equal size. Raises UserError if there are more shards
+        than items.
         """
         if self.of > len(items):
             raise UserError(

@@ -193,10 +193,11 @@ def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate
 
 
 def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
-    """Return `paired_difference` of strata, with ends that are so many standard errors away.
+    """Return the mean over strata of paired differences, with ends so many standard errors away.
 
-    `parts` has for each stratum the differences of its E episodes, from -1 to 1, (E,); `errors` is
-    the number of standard errors from the mean to either end, such as 1.96.
+    It is `paired_difference` with another interval. `parts` has for each stratum (group of
+    episodes) the differences of its E episodes, from -1 to 1, (E,); `errors` is the number of
+    standard errors from the mean to either end, such as 1.96.
     """
     value, error = _paired_error(parts)
     n = sum(int((~np.isnan(part)).sum()) for part in parts)

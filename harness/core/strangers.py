@@ -29,10 +29,10 @@ _watchers: set[int] = set()  # processes with a thread that watches
 
 @contextmanager
 def watched(what: str, patience_s: float | None = None) -> Iterator[None]:
-    """Enter a context in which a line on stderr names code that takes long, once.
+    """Enter a context that names code which takes long, once, on stderr.
 
-    `what` names the code, and `patience_s` is how many seconds it may take before that;
-    `PATIENCE_S` by default. The code is not stopped.
+    So the user knows what he waits for. `what` names the code, and `patience_s` is how many seconds
+    it may take before that; `PATIENCE_S` by default. The code is not stopped.
     """
     call = object()
     _calls[call] = what, time.monotonic(), patience_s or PATIENCE_S
@@ -78,10 +78,10 @@ def strangers(what: str = "a package") -> Iterator[None]:
 
 @contextmanager
 def aside(what: str) -> Iterator[None]:
-    """Enter a context for another package's code that prints: its stdout goes to stderr.
+    """Enter a context for another package's code that may print: its stdout goes to stderr.
 
-    As in `strangers`, it can neither end the program nor change the working folder, and a line on
-    stderr says if it takes long. `what` names it in messages.
+    So it cannot spoil what a command prints. It can neither end the program nor change the working
+    folder, and a line on stderr says if it takes long. `what` names it in messages.
     """
     with watched(what), strangers(what), redirect_stdout(sys.stderr):
         yield
@@ -102,7 +102,7 @@ def is_ours(thing: object) -> bool:
 def is_in_harness(named: Any) -> bool:
     """Return whether a class or function is defined in a module of the harness.
 
-    It is looked up there by its name, since an object may state any module and name.
+    A package's own can state any module and name, so it is looked up there by its name.
     """
     module = str(getattr(named, "__module__", ""))
     if not module.startswith("harness."):
@@ -139,9 +139,10 @@ def worded(
 
 
 def ends_the_program(error: BaseException) -> bool:
-    """Return whether an exception would end the program though it is no error, as SystemExit does.
+    """Return whether an exception would end the program without being an error.
 
-    A Ctrl-C that somebody typed, and `process.Stop` (a signal to stop), do not count.
+    SystemExit does so. A Ctrl-C that somebody typed, and `process.Stop` (a signal to stop), do not
+    count.
     """
     if isinstance(error, Stop):
         return False

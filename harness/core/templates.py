@@ -119,9 +119,9 @@ _account = _Account()
 
 
 def begin() -> None:
-    """Give the template rendering that begins in this thread its full budget of `MOST_STEPS`.
+    """Give the template rendering that begins in this thread its full budget of work.
 
-    A step is one item that it reads, or eight characters.
+    It is `MOST_STEPS` steps; a step is one item that the template reads, or eight characters.
     """
     _account.left = MOST_STEPS
 
@@ -163,7 +163,8 @@ def written(value: Any) -> Any:
 def looked_in(value: Any) -> Any:
     """Return a container that a template searches (`in`), after charging for the search.
 
-    The rendering's budget of steps is charged with its length; a mapping costs nothing.
+    The rendering's budget of steps, which limits its work, is charged with the container's length;
+    a mapping costs nothing.
     """
     return value if isinstance(value, _MAPPINGS) else read(value)
 
@@ -487,9 +488,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
         )
 
     def is_small(self, node: nodes.Node) -> bool:
-        """Return whether an expression of a template is known to cost nothing to read: a constant.
+        """Return whether reading an expression of a template costs nothing: it is a constant.
 
-        The code that is generated for it charges the rendering's budget of steps for all others.
+        `node` is the expression. The code that is generated for all others charges the budget of
+        steps that limits a rendering's work.
         """
         return isinstance(node, nodes.Const)
 

@@ -60,9 +60,9 @@ def node_versions() -> dict[str, str]:
 
 
 def differing(wanted: dict[str, str]) -> str | None:
-    """Describe the first version that differs here from `wanted`; None if none does.
+    """Return a phrase on the first version that differs here from `wanted`; None if none does.
 
-    `wanted` has versions by name, as `node_versions` gives them on another node.
+    `wanted` has versions by name, as `node_versions` gives them on another node of a job.
     """
     here = node_versions()
     for name in {**wanted, **here}:

@@ -24,12 +24,13 @@ WAITING = 64
 
 
 class HeadInTime(H11Protocol):
-    """Limit how long a request's line and headers may take, in uvicorn's HTTP protocol.
+    """Limit how long a client may take to send a request's line and headers, in uvicorn's protocol.
 
     A connection is closed after `HEAD_S` seconds without a complete head. At most `WAITING`
     connections may wait for one; of more, the one that waited longest is closed.
     """
 
+    # timer that closes the connection; None while no head is awaited
     _late: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -38,7 +39,10 @@ class HeadInTime(H11Protocol):
         self._watch()
 
     def data_received(self, data: bytes) -> None:
-        """Handle bytes that came, and begin or end the time limit of a request's head."""
+        """Handle bytes of a connection, and begin or end the time limit of a request's head.
+
+        The event loop calls this; a head is the request's line and headers.
+        """
         super().data_received(data)
         self._watch()
 

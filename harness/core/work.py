@@ -79,10 +79,10 @@ def start_of(out: Path, kind: type[Kind]) -> Kind | None:
 
 
 def unanswered(out: Path) -> str | None:
-    """Return why the work in an output folder stopped, if its model could not be asked, else None.
+    """Return why a stopped command could not ask its model; None if it stopped otherwise.
 
-    `out` may also be a study's folder, whose runs are subfolders: the first such reason is
-    returned.
+    `out` is its output folder. It may also be a study's folder, whose runs are subfolders: the
+    first such reason is returned.
     """
     for place in (out, *([] if (out / "run.json").is_file() else sorted(out.glob("*/")))):
         with suppress(OSError, ValueError, UserError):
@@ -93,7 +93,8 @@ def unanswered(out: Path) -> str | None:
 def idle(out: Path) -> bool:
     """Return whether the work in a folder stopped before its model answered anything.
 
-    Then nothing is lost if the work begins anew, with other settings.
+    Then nothing is lost if the work begins anew, with other settings. `out` is a command's output
+    folder.
     """
     work = out / WORK
     with suppress(OSError):
@@ -111,7 +112,9 @@ def same(
     stored: Mapping[str, Any],
     typed: Callable[[], str] = lambda: "",
 ) -> None:
-    """Raise UserError, naming the differences, unless the settings `now` equal the `stored` ones.
+    """Raise UserError, naming the differences, unless a stopped command is typed again as before.
+
+    Work goes on only with the settings that it began with.
 
     Args:
         out: the output folder, named in the message.
@@ -206,9 +209,10 @@ def working(out: Path, begin: WorkStart, last: str | None = None) -> Iterator[Pa
 
 @contextmanager
 def going_on(out: Path) -> Iterator[None]:
-    """Enter a context that adds a note to an interrupt or `Unfinished` error.
+    """Enter a context that tells the user, where work is interrupted, that it can be continued.
 
-    It says that the output folder `out` keeps what is done.
+    It adds a note to an interrupt or `Unfinished` error: the output folder `out` keeps what is
+    done.
     """
     try:
         yield
