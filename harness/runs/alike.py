@@ -15,10 +15,13 @@ OPENED = ("radio", "network", "schedule", "file")
 
 
 def setup(run: Run, scenario: Scenario | None = None) -> dict[str, Any]:
-    """Return what a run's answers and latency are of, beside its layouts, by a name for errors.
+    """Return what two runs must have alike for their success to be compared as one thing's.
 
-    `scenario` is that of its scenes, None where it does not count. Measured times are each run's
-    own, and count as alike.
+    Its keys are names for error messages: `scenario` with its parameters, `model` and `prompt` of
+    all that answer, `temperature` with the sampling seed, `ties`, `latency` (the seconds of
+    answers) and `radio` by profile; `different` compares two of these. `scenario` is that of the
+    run's scenes, None where it does not count. Measured times are each run's own, and count as
+    alike.
     """
     manifest = run.manifest
     agents = (manifest.agent(0), *manifest.helpers)

@@ -51,7 +51,12 @@ def _label(name: str, role: Role) -> str:
 
 
 def answer_metrics(roles: Sequence[Role]) -> Iterator[Metric]:
-    """Yield the metrics of each role's answers, in the order of a summary's rows."""
+    """Yield the metrics on models' answers themselves, such as the share that could be parsed.
+
+    A role is who answers, and to what: `ego`, `helper`, or `merge` (the ego again, with the
+    messages that it heard). Each of `roles` has metrics of its own, in the order of a summary's
+    rows.
+    """
     rates: tuple[tuple[tuple[str, str, Better, Callable[[Answers], Floats]], ...], ...] = (
         (
             (

@@ -12,9 +12,10 @@ from harness.runs.records import Answer, AnswerFacts, Times
 
 
 def times(answers: Iterable[Answer | AnswerFacts]) -> dict[str, Times]:
-    """Return for each role the percentiles of the seconds that answers took, with intervals.
+    """Return for each role how long answers took: percentiles of the seconds, with intervals.
 
-    Only answers that were timed and came at the first attempt count.
+    A role is who answers: `ego`, `helper`, or `merge` (the ego after it heard messages). Only
+    answers that were timed and came at the first attempt count.
     """
     by_role: dict[str, list[Answer | AnswerFacts]] = {}
     for answer in answers:

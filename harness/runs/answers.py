@@ -92,7 +92,10 @@ class Answers:
             yield from self._span(place)
 
     def counted(self) -> Answered:
-        """Read all answers once, and return their counts and the ego's distributions."""
+        """Read all answers once, and return how many there are, how many failed, and the ego's.
+
+        The ego's are its probabilities of the actions.
+        """
         count, failed, ego = Counter[str](), dict[str, Counter[str]](), list[tuple[float, ...]]()
         for answer in self:
             if answer.error is not None:

@@ -46,8 +46,9 @@ CLOSE = 1e-6  # how near numbers stay that were only written and read again
 def refuse(run: Run | SuiteRun) -> None:
     """Raise UserError if a table of a run or suite contradicts the tables it is computed from.
 
-    Such as a mean in `summary.csv` that is not that of `episodes.csv`. A suite is checked with all
-    of its runs. A suite is a run on each of several scenarios.
+    It guards what is computed from files that anybody may have written; such is a mean in
+    `summary.csv` that is not that of `episodes.csv`. A suite, a run on each of several scenarios,
+    is checked with all of its runs.
     """
     if isinstance(run, SuiteRun):
         for member in run.runs.values():
@@ -63,9 +64,10 @@ def refuse(run: Run | SuiteRun) -> None:
 
 
 def sound(folder: Path) -> Run:
-    """Read a run, for what is computed from its tables.
+    """Read a run, and check it before something is computed from its tables.
 
-    Raises UserError if it is broken, or a table contradicts those that it is computed from.
+    `folder` is the run's. Raises UserError if it is broken, or a table contradicts those that it is
+    computed from.
     """
     run = read(folder)
     refuse(run)
@@ -149,8 +151,8 @@ def _scores(run: Run) -> Iterator[Score]:
 def current(run: Run) -> bool:
     """Return whether a run's figures were computed by the rules that this harness has for them.
 
-    The run's manifest states the version of the rules, a number; one that states none is of version
-    1, the oldest.
+    Only then must they be the same if computed again. The run's manifest states the version of the
+    rules, a number; one that states none is of version 1, the oldest.
     """
     return run.manifest.versions.get("figures", "1") == str(FIGURES)
 
@@ -188,10 +190,11 @@ def _lacking(run: Run, computed: Iterable[Score]) -> Iterator[Key]:
 
 
 def unchecked(run: Run) -> Iterator[str]:
-    """Yield a sentence on a run's figures that nothing here computes again, if it has any.
+    """Yield a sentence on those of a run's figures that nobody can compute again here.
 
-    Such are those of a package's metric. Another is on figures that a run by rules of an earlier
-    version is allowed to lack.
+    Such are those of another package's metric. Another sentence is on figures that a run by rules
+    of an earlier version of the harness is allowed to lack. Nothing is yielded if all can be
+    checked.
     """
     figures = {score.key: score for score in run.scores}
     here = {} if current(run) else {score.key: score for score in _scores(run)}

@@ -134,7 +134,7 @@ def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
 
 
 def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
-    """Return values (n, A) of n decisions and A actions as columns (n,) by name.
+    """Return values of n decisions and A actions, (n, A), as columns (n,) of a table, by name.
 
     There is a column for each of `actions`, whose name begins with `name`, such as `fused_IDLE`.
     """
@@ -142,7 +142,7 @@ def by_action(name: str, values: Any, actions: Sequence[str]) -> dict[str, Any]:
 
 
 def by_message(name: str, values: Any) -> dict[str, Any]:
-    """Return values (n, H) of n decisions and H messages as columns (n,) by name.
+    """Return values of n decisions and H messages, (n, H), as columns (n,) of a table, by name.
 
     There is a column for each message, counted from 1, whose name begins with `name`, such as
     `delivered_1`.
@@ -166,18 +166,20 @@ class Decisions:
     """Hold n decisions of a run as a table, one row for each decision point, condition and seed.
 
     A decision point is one situation in which a decision is due. A condition is a named set of
-    settings of channel, asking and fusion under which it is decided, and the seed is that of the
-    channel's random numbers. `actions` are the names of the A meta-actions, in the order of every
-    distribution, and `helpers` is the greatest number of messages in a decision. Columns of `table`
-    are read by name as arrays (n,), or (n, A), which `_arrays` keeps, and its rows as dicts, of
-    which `_rows` keeps some.
+    settings of the radio, of asking helpers and of fusing their messages under which it is decided,
+    and the seed is that of the channel's random numbers. `actions` are the names of the A
+    meta-actions, in the order of every distribution, and `helpers` is the greatest number of
+    messages in a decision. Columns of `table` are read by name as arrays (n,), or (n, A), which
+    `_arrays` keeps, and its rows as dicts, of which `_rows` keeps some.
     """
 
     table: pa.Table  # its columns, (n,) each, are those of `schema`
     # names of the meta-actions, in the order of every distribution over them
     actions: tuple[str, ...]
     helpers: int  # the greatest number of messages in a decision: of columns such as `helper_1`
+    # columns that were read as arrays, by name, kept for the next call
     _arrays: dict[str, Floats] = field(default_factory=dict, repr=False, compare=False)
+    # rows that were read as dicts, by the index of their chunk, kept for the next call
     _rows: dict[int, list[dict[str, Any]]] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
@@ -217,11 +219,14 @@ class Decisions:
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
-        """Return the column of this name, which holds whole numbers, of all n rows, (n,)."""
+        """Return a column of whole numbers of the table of decisions, by its name, (n,)."""
         return cast(Ints, _values(self.table[name], 0, np.int64))
 
     def flags(self, name: str) -> Bools:
-        """Return a mask (n,) of n rows: where the column of this name is known and true."""
+        """Return in which of n decisions a yes-or-no column is true and known, (n,).
+
+        `name` is the column's.
+        """
         return np.asarray(self[name] == 1.0)
 
     def of_actions(self, name: str) -> Floats:
@@ -245,10 +250,10 @@ class Decisions:
         return np.stack(columns, axis=-1) if columns else np.empty((len(self), 0))
 
     def codes(self, name: str, names: Sequence[str]) -> Ints:
-        """Return of each of n rows of a column of labels the index of its label in `names`, (n,).
+        """Return a column of labels as numbers: the index of each label in `names`, (n,).
 
-        It is -1 in a row without one. `name` is the column's. Raises ValueError for a label that is
-        not in `names`.
+        It is of n decisions, and -1 in a row without one. `name` is the column's. Raises ValueError
+        for a label that is not in `names`.
         """
         column = self.table[name].combine_chunks()
         position = {label: place for place, label in enumerate(names)}
@@ -259,14 +264,15 @@ class Decisions:
         return cast(Ints, lookup[_values(column.indices, len(labels), np.int32)])
 
     def labels(self, name: str) -> list[str | None]:
-        """Return the labels of the column of this name as a list of n texts; None where unknown."""
+        """Return a column of labels, such as `danger`, as a list of n texts; None where unknown."""
         return cast("list[str | None]", self.table[name].to_pylist())
 
     @cached_property
     def scenes(self) -> dict[str, range]:
-        """Return the range of rows of each scene (decision point), by id, in order.
+        """Return which rows of the table are about each scene, by the scene's id.
 
-        Raises ValueError if the rows of a scene are not adjacent.
+        They are ranges, since all rows of a scene (decision point) stand together. Raises
+        ValueError if they do not.
         """
         if not len(self):
             return {}
@@ -312,7 +318,7 @@ class Decisions:
         return Decision(**{**plain, "fused": fused, "messages": tuple(messages)})
 
     def infinite(self) -> str | None:
-        """Return the name of a column that has an infinite number; None if there is none."""
+        """Return the name of a column with an infinite number, which no run has, or None."""
         for column in self.table.schema:
             if (
                 column.type == NUMBER
@@ -360,10 +366,11 @@ class Decisions:
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str], most: int | None = None) -> "Decisions":
-        """Read decisions from a Parquet file; `actions` names its meta-actions, in order.
+        """Read decisions from a Parquet file that anybody may have written.
 
-        Raises OSError or ValueError if it is none, lacks a column, or has more than `most` rows or
-        more bytes than its rows can need: a file of a few bytes may hold a thousand million rows.
+        `actions` names its meta-actions, in order. Raises OSError or ValueError if it is none,
+        lacks a column, or has more than `most` rows or more bytes than its rows can need: a file of
+        a few bytes may hold a thousand million rows.
         """
         with arrow_file(path) as file:  # read_table would make columns of folder names
             source = pq.ParquetFile(file)
@@ -397,7 +404,7 @@ class Decisions:
         )
 
     def frame(self) -> "pd.DataFrame":
-        """Return a pandas table, in which names are categories and flags may be unknown."""
+        """Return the decisions as a pandas table: names are categories, flags may be unknown."""
         import pandas as pd
 
         return cast(

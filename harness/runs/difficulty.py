@@ -26,12 +26,13 @@ REFERENCES = ("local-view", "cruise", "uniform")  # that ask no model
 
 
 class Layout(Struct, frozen=True):
-    """Hold the success of three reference policies in one layout: a line of `difficulty.csv`.
+    """Hold how hard one start situation is: the success of three policies without a model in it.
 
-    A layout is one start situation of a scenario, that of the episode of this number; `danger` is
-    the side from which the hidden vehicle comes. The references need no model: two rules that
-    drive, `local-view` (by what the ego alone sees) and `cruise` (never brakes), with 1 for success
-    and else 0, and actions drawn at random, `uniform`, with a probability.
+    A layout is a drawn start situation of a scenario, here that of the episode of this number;
+    `danger` is the side from which the hidden vehicle comes. The policies are two rules that drive,
+    `local-view` (by what the ego alone sees) and `cruise` (never brakes), with 1 for success and
+    else 0, and actions drawn at random, `uniform`, with a probability. It is a line of
+    `difficulty.csv`.
     """
 
     episode: int  # the episode's number
@@ -48,12 +49,13 @@ class Layout(Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Pool:
-    """Hold all N layouts that a run's E layouts are a random sample of, with their difficulty.
+    """Hold how hard all N layouts are that a run's E layouts were sampled from.
 
-    A layout is one start situation of a scenario, and has one episode. How hard it is, is known
-    from the success of K reference policies that need no model, `known` (N, K). `dangerous`, (N,),
-    says whether it has a danger, and `answered`, (E,), has the index among the N of each of the
-    run's. A danger is a vehicle that would meet an ego which keeps its speed.
+    By it a run's success is corrected for the luck of an easy or a hard sample. A layout is one
+    start situation of a scenario, and has one episode. How hard it is, is known from the success of
+    K reference policies that need no model, `known` (N, K). `dangerous`, (N,), says whether it has
+    a danger, and `answered`, (E,), has the index among the N of each of the run's. A danger is a
+    vehicle that would meet an ego which keeps its speed.
     """
 
     known: Floats  # success of each reference in each layout, 0 to 1, (N, K)
@@ -62,10 +64,11 @@ class Pool:
 
     @classmethod
     def of(cls, layouts: Sequence[Layout], episodes: Iterable[int]) -> "Pool":
-        """Return the pool of all layouts of a dataset, by one record of each, `layouts`.
+        """Return how hard a run's layouts are among all of a dataset, given a record of each.
 
-        `episodes` are the numbers of the episodes that the run evaluated, each that of one layout.
-        A layout is one start situation of a scenario.
+        A layout is one start situation of a scenario, with one episode. `layouts` has the success
+        of rules without a model in each; `episodes` are the numbers of those that the run
+        evaluated.
         """
         places = {layout.episode: place for place, layout in enumerate(layouts)}
         return cls(
@@ -79,10 +82,10 @@ class Pool:
     ) -> Estimate | None:
         """Return the difference in success a - b, corrected for how hard the run's layouts are.
 
-        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes,
-        and are paired by episode. `success` says how episodes are averaged, `level` is the
-        confidence of the interval. None if it cannot be corrected, as with too few episodes. A
-        layout is one start situation of a scenario.
+        `a` and `b` are the success of the same episodes, (S, E), by S seeds of the channel's random
+        draws and E episodes, and are paired by episode. `success` says how episodes are averaged,
+        `level` is the confidence of the interval. None if it cannot be corrected, as with too few
+        episodes. A layout is one start situation of a scenario.
         """
 
         def plain(part: Bools) -> Estimate:
@@ -93,9 +96,9 @@ class Pool:
     def estimate(self, success: Success, values: Floats) -> Estimate | None:
         """Return the mean success, corrected for how hard the run's layouts are.
 
-        `values` are the success of its episodes, (S, E), by S channel seeds and E episodes;
-        `success` says how episodes are averaged. None if it cannot be corrected, as with too few
-        episodes. A layout is one start situation of a scenario.
+        `values` are the success of its episodes, (S, E), by S seeds of the channel's random draws
+        and E episodes; `success` says how episodes are averaged. None if it cannot be corrected, as
+        with too few episodes. A layout is one start situation of a scenario.
         """
 
         def plain(part: Bools) -> Estimate:
@@ -135,7 +138,8 @@ def adjusted_scores(
     """Yield the scores of success and of its gains that are adjusted for layout difficulty.
 
     A layout is one start situation of a scenario. A gain is a condition's success less that of the
-    condition without a radio. A condition is a named set of settings of channel, asking and fusion.
+    condition without a radio. A condition is a named set of settings of the radio, of asking
+    helpers and of fusing their messages.
 
     Args:
         grid: the conditions, seeds and episodes of the run.

@@ -22,10 +22,10 @@ def doubted(
 ) -> set[str]:
     """Return the names of the conditions that a report warns about.
 
-    A condition is a named set of settings of channel, asking and fusion that a run scores. A
-    warning is due if it is a control, which replaces what helpers say; if half of its decisions or
-    more act at another time than the dataset knows the outcome for; or if its radio is outside of
-    what its channel model was validated for.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages that a run scores. A warning is due if it is a control, which replaces what helpers
+    say; if half of its decisions or more act at another time than the dataset knows the outcome
+    for; or if its radio is outside of what its channel model was validated for.
 
     Args:
         conditions: the settings of each condition, values by name, its `name` among them.
@@ -39,10 +39,11 @@ def doubted(
 
 
 def under(conditions: Conditions, control: str) -> list[str]:
-    """Return the names of the conditions with this control, such as `messages=blind`.
+    """Return the names of the conditions that test whether a gain comes from cooperation.
 
-    `conditions` has the settings of each, values by name. A control replaces what helpers say, to
-    show whether a gain comes from cooperation.
+    Under such a control, named by `control` as in `messages=blind`, something else replaces what
+    helpers say. A condition is a set of settings that a run scores; `conditions` has the settings
+    of each, values by name.
     """
     setting, _, value = control.partition("=")
     return [c["name"] for c in conditions if c.get(setting) == value]
@@ -53,7 +54,8 @@ def lagging(off_lag: Mapping[str, float | None]) -> list[str]:
 
     The lag is the time from a decision to its action for which the dataset knows the outcome.
     `off_lag` has by condition the share of decisions, 0 to 1, that would act in another frame; None
-    where unknown. A condition is a named set of settings of channel, asking and fusion.
+    where unknown. A condition is a named set of settings of the radio, of asking helpers and of
+    fusing their messages.
     """
     return [name for name, share in off_lag.items() if (share or 0.0) >= MOST_OFF_LAG]
 

@@ -26,8 +26,8 @@ from harness.runs.records import Score
 def over_seeds(name: str, values: Floats) -> Estimate:
     """Return the mean of a metric's values with a 95 % interval over channel seeds.
 
-    `values` are (S, E), by S channel seeds and E episodes, NaN where unknown; `name` is the
-    metric's.
+    `values` are (S, E), by S seeds of the channel's random draws and E episodes, NaN where unknown;
+    `name` is the metric's.
     """
     if entry(name).interval == "rate":
         return in_range(name, seed_rate_interval(values))
@@ -37,8 +37,8 @@ def over_seeds(name: str, values: Floats) -> Estimate:
 def over_episodes(name: str, values: Floats) -> Estimate:
     """Return the mean of a metric's values with a 95 % interval over episodes.
 
-    `values` are (S, E), by S channel seeds and E episodes, NaN where unknown; `name` is the
-    metric's.
+    `values` are (S, E), by S seeds of the channel's random draws and E episodes, NaN where unknown;
+    `name` is the metric's.
     """
     means = known_mean(values, axis=0)
     rate = entry(name).interval == "rate"
@@ -49,8 +49,9 @@ def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float =
     """Return the difference a - b of a metric with its interval over episodes.
 
     `pairs` has the metric's values a and b of the same episodes, (E, S) each, by E episodes and S
-    channel seeds: one pair, or of balanced success one for each half, with a danger and without, in
-    which the episodes of the other half are NaN. `level` is the confidence of the interval.
+    seeds of the channel's random draws: one pair, or of balanced success one for each half, with a
+    danger and without, in which the episodes of the other half are NaN. `level` is the confidence
+    of the interval.
     """
     if entry(name).interval != "rate":
         ((a, b),) = pairs
@@ -64,9 +65,10 @@ def difference(name: str, pairs: Sequence[tuple[Floats, Floats]], level: float =
 def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False) -> Estimate:
     """Return a metric's estimate: for balanced success the mean of those of its two halves.
 
-    A half is the episodes with a danger, or those without. `estimate` returns the estimate of the
-    metric with a name. Halves have no episode in common, so that their intervals are independent.
-    `shared` says that they share units, such as seeds: n is then that of each half, else the sum.
+    A half is the episodes with a danger (a vehicle that would meet a cruising ego), or those
+    without. `estimate` takes the name of a metric and returns its estimate. Halves have no episode
+    in common, so that their intervals are independent. `shared` says that they share units, such as
+    seeds: n is then that of each half, else the sum. For any other metric it is `estimate(name)`.
     """
     halves = entry(name).halves
     if not halves:
@@ -82,14 +84,18 @@ def halved(name: str, estimate: Callable[[str], Estimate], shared: bool = False)
 def p_value(name: str, pairs: Sequence[tuple[Floats, Floats]]) -> float | None:
     """Return the p-value of no difference in a metric; None if the difference has no interval.
 
-    `pairs` has the values of both sides, (E, S) each, as `difference` takes them: E episodes by S
-    channel seeds.
+    `name` is the metric's. `pairs` has the values of both sides for the same episodes, (E, S) each,
+    by E episodes and S seeds of the channel's random draws: one pair, or for balanced success one
+    for each half of the episodes, with a danger and without.
     """
     return multiplicity.p_value(lambda level: difference(name, pairs, level))
 
 
 def in_range(name: str, e: Estimate) -> Estimate:
-    """Return an estimate with its interval cut to the metric's range, from 0 to `most`."""
+    """Return an estimate with its interval cut to what the metric can be, from 0 to its `most`.
+
+    `name` is the metric's, and `e` the estimate.
+    """
     low, high = float(np.maximum(e.low, 0.0)), float(np.minimum(e.high, entry(name).most))
     return Estimate(e.value, low, high, e.n, e.n_excluded)
 

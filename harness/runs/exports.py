@@ -32,7 +32,7 @@ class Option:
 
 @runtime_checkable
 class Export(Protocol):
-    """Describe an export format that an extension adds: a run as a file of another program.
+    """Describe a format that an extension adds, in which a run is written for another program.
 
     `help` is the help of its command-line option, `doing` what is said while it writes, and `needs`
     the names of the optional modules without which it cannot.
@@ -45,7 +45,7 @@ class Export(Protocol):
     needs: tuple[str, ...]
 
     def write(self, run: Run, file: Path, dataset: Path | None, **options: Any) -> Path:
-        """Write a run to a file and return it.
+        """Write a run to a file in this format, and return the file.
 
         `dataset` is the folder of the run's dataset, if the user named one; `options` holds the
         values of the format's further options by name, with `_` for `-`.
@@ -65,6 +65,8 @@ class Exports(Plugins[Export]):
     words for what is allowed.
     """
 
+    # what packages' formats must have, by attribute: a test of its value, and words for what is
+    # allowed
     stated: ClassVar = {
         "help": of_type(str),
         "doing": of_type(str),
@@ -77,6 +79,9 @@ EXPORTS = Exports("swarmdrive.exports", Export, {})
 
 
 def options_of(format: Export) -> Mapping[str, Option]:
-    """Return the further command-line options of an export format by name; empty if it has none."""
+    """Return the further command-line options of an export format, by name.
+
+    It is empty if the format has none.
+    """
     options: Mapping[str, Option] = getattr(format, "options", MappingProxyType({}))
     return options

@@ -15,7 +15,9 @@ from harness.runs.records import Episode
 class Grid:
     """Hold the conditions, seeds and episodes of a run: the axes (C, S, E) of its figures.
 
-    Each combination is a cell: one episode under one condition with one seed.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages; seeds are those of the radio channel's random draws. Each combination is a cell: one
+    episode under one condition with one seed.
     """
 
     conditions: tuple[str, ...]  # names of the C conditions, operating points of the run
@@ -27,9 +29,10 @@ class Grid:
         return len(self.conditions), len(self.seeds), len(self.episodes)
 
     def places(self, decisions: Decisions) -> Ints:
-        """Return the index of each of n decisions' cells in a flattened array (C, S, E), (n,).
+        """Return the cell of the run that each of n decisions is in, an index, (n,).
 
-        Raises ValueError for a decision outside the grid.
+        A cell is one episode under one condition with one seed; the index is that in a flattened
+        array (C, S, E) of all. Raises ValueError for a decision outside the grid.
         """
         condition = decisions.codes("condition", self.conditions)
         seed, episode = (
@@ -39,9 +42,9 @@ class Grid:
         return np.ravel_multi_index((condition, seed, episode), self.shape)
 
     def ordered(self, episodes: Sequence[Episode]) -> list[Episode]:
-        """Return the episodes in the order of the cells: by condition, seed and episode.
+        """Return the episodes' records by condition, then seed, then number.
 
-        Raises ValueError unless each cell has exactly one.
+        It is the order of arrays (C, S, E). Raises ValueError unless there is exactly one for each.
         """
         by_cell = {(e.condition, e.seed, e.episode): e for e in episodes}
         cells = [*product(self.conditions, self.seeds, self.episodes)]

@@ -18,9 +18,10 @@ IN_WORDS = {SUCCESS: "success", BALANCED: "balanced success"}
 
 
 class Scored(Protocol):
-    """Describe what has scores, one for each metric and condition: a run, or a suite of several.
+    """Describe what has scores, one for each metric and condition: a run, or several together.
 
-    A condition is a named set of settings of channel, asking and fusion.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
 
     @property
@@ -38,7 +39,7 @@ def headline_metric(*names: Container[str]) -> str:
 
 
 def headline_of(*runs: Scored) -> str:
-    """Return the name of the metric by which runs are read, the headline metric.
+    """Return the name of the metric by which some runs or suites are read, the headline metric.
 
     It is balanced success, the mean of success with a danger and without, if all of them have a
     value of it; otherwise plain success. A danger is a vehicle that would meet an ego which keeps
@@ -51,11 +52,10 @@ def headline_of(*runs: Scored) -> str:
 
 
 def best_of(success: Mapping[str, float], radios: Container[str], doubted: Container[str]) -> str:
-    """Return the name of the condition with the highest success; empty if there is none.
+    """Return the name of the condition under which a run does best; empty if there is none.
 
-    A condition is a named set of settings of channel, asking and fusion that a run scores. Of
-    equals it is the first. Conditions with a warning do not count if another one with a radio is
-    left.
+    A condition is a named set of settings that a run scores. It is that with the highest success,
+    of equals the first. One with a warning does not count if another one with a radio is left.
 
     Args:
         success: success from 0 to 1 by condition.

@@ -35,12 +35,12 @@ class Listed:
 
     `name` is its folder, `kind` what made it (`eval`, `drive`, `suite`, or a study's word), and
     `tags` words by which to find it; `model`, `prompt` and `answer` name the model, prompt version
-    and answer mode. `condition` is the condition (named set of settings of channel, asking and
-    fusion) with the highest success that no warning is about, `success` that success, 0 to 1, by
-    the metric `metric`, and `low` and `high` the ends of its 95 % interval. `unread` is the share
-    of the ego's answers that could not be parsed. `state` says whether it is finished or broken,
-    and `why` how an unfinished run goes on, or what is wrong with a broken one. `date` is when it
-    began, or a study was last written.
+    and answer mode. `condition` is the condition (named set of settings of the radio, of asking
+    helpers and of fusing their messages) with the highest success that no warning is about,
+    `success` that success, 0 to 1, by the metric `metric`, and `low` and `high` the ends of its 95
+    % interval. `unread` is the share of the ego's answers that could not be parsed. `state` says
+    whether it is finished or broken, and `why` how an unfinished run goes on, or what is wrong with
+    a broken one. `date` is when it began, or a study was last written.
     """
 
     name: str  # its folder, relative to the folder that is listed
@@ -199,7 +199,7 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
 
 
 def own_name(name: str) -> bool:
-    """Return whether a name can be that of a run's folder in a list: one visible name, no path."""
+    """Return whether a text can be the name of a run's folder in a list: visible, and no path."""
     return os.path.basename(name) == name and not name.startswith(".") and name != ""
 
 

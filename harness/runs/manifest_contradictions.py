@@ -10,10 +10,10 @@ from harness.runs.records import Answer
 
 
 def of_manifest(run: Run, answers: Iterable[Answer], *, current: bool) -> Iterator[str]:
-    """Yield a sentence for each statement of a run's manifest that the run itself contradicts.
+    """Yield a sentence for each statement of a run's `run.json` that the run's own data contradict.
 
-    `answers` are the run's. A run that is not `current`, by earlier rules for figures, may lack
-    records, and its times of answers are not compared.
+    Such is a number of episodes. `answers` are the run's. A run that is not `current`, by earlier
+    rules for figures, may lack records, and its times of answers are not compared.
     """
     answers = list(answers)
     yield from _of_counts(run, answers)

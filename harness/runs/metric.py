@@ -31,9 +31,9 @@ class Metric:
     The function is one of these: `decisions` takes a table of n decisions and returns a value each,
     (n,), whose mean (sum, if `total`) is the episode's; `episodes` takes an episode's record and
     returns its value; `answers` takes the n answers of a `role` and returns a value each; `pooled`
-    names a figure of all decisions together. `percentile` is that of their latencies, and `halves`
-    names two metrics, with a danger and without, whose mean it is. One without any is computed
-    where `summary.csv` is made.
+    computes one figure of all decisions together. `percentile` is that of their latencies, and
+    `halves` names two metrics, with a danger and without, whose mean it is. One without any is
+    computed where `summary.csv` is made.
 
     `better` says which change is better (`higher`, `lower`, `neither`), `interval` whether it is a
     share (`rate`) or a mean, and `most` is the greatest value. `primary` ones are those that
@@ -50,27 +50,31 @@ class Metric:
     better: Better  # which change of it is better
     # `rate` for a share of events, whose interval is Wilson's; `mean` for Student's t
     interval: Literal["rate", "mean"] = "mean"
-    most: float = math.inf  # the greatest value that it can have
-    # whether the p of its differences is corrected (decision 0084); all others are exploratory
+    most: float = math.inf  # the greatest value that it can have, such as 1 for a share
+    # whether comparisons of runs are judged by it, with p-values corrected for multiple testing;
+    # all others are exploratory
     primary: bool = False
     label: str = ""  # its name for people; by default the name with spaces
-    # returns its values for decisions (n,), whose mean is the episode's
+    # takes a table of n decisions and returns its values, (n,), whose mean is the episode's
     decisions: Callable[[Any], Floats] | None = None
-    # returns an episode's value; None where unknown
+    # takes an episode's record and returns its value; None where unknown
     episodes: Callable[[Episode], Any] | None = None
-    # returns its values for the answers (n,) of one role; NaN where unknown
+    # takes the n answers of one role and returns its values, (n,); NaN where unknown
     answers: Callable[[Answers], Floats] | None = None
-    role: Role | None = None  # whose answers
+    # role whose answers it is of: `ego`, `helper`, or `merge` (the ego after it heard messages)
+    role: Role | None = None
     percentile: int | None = None  # the percent of all decisions whose latency is at most so long
-    # returns its value for all decisions, which has no mean
+    # computes a figure of all decisions together, which is no mean, such as `reliability.coverage`
     pooled: reliability.Figure | None = None
     total: bool = False  # whether an episode has the sum over its decisions instead of the mean
-    world: World | None = None  # the world in which it is known; None for every world
+    # the only kind of run that knows it, `frozen` (recorded scenes) or `closed-loop`; None for both
+    world: World | None = None
     optional: bool = False  # whether a run in which it is nowhere known has no row of it
     half: bool = False  # whether it is of the episodes with a danger alone, or of those without
     # names of two metrics whose mean it is: of the episodes with a danger, and of those without
     halves: tuple[str, ...] = ()
-    # the metric that it corrects by the layouts' difficulty, where two runs are compared
+    # name of the metric that it corrects, where two runs are compared, by how hard start situations
+    # are; empty for none
     corrects: str = ""
     # whether another has taken its place: tables and, where it is still computed, comparisons keep
     # it, and pages leave it out
@@ -111,5 +115,8 @@ def decision_share(
 
 
 def of_column(name: str) -> Callable[[Columns], Floats]:
-    """Return the function that takes a table of n decisions and returns its column `name`, (n,)."""
+    """Return a function that takes a table of n decisions and returns its column `name`, (n,).
+
+    It is for metrics that are one column.
+    """
     return lambda d: d[name]

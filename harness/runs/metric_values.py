@@ -20,10 +20,11 @@ from harness.runs.records import Episode
 def by_episode(
     metrics: Sequence[Metric], grid: Grid, decisions: Decisions, episodes: Sequence[Episode]
 ) -> dict[str, Floats]:
-    """Return each metric's values by its name, (C, S, E); NaN where unknown.
+    """Return the value of each metric in each episode, by the metric's name, (C, S, E).
 
-    The axes are those of the grid: C conditions, S channel seeds and E episodes, and `episodes`, of
-    one record for each, are in that order.
+    The axes are those of the grid: C conditions, S channel seeds and E episodes; `episodes`, a
+    record of how each ended, are in that order. `decisions` are those of all episodes. NaN where
+    unknown.
     """
     places = grid.places(decisions)
 
@@ -36,10 +37,10 @@ def by_episode(
 
 
 def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
-    """Return a metric's values from how episodes ended, (C, S, E); NaN where unknown.
+    """Return a metric's value in each episode from how the episodes ended, (C, S, E).
 
-    The axes are those of the grid: C conditions, S channel seeds and E episodes, and `episodes`, of
-    one record for each, are in that order.
+    NaN where unknown. The axes are those of the grid: C conditions, S seeds of the channel's random
+    draws and E episodes; `episodes`, a record of each, are in that order.
     """
     function = metric.episodes
     assert function
@@ -52,7 +53,7 @@ def of_ends(metric: Metric, grid: Grid, episodes: Sequence[Episode]) -> Floats:
 
 
 def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Floats:
-    """Return a metric's value for each of n episodes, (n,), from m decisions; NaN where unknown.
+    """Return a metric's value for each of n episodes, (n,), from their m decisions; NaN if unknown.
 
     `places`, (m,), is the index from 0 to n - 1 of each decision's episode.
     """
@@ -98,9 +99,10 @@ def by_danger(success: Floats, dangerous: Bools) -> dict[str, Floats]:
 
 
 def known_in(values: Mapping[str, Floats]) -> list[str]:
-    """Return the names of the metrics that a run with these values by episode states, in order.
+    """Return the names of the metrics that a run with these values states, in order.
 
-    Metrics of one half (with or without a danger) are stated only if there are episodes of both.
+    `values` has each metric's values by episode. Metrics of one half (with or without a danger) are
+    stated only if there are episodes of both.
     """
     names = {name for name, v in values.items() if not (entry(name).optional and np.isnan(v).all())}
     both = names.issuperset(entry(BALANCED).halves)

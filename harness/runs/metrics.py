@@ -24,6 +24,8 @@ class Metrics(Plugins[Metric]):
     words for what is allowed.
     """
 
+    # what packages' metrics must have, by attribute: a test of its value, and words for what is
+    # allowed
     stated: ClassVar = {
         "meaning": of_type(str),
         "label": of_type(str),
@@ -87,7 +89,7 @@ def metrics_of(world: World) -> tuple[Metric, ...]:
 
 @lru_cache(1024)
 def entry(name: str) -> Metric:
-    """Return the metric of a name; a plain one without a meaning if it is not registered.
+    """Return the metric of a name; for one that is unknown here, a plain one without a meaning.
 
     Such a name may stand in a run that another version of the harness made.
     """

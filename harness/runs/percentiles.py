@@ -22,7 +22,7 @@ Decided = tuple[Ints, Floats]  # the episode's index and the value of each decis
 
 
 def percentiles(latency_ms: Floats) -> Floats:
-    """Return the `PERCENTILES` of latencies (n,), ms; NaN if none is known.
+    """Return the `PERCENTILES`, such as the 95th, of latencies (n,), ms; NaN if none is known.
 
     Unknown latencies, which are NaN, are left out.
     """

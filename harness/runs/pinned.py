@@ -15,13 +15,13 @@ KIND = "episodes"  # of its intervals
 
 
 def mean_difference(pairs: Pairs) -> Estimate:
-    """Return the mean over families of success a - b, by the rules of the oldest runs.
+    """Return the mean difference in success a - b by the rules of the oldest runs, to check these.
 
-    They are version 1 of the rules for figures; `harness.core.versions.FIGURES` has today's. A
-    family is the scenes of one scenario. `pairs` has for each its rule of how success is averaged
-    and the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes. The
-    interval of each half of a family, with a danger or without, is computed apart, and these are
-    combined.
+    They are version 1 of the rules for figures; `harness.core.versions.FIGURES` has today's. It is
+    the mean over families; a family is the scenes of one scenario. `pairs` has for each its rule of
+    how success is averaged and the success a and b of its episodes, (S, E) each, by S seeds of the
+    channel's random draws and E episodes. The interval of each half of a family, with a danger or
+    without, is computed apart, and these are combined.
     """
     families = []
     for success, a, b in pairs:
@@ -31,11 +31,12 @@ def mean_difference(pairs: Pairs) -> Estimate:
 
 
 def gain(run: Run, score: Score) -> Score:
-    """Return a run's gain over the condition without a radio, by the rules of the oldest runs.
+    """Return a run's gain over the condition without a radio by the oldest rules, to check it.
 
-    They are version 1 of the rules for figures; `harness.core.versions.FIGURES` has today's.
-    `score` is a score of the run's whose condition and metric are taken; its value is not. A
-    condition is a named set of settings of channel, asking and fusion.
+    A gain is the difference in success of the same episodes. The rules are version 1 of those for
+    figures; `harness.core.versions.FIGURES` has today's. `score` is a score of the run whose
+    condition and metric are taken; its value is not. A condition is a named set of settings of the
+    radio, of asking helpers and of fusing their messages.
     """
     success, values = by_condition(run.grid, run.episodes)
     counted = success if score.metric == GAINS[BALANCED] else success.plain

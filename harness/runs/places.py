@@ -6,9 +6,10 @@ from harness.core.arrays import Floats, Ints
 
 
 def sum_by_place(values: Floats, places: Ints, n: int) -> Floats:
-    """Return the sum of the known values of each of n groups, such as episodes, (n,).
+    """Return the sum of the known values in each of n groups, such as over an episode, (n,).
 
-    `places`, (m,), is the group of each of m `values`, (m,): an index from 0 to n - 1.
+    `places`, (m,), is the group of each of m `values`, (m,): an index from 0 to n - 1. NaN are left
+    out; the sum of no value is 0.
     """
     return np.bincount(places, weights=np.nan_to_num(values), minlength=n).astype(float)
 

@@ -41,8 +41,9 @@ AT_ONCE = 1 << 17  # how many numbers of resamples are summed at once: they stay
 def mass(p: Floats, optimal: Bools) -> Floats:
     """Return the probability that policies give to all optimal actions together, (...).
 
-    A policy, `p`, is the probabilities of A actions in a decision, (..., A), and `optimal` is the
-    mask of actions after which success is still possible, (..., A). NaN where no action is optimal.
+    It is a score of probabilities: 1 is best. A policy, `p`, is the probabilities of A actions in a
+    decision, (..., A), and `optimal` is the mask of actions after which success is still possible,
+    (..., A). NaN where no action is optimal.
     """
     # rounding may lift it above 1
     total = np.minimum(np.sum(np.where(optimal, p, 0.0), axis=-1), 1.0)
@@ -61,11 +62,12 @@ def brier(p: Floats, optimal: Bools) -> Floats:
 
 
 def likelihood_nats(p: Floats, optimal: Bools) -> Floats:
-    """Return -ln of the probability of the optimal actions together (Good 1952), (...).
+    """Return the logarithmic score of policies: -ln of the optimal actions' probability, (...).
 
-    A policy, `p`, is the probabilities of A actions in a decision, (..., A), and `optimal` is the
-    mask of actions after which success is still possible, (..., A). NaN where no action is optimal.
-    A probability below `LEAST_P` counts as that, so that it is 5.3 nats at most.
+    It is in nats, 0 is best (Good 1952). A policy, `p`, is the probabilities of A actions in a
+    decision, (..., A), and `optimal` is the mask of actions after which success is still possible,
+    (..., A). NaN where no action is optimal. A probability below `LEAST_P` counts as that, so that
+    it is 5.3 nats at most.
     """
     return np.asarray(-np.log(np.maximum(mass(p, optimal), LEAST_P)))
 
@@ -99,11 +101,11 @@ class Judged:
 
     @classmethod
     def of(cls, p: Floats, optimal: Bools, episode: Ints) -> "Judged":
-        """Return those of n decisions that have exactly one optimal action.
+        """Return how sure and how right those decisions are that have exactly one optimal action.
 
-        `p` are the decisions' policies, probabilities of A actions, (n, A), `optimal` is the mask
-        of actions after which success is still possible, (n, A), and `episode`, (n,), the index of
-        each decision's episode.
+        They are chosen from n. `p` are the decisions' policies, probabilities of A actions, (n, A),
+        `optimal` is the mask of actions after which success is still possible, (n, A), and
+        `episode`, (n,), the index of each decision's episode.
         """
         hits = right(p, optimal)
         is_judged = ~np.isnan(hits) & (optimal.sum(axis=-1) == 1)
@@ -111,9 +113,10 @@ class Judged:
 
     @classmethod
     def joined(cls, parts: Sequence["Judged"], sizes: Sequence[int]) -> "Judged":
-        """Join decisions of parts of a run; `sizes` are the numbers of episodes in the parts.
+        """Join the decisions of several parts of a run, as if they were of one.
 
-        Episodes are counted through: the first of a part follows the last of the part before.
+        `sizes` are the numbers of episodes in the parts. Episodes are counted through: the first of
+        a part follows the last of the part before.
         """
         starts = np.cumsum([0, *sizes[:-1]])
         episode = [part.episode + start for part, start in zip(parts, starts, strict=True)]
@@ -122,9 +125,10 @@ class Judged:
         return cls(sure, hits, np.concatenate(episode))
 
     def bins(self) -> Ints:
-        """Return the number from 0 of each of n decisions' bin, (n,); those in a bin are as sure.
+        """Return in which bin of like confidence each of n decisions is, its number from 0, (n,).
 
-        There are `BINS` bins of about as many decisions each; `calibration_error` uses the same.
+        There are `BINS` bins of about as many decisions each, as a reliability diagram shows them;
+        `calibration_error` uses the same.
         """
         levels, level = np.unique(-self.sure, return_inverse=True)
         return np.asarray(_bins(np.bincount(level, minlength=len(levels))[None])[0][level])
@@ -136,8 +140,9 @@ Figure = Callable[[Floats, Floats, Floats], Floats]
 def decisions(count: Floats, hits: Floats, sure: Floats) -> Floats:
     """Return the number of decisions in each of R bootstrap resamples, (R,).
 
-    All arguments are (R, L), by resample and by L levels of how sure decisions are: `count` is how
-    many decisions there are; `hits`, how many of these are right, and `sure` are not used.
+    It is a figure of the same form as `calibration_error` and `coverage`, so all arguments are (R,
+    L), by resample and by L levels of how sure decisions are: `count` is how many decisions there
+    are; `hits`, how many of these are right, and `sure`, the sum of their confidence, are not used.
     """
     return np.asarray(count.sum(axis=1))
 
@@ -178,11 +183,12 @@ def coverage(count: Floats, hits: Floats, sure: Floats) -> Floats:
 
 
 def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
-    """Return a figure of judged decisions, such as `coverage`, with its bootstrap interval.
+    """Return a figure of calibration, such as `coverage`, with its bootstrap interval.
 
-    `figure` is `decisions`, `calibration_error` or `coverage`; `episodes` is the number of all
-    episodes. A figure other than the number of decisions is unknown with fewer than `LEAST` of
-    these or from fewer than `LEAST_EPISODES` episodes.
+    `judged` has how sure and how right decisions are. `figure` is `decisions`, `calibration_error`
+    or `coverage`; `episodes` is the number of all episodes. A figure other than the number of
+    decisions is unknown with fewer than `LEAST` of these or from fewer than `LEAST_EPISODES`
+    episodes.
     """
     return estimates(judged, [figure], episodes)[0]
 
@@ -190,12 +196,12 @@ def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
 def estimates(
     judged: Judged, figures: Sequence[Figure], episodes: int, older: bool = False
 ) -> list[Estimate]:
-    """Return several figures of the same decisions, with intervals from the same resamples.
+    """Return several figures of calibration, with intervals from the same bootstrap resamples.
 
-    `figures` are among `decisions`, `calibration_error` and `coverage`; `episodes` is the number of
-    all episodes. With `older` they are computed as the oldest runs did (version 1 of
-    `harness.core.versions.FIGURES`): any number of episodes is enough, and a figure whose resamples
-    are all alike has an interval of no width.
+    `judged` has how sure and how right decisions are. `figures` are among `decisions`,
+    `calibration_error` and `coverage`; `episodes` is the number of all episodes. With `older` they
+    are computed as in the oldest runs (version 1 of `harness.core.versions.FIGURES`): any number of
+    episodes is enough, and a figure whose resamples are all alike has an interval of no width.
     """
     known_figures = [figure for figure in figures if _is_known(figure, judged, older)]
     values = []
@@ -208,8 +214,9 @@ def estimates(
 def difference(
     a: Judged, b: Judged, figure: Figure, episodes: int
 ) -> tuple[float, float, Estimate]:
-    """Return a figure, such as `coverage`, of run A, that of run B, and B - A with its interval.
+    """Return a figure of calibration, such as `coverage`, of runs A and B, and B - A.
 
+    The difference has an interval. `a` and `b` have how sure and how right the runs' decisions are.
     They are paired by episode: episodes in which either has no decision are left out. All are NaN
     if one is left with fewer than `LEAST` decisions or `LEAST_EPISODES` episodes. `episodes` is the
     number of all episodes.

@@ -16,30 +16,30 @@ HELPER = "helper"
 
 
 class RoleAgents(ABC):
-    """Say which agents answer for the vehicles of a role in place of the ego's; a base class.
+    """Say which models answer for the vehicles of a role in place of the ego's; a base class.
 
-    An agent is a model, its prompt and how it answers (`harness.evaluate.agent.Agent`); a role is
-    what a vehicle is asked as, such as `helper`. `chosen_by` names the settings that choose them.
-    Objects do not change.
+    With its prompt and its way of answering such a model is an agent
+    (`harness.evaluate.agent.Agent`); a role is what a vehicle is asked as, such as `helper`.
+    `chosen_by` names the settings that choose them. Objects do not change.
     """
 
     chosen_by: ClassVar[tuple[str, ...]]  # names of the settings of its extension that choose them
 
     @abstractmethod
     def opened(self, settings: Any, ego: Any) -> tuple[Any, ...]:
-        """Return the role's agents, each an `Agent`, which vehicles of the role take in turn.
+        """Return the models that answer for the role, which its vehicles take in turn.
 
-        There are none if the ego's answers for all. `settings` are the run's, a
-        `harness.runs.settings.Settings`, and `ego` is the ego's agent. Raises UserError for agents
-        that do not exist, or do not go together.
+        Each is an `Agent`, with its prompt and its way of answering. There are none if the ego's
+        answers for all. `settings` are the run's, a `harness.runs.settings.Settings`, and `ego` is
+        the ego's `Agent`. Raises UserError for agents that do not exist, or do not go together.
         """
 
     @abstractmethod
     def settings(self, ego: Any, agents: Sequence[Any]) -> dict[str, Any]:
-        """Return the values, by name, of the settings in `chosen_by` that open these agents.
+        """Return the settings that open these models again, values by name, for a run's record.
 
-        `ego` is the ego's `Agent`, and `agents` are the role's. An agent is a model, its prompt and
-        how it answers.
+        They are those in `chosen_by`. `ego` is the ego's `Agent`, and `agents` are the role's. An
+        agent is a model, its prompt and how it answers.
         """
 
     @abstractmethod
@@ -53,18 +53,18 @@ class RoleAgents(ABC):
 
     @abstractmethod
     def check(self, run: Any) -> None:
-        """Raise UserError if a run has agents that cannot answer for the role.
+        """Raise UserError if the models that a run has for this role cannot answer for it.
 
         `run` is a `harness.evaluate.spec.Spec`: a run that is about to begin, its settings opened.
-        An agent is a model, its prompt and how it answers.
         """
 
     @abstractmethod
     def unlike(self, run: Any) -> str | None:
-        """Return why the ego's prompt cannot show messages of a run's agents, or None if it can.
+        """Return why the ego's prompt cannot show messages of helpers' models, or None if it can.
 
         `run` is a `harness.evaluate.spec.Spec`: a run that is about to begin, its settings opened.
-        An agent is a model, its prompt and how it answers.
+        The models of its helpers, with prompt and way of answering, may give answers of another
+        form than the prompt takes.
         """
 
 
@@ -72,10 +72,10 @@ AGENTS = Shipped[RoleAgents]("swarmdrive.agents", RoleAgents, {})
 
 
 def of_helpers() -> RoleAgents:
-    """Return the object that says which agents answer for helpers in place of the ego's.
+    """Return what says which models answer for helpers in place of the ego's.
 
-    An agent is a model, its prompt and how it answers. Raises UserError if no installed extension
-    adds one.
+    It is an object of the extension that adds such models, each with its prompt and its way of
+    answering. Raises UserError if no installed extension adds one.
     """
     if HELPER in AGENTS:
         return AGENTS[HELPER]
@@ -94,9 +94,9 @@ def opened(settings: Any, ego: Any) -> tuple[Any, ...]:
 
 
 def settings() -> tuple[str, ...]:
-    """Return the names of the settings of extensions that give helpers agents of their own.
+    """Return the names of the settings that give helpers models of their own.
 
-    An agent is a model, its prompt and how it answers.
+    Extensions add them; without any, the ego's model answers for helpers.
     """
     return AGENTS[HELPER].chosen_by if HELPER in AGENTS else ()
 

@@ -73,17 +73,18 @@ def read_part(
 
 
 def facts_of(part: Path) -> list[AnswerFacts]:
-    """Return the answers of a part of a run, without their texts.
+    """Return the answers in the folder of a part of a run, without their texts.
 
-    Raises UserError if the file is broken.
+    A part is some of the run's episodes, as one worker finished them. Raises UserError if the file
+    is broken.
     """
     return whole(part, lambda part: _FACTS.decode_lines(bytes_of(part / "answers.jsonl", "rows")))
 
 
 def ends_of(part: Path) -> tuple[Episode, ...]:
-    """Return the episodes of a part of a run, each with its outcome.
+    """Return how the episodes of a part of a run ended, a record of each.
 
-    Raises UserError if the file is broken.
+    A part is a folder of some of the run's episodes. Raises UserError if the file is broken.
     """
     return whole(part, lambda part: records_of(part / "episodes.csv", Episode))
 
@@ -94,19 +95,23 @@ def _read_tables(part: Path, actions: Sequence[str]) -> tuple[Decisions, tuple[E
 
 
 def decisions_of(parts: Sequence[Path], actions: Sequence[str]) -> DecisionFiles:
-    """Return the decisions of all parts of a run, as files that are read one at a time.
+    """Return the decisions of all parts of a run as files, which are read one at a time.
 
-    `parts` are the parts' folders, and `actions` the names of the meta-actions.
+    A part is a folder of some of the run's episodes, as one worker finished them. `parts` are the
+    folders, and `actions` the names of the meta-actions.
     """
     return DecisionFiles([part / "decisions.parquet" for part in parts], tuple(actions))
 
 
 def answers_in(part: Path) -> int:
-    """Return the number of answers in the folder of a part of a run."""
+    """Return the number of answers in the folder of a part, some of a run's episodes."""
     return bytes_of(part / "answers.jsonl", "rows").count(b"\n")
 
 
 def lines_of(parts: Iterable[Path]) -> Iterator[bytes]:
-    """Yield the content of `answers.jsonl` of each part of a run, in the order of their folders."""
+    """Yield the answers of each part of a run as lines of JSON, to make its `answers.jsonl`.
+
+    A part is a folder of some of the run's episodes; the order is that of `parts`.
+    """
     for part in parts:
         yield bytes_of(part / "answers.jsonl", "rows")

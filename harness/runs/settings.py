@@ -312,7 +312,7 @@ class Option(NamedTuple):
 
     @property
     def off(self) -> str:
-        """Return the text that turns the option off, if it is a flag."""
+        """Return what is typed to turn a yes-or-no option off, such as `--no-flip`."""
         return "--no-" + self.name.replace("_", "-")
 
     def of(self, settings: Any) -> Any:
@@ -374,9 +374,9 @@ def core_options(world: type[Struct]) -> list[Option]:
 
 
 def of_extensions() -> dict[str, Setting]:
-    """Return the settings that extensions add, by name.
+    """Return the settings of runs that extensions add, by name.
 
-    One with a name of the core's settings is left out.
+    One that has the name of a setting of the core is left out.
     """
     joined = extensions.joined(HELP, "settings")
     return {name: setting for name, setting in joined.items() if name not in HELP}
@@ -453,7 +453,8 @@ def changed(settings: Settings, given: Mapping[str, Any]) -> Settings:
 def deciding(settings: Settings) -> Settings:
     """Return the settings that must be equal when a stopped run resumes.
 
-    All others, such as tags and the addresses of servers, are set to their defaults.
+    All others, such as tags and the addresses of servers, are set to their defaults, so that two
+    results can be compared.
     """
     declared = options(type(settings.world))
     free = {option.name: option.default for option in declared if option.same == NOTHING}
@@ -474,9 +475,10 @@ def words(settings: Settings) -> tuple[str, ...]:
 
 
 def difference(before: Settings, now: Settings) -> tuple[str, str]:
-    """Return the options that differ, as they are typed before and now, as two texts.
+    """Return the options in which a stopped run and the command typed now differ, as two texts.
 
-    Those that may differ when a run resumes are left out; both are empty for different commands.
+    They are as typed `before` and `now`. Those that may differ when a run resumes are left out;
+    both texts are empty for different commands.
     """
     if type(before.world) is not type(now.world):
         return "", ""
@@ -490,9 +492,10 @@ def difference(before: Settings, now: Settings) -> tuple[str, str]:
 
 
 def of_words(typed: Sequence[str]) -> Settings:
-    """Return the settings of a command line, given as words, the program's name first.
+    """Return the settings that a command line gives, for the `command` that a run states.
 
-    Raises UserError if `words` would not write it.
+    `typed` has its words, the program's name first. Raises UserError if `words` would write the
+    settings otherwise.
     """
     try:
         kind = next(kind for kind, command in COMMANDS.items() if command == typed[1])
@@ -604,7 +607,7 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
 
 
 def otherwise(folder: Path, made_with: Settings) -> str | None:
-    """Return a sentence on settings of a folder's `run.toml` that the run was not made with.
+    """Return a sentence if a folder's `run.toml` has other settings than its run was made with.
 
     `made_with` are the settings in the run's `run.json`. None if the file agrees, or is missing.
     """

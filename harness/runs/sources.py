@@ -41,7 +41,10 @@ def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
 
 
 def read(out: Path) -> dict[str, bytes]:
-    """Return the content of the files in a run folder's `sources`, by path; links are left out."""
+    """Return the files that a run was made of, as its folder keeps them in `sources`.
+
+    They are prompts, models' descriptions and the like: content by path. Links are left out.
+    """
     kept = out / SOURCES
     files = sorted(path for path in kept.rglob("*") if path.is_file() and not path.is_symlink())
     return {file.relative_to(kept).as_posix(): bytes_of(file, "text") for file in files}
@@ -64,9 +67,10 @@ def prompt_of(run: Run, prompt_record: Mapping[str, Any]) -> Prompt | None:
 
 
 def lacking(run: Run) -> str | None:
-    """Return a sentence that names a prompt of the run which cannot be found; None if all are here.
+    """Return a sentence that names a prompt of a run which cannot be found; None if all are here.
 
-    A prompt is found if it is installed with the right digest, or stored in the run's folder.
+    A prompt is found if it is installed with the digest that the run states, or stored in its
+    folder.
     """
     for agent in (run.manifest.agent(0), *run.manifest.helpers):
         if prompt_of(run, agent["prompt"]) is None:

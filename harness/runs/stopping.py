@@ -51,19 +51,20 @@ class StoppingRule(ABC):
 
     @property
     def options(self) -> str:
-        """Return what is typed to choose this rule, for people."""
+        """Return what a user types to choose this rule, for messages."""
         return " and ".join(f"--{name.replace('_', '-')}" for name in self.settings())
 
     @abstractmethod
     def opened(self, settings: Mapping[str, Any]) -> "StoppingRule | None":
-        """Return the rule that a run's settings of extensions, by name, choose; None for none.
+        """Return this rule as a run's settings choose it; None if they choose none.
 
-        Raises UserError for a value that is not allowed.
+        `settings` has those of extensions, values by name, such as the level of confidence. Raises
+        UserError for a value that is not allowed.
         """
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """Return the values, by name, of the settings in `chosen_by` that choose this rule."""
+        """Return the settings that choose this rule, values by name, as a run states them."""
 
     @abstractmethod
     def check(self, run: Any) -> None:
@@ -74,9 +75,10 @@ class StoppingRule(ABC):
 
     @abstractmethod
     def planned_looks(self, layouts: int) -> Sequence[int]:
-        """Return after how many of a run's `layouts` the rule looks, ascending; the last is all.
+        """Return after how many of a run's layouts this rule tests whether these are enough.
 
-        At a look, after some of its layouts, a rule says whether these are enough.
+        The numbers ascend; the last is `layouts`, all of them. A layout is one start situation,
+        with one episode.
         """
 
     @abstractmethod
@@ -84,51 +86,53 @@ class StoppingRule(ABC):
         """Return whether a run may stop, by its episodes so far.
 
         `grid` has the conditions, seeds and layouts so far; `episodes` are in its order: by
-        condition, seed and layout. A condition is a named set of settings of channel, asking and
-        fusion. A layout is one start situation of a scenario.
+        condition, seed and layout. A condition is a named set of settings of the radio, of asking
+        helpers and of fusing their messages. A layout is one start situation of a scenario.
         """
 
     @abstractmethod
     def record(self, looks: InterimLooks) -> dict[str, Any]:
-        """Return what a run's manifest states of this rule and of the looks, values by name.
+        """Return what a run's manifest states of this rule and of when it tested, values by name.
 
-        At a look, after some of its layouts, a rule says whether these are enough.
+        At a look, after some of the run's layouts (start situations), the rule tests whether these
+        are enough.
         """
 
     @abstractmethod
     def looks(self, record: Mapping[str, Any]) -> InterimLooks:
-        """Return the looks of a run that has ended, given what its manifest states (`record`).
+        """Return when a run that has ended was tested for being enough, as its manifest states it.
 
-        At a look, after some of its layouts, the rule said whether these were enough. A layout is
-        one start situation of a scenario. Raises ValueError if `record` states no looks that can
-        be.
+        At a look, after some of its layouts (start situations), the rule said whether these were
+        enough. `record` is what the manifest states. Raises ValueError if it states no looks that
+        can be.
         """
 
     @abstractmethod
     def contradictions(
         self, record: Mapping[str, Any], grid: "Grid", episodes: "Sequence[Episode]"
     ) -> Iterator[str]:
-        """Yield a sentence on each statement of a run's last look that its episodes contradict.
+        """Yield a sentence for each statement of a run's last look that its episodes contradict.
 
-        `record` is what its manifest states; `episodes` are all of the run, in the order of the
-        grid: by condition, seed and layout. At a look, after some of its layouts, a rule says
-        whether these are enough.
+        At a look, after some of its layouts (start situations), a rule says whether these are
+        enough. `record` is what the run's manifest states of looks; `episodes` are all of the run,
+        in the order of the grid: by condition, seed and layout.
         """
 
     def unchecked(self, record: Mapping[str, Any]) -> str | None:
-        """Return what nobody can check of the looks that a run states, as a sentence, or None.
+        """Return a sentence on what nobody can check of the looks that a run states, or None.
 
-        `record` is what its manifest states. At a look, after some of its layouts, a rule says
-        whether these are enough.
+        At a look, after some of a run's layouts (start situations), a rule says whether these are
+        enough. `record` is what the run's manifest states.
         """
         return None
 
     @abstractmethod
     def sentence(self, record: Mapping[str, Any]) -> str:
-        """Return a sentence on when a run was looked at, and which of its intervals hold.
+        """Return a sentence for a report on when a run was tested for being enough.
 
-        `record` is what its manifest states. At a look, after some of its layouts, a rule says
-        whether these are enough.
+        It also says which of the run's intervals hold in spite of that. The rule tests after some
+        of the layouts (start situations) whether these are enough; `record` is what the run's
+        manifest states of it.
         """
 
     @abstractmethod
@@ -136,30 +140,31 @@ class StoppingRule(ABC):
         """Yield the further scores of a run that may stop, by intervals that hold at every look.
 
         `grid` has the run's conditions, seeds and layouts; `episodes` are in its order: by
-        condition, seed and layout. A condition is a named set of settings of channel, asking and
-        fusion. A layout is one start situation of a scenario. At a look, after some of its layouts,
-        a rule says whether these are enough.
+        condition, seed and layout. A condition is a named set of settings of the radio, of asking
+        helpers and of fusing their messages. A layout is one start situation of a scenario. At a
+        look, after some of its layouts, a rule says whether these are enough.
         """
 
     @abstractmethod
     def difference(self, success: "Success", a: "Floats", b: "Floats") -> "Estimate":
         """Return the difference in success a - b, with an interval that holds at every look.
 
-        `a` and `b` are the success of the same episodes, 0 or 1, (S, E), by S channel seeds and E
-        episodes, and are paired by episode. `success` says how episodes are averaged. At a look,
-        after some of its layouts, a rule says whether these are enough.
+        `a` and `b` are the success of the same episodes, 0 or 1, (S, E), by S seeds of the
+        channel's random draws and E episodes, and are paired by episode. `success` says how
+        episodes are averaged. At a look, after some of its layouts, a rule says whether these are
+        enough.
         """
 
 
 def looked_otherwise(
     rule: StoppingRule, looks: InterimLooks, grid: "Grid", episodes: "Sequence[Episode]"
 ) -> Iterator[str]:
-    """Yield a sentence for each way in which a run's interim looks are not what a rule makes of it.
+    """Yield a sentence for each way in which a run was looked at otherwise than its rule says.
 
-    `rule` is the run's stopping rule, and `looks` are what the run states: after how many layouts
-    it was looked at, and whether it stopped. `episodes` are all of the run, in the order of the
-    grid: by condition, seed and layout. A condition is a named set of settings of channel, asking
-    and fusion. A layout is one start situation of a scenario.
+    At a look, after some of its layouts (start situations), a stopping `rule` says whether these
+    are enough. `looks` are what the run states: after how many layouts it was looked at, and
+    whether it stopped. `episodes` are all of the run, in the order of the grid: by condition, seed
+    and layout.
     """
     planned = tuple(rule.planned_looks(looks.layouts)[: len(looks.at)])
     if looks.at != planned:

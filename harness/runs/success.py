@@ -45,11 +45,12 @@ class Success:
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], headline_metric: str) -> "Success":
-        """Return the rule for E episodes, given one record of each and the name of a metric.
+        """Return how success of a run's E episodes is averaged, plainly or balanced over dangers.
 
-        `headline_metric` is that of plain success, or of balanced; the rule is balanced only if it
-        names that, and there are episodes with a danger and without. A danger is a vehicle that
-        would meet an ego which keeps its speed.
+        `episodes` has one record of each. `headline_metric` names plain or balanced success, the
+        metric by which the run is read; the rule is balanced only if it names that, and there are
+        episodes with a danger and without. A danger is a vehicle that would meet an ego which keeps
+        its speed.
         """
         return cls(
             np.array(
@@ -59,7 +60,7 @@ class Success:
 
     @property
     def metric(self) -> str:
-        """Return the name of the metric of success that this rule computes, as in `summary.csv`.
+        """Return the name of the metric of success that this rule averages to, as in `summary.csv`.
 
         It is that of balanced success if there are episodes with a danger and without, else of
         plain success.
@@ -68,23 +69,30 @@ class Success:
 
     @property
     def words(self) -> str:
-        """Return the name of the metric of success that this rule computes, in words for people."""
+        """Return the name of the metric of success that this rule averages to, for people."""
         return IN_WORDS[self.metric]
 
     @property
     def plain(self) -> "Success":
-        """Return the rule that averages the same episodes plainly, be there a danger or not."""
+        """Return the rule that averages the same episodes plainly, with a danger or not.
+
+        A danger is a vehicle that would meet an ego which keeps its speed.
+        """
         return Success(np.zeros_like(self.dangerous))
 
     @property
     def ways(self) -> "tuple[Success, ...]":
-        """Return the plain rule, and then the balanced one if this is balanced."""
+        """Return the plain rule for the same episodes, then the balanced one if this is it.
+
+        A balanced mean is that of success with a danger and without.
+        """
         return (self.plain, self) if self.metric == BALANCED else (self,)
 
     def mean(self, success: Floats) -> float:
         """Return the mean of success, plain or balanced as this rule says.
 
-        `success` is 1 or 0 (NaN where unknown), (S, E), by S channel seeds and E episodes.
+        `success` is 1 or 0 (NaN where unknown), (S, E), by S seeds of the channel's random draws
+        and E episodes.
         """
         return float(
             np.mean([known_mean(known_mean(success[:, part], 0), 0) for part in self.parts])
@@ -93,7 +101,8 @@ class Success:
     def estimate(self, success: Floats) -> Estimate:
         """Return the mean of success with its 95 % interval over episodes.
 
-        `success` is 1 or 0 (NaN where unknown), (S, E), by S channel seeds and E episodes.
+        `success` is 1 or 0 (NaN where unknown), (S, E), by S seeds of the channel's random draws
+        and E episodes.
         """
         return self._mean(lambda part: over_episodes(SUCCESS, success[:, part]))
 
@@ -101,14 +110,15 @@ class Success:
         """Return the difference in mean success a - b, with an interval of confidence `level`.
 
         `a` and `b` are the success of the same episodes, such as under two conditions, (S, E), by S
-        channel seeds and E episodes. They are paired by episode.
+        seeds of the channel's random draws and E episodes. They are paired by episode.
         """
         return mean_difference([(self, a, b)], level)
 
     def p_value(self, a: Floats, b: Floats) -> float | None:
         """Return the p-value of no difference in success; None if that has no interval.
 
-        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes.
+        `a` and `b` are the success of the same episodes, (S, E), by S seeds of the channel's random
+        draws and E episodes.
         """
         return p_of_mean([(self, a, b)])
 
@@ -116,9 +126,9 @@ class Success:
         """Return the name with the highest success, then those not significantly below it.
 
         `successes` has by name, such as that of a condition, the success of the same episodes, (S,
-        E), by S channel seeds and E episodes. Not below it are names whose paired difference from
-        the best has a p above `LEVEL`, by Holm's method for all pairs since the best was picked, or
-        that have no p.
+        E), by S seeds of the channel's random draws and E episodes. Not below it are names whose
+        paired difference from the best has a p above `LEVEL`, by Holm's method for all pairs since
+        the best was picked, or that have no p.
         """
         best = max(successes, key=lambda name: self.mean(successes[name]))
         rest = [name for name in successes if name != best]
@@ -129,11 +139,12 @@ class Success:
         return [best, *close]
 
     def spread(self, a: Floats, b: Floats, counts: Ints) -> Spread:
-        """Return how much the difference in success b - a varies between episodes, by group.
+        """Return how much the difference in success b - a varies between episodes.
 
-        `a` and `b` are the success of the same episodes, (S, E), by S channel seeds and E episodes.
-        `counts` (..., E) says how often each episode counts in a bootstrap resample. Groups are all
-        episodes, or those with a danger and those without.
+        A power analysis needs it. `a` and `b` are the success of the same episodes, (S, E), by S
+        seeds of the channel's random draws and E episodes. `counts` (..., E) says how often each
+        episode counts in a bootstrap resample. The variance is given by group: of all episodes, or
+        of those with a danger and those without.
         """
         differences, parts = known_mean(b - a, 0), self.parts
         variances = [variance(differences[part], counts[..., part]) for part in parts]
@@ -142,9 +153,9 @@ class Success:
     def resampled(self, draws: np.random.Generator, times: int) -> Ints:
         """Return how often each of E episodes counts in bootstrap resamples, (1 + times, E).
 
-        There are `times` resamples after a first row, the sample itself. Episodes with and without
-        a danger are resampled apart. `draws` is the generator of random numbers. A danger is a
-        vehicle that would meet an ego which keeps its speed.
+        There are `times` resamples after a first row, the sample itself. Episodes with a danger (a
+        vehicle that would meet a cruising ego) and without are resampled apart. `draws` is the
+        generator of random numbers.
         """
         counts = np.empty((1 + times, len(self.dangerous)), dtype=np.int64)
         for part in self.parts:
@@ -152,9 +163,9 @@ class Success:
         return counts
 
     def weights(self, counts: Ints) -> Floats:
-        """Return the weight of each of E episodes in the mean, (..., E), if it counts so often.
+        """Return how much each of E episodes weighs in the mean, (..., E).
 
-        `counts`, (..., E), says how often, as in a bootstrap resample.
+        `counts`, (..., E), says how often each counts, as in a bootstrap resample.
         """
         shares = sum(part / (len(self.parts) * part.sum()) for part in self.parts)
         return np.asarray(counts * shares)
@@ -181,20 +192,22 @@ def by_condition(
 ) -> tuple[Success, dict[str, Floats]]:
     """Return how success of a run's episodes is averaged, and their success by condition, (S, E).
 
-    Success is 1 or 0, by S channel seeds and E episodes. `grid` has the run's conditions, seeds and
-    episodes, and `episodes` are in its order: by condition, seed and number; `headline_metric` is
-    the name of plain or of balanced success. A condition is a named set of settings of channel,
-    asking and fusion.
+    Success is 1 or 0, by S seeds of the channel's random draws and E episodes. `grid` has the run's
+    conditions, seeds and episodes, and `episodes` are in its order: by condition, seed and number;
+    `headline_metric` is the name of plain or of balanced success. A condition is a named set of
+    settings of the radio, of asking helpers and of fusing their messages.
     """
     values = dict(zip(grid.conditions, of_ends(METRICS[SUCCESS], grid, episodes), strict=True))
     return Success.of(episodes[: len(grid.episodes)], headline_metric), values
 
 
 def is_gain(score: Score, conditions: Container[str]) -> bool:
-    """Return whether a score is a gain, paired by episode, over the condition without a radio.
+    """Return whether a score is a gain: the difference to the condition without a radio.
 
-    `conditions` are names; it is none if the score's condition or that without a radio (`BASELINE`)
-    is not among them. A condition is a named set of settings of channel, asking and fusion.
+    Gains are paired by episode. `conditions` are the names of those that the run scores; it is no
+    gain if the score's condition, or that without a radio (`BASELINE`), is not among them. A
+    condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     has_conditions = score.condition in conditions and BASELINE in conditions
     return has_conditions and score.interval == PAIRED and score.metric in GAINS.values()
@@ -208,9 +221,10 @@ Pairs = Sequence[tuple[Success, Floats, Floats]]
 class Plays(Generic[Setting]):
     """Hold the success of the same episodes under several settings, by family of scenes.
 
-    A setting is what is compared, such as a condition's name; a family is the scenes of one
-    scenario. `families` has for each how its success is averaged, and by setting the success of its
-    episodes, 1 or 0, (S, E), by S channel seeds and E episodes.
+    It is what gains over a suite of scenarios are computed from. A setting is what is compared,
+    such as a condition's name; a family is the scenes of one scenario. `families` has for each how
+    its success is averaged, and by setting the success of its episodes, 1 or 0, (S, E), by S seeds
+    of the channel's random draws and E episodes.
     """
 
     # for each family how its success is averaged, and by setting the success of its episodes, 1 or
@@ -219,14 +233,19 @@ class Plays(Generic[Setting]):
 
     @property
     def plain(self) -> "Plays[Setting]":
-        """Return a copy in which every family's success is averaged plainly, not balanced."""
+        """Return a copy in which success is averaged plainly in every family of scenes.
+
+        Balanced, it would be the mean of that with a danger and without. A family is the scenes of
+        one scenario.
+        """
         return Plays([(rule.plain, success) for rule, success in self.families])
 
     def pairs(self, setting: Setting, base: Setting) -> Pairs:
-        """Return for each family how its success is averaged, and that of two settings, (S, E).
+        """Return for each family the success of the same episodes under two settings, to compare.
 
-        The success of `setting` comes first, then that of `base`, by S channel seeds and E
-        episodes.
+        An item is how the family's success is averaged, and the success of `setting` and that of
+        `base`, (S, E) each, by S seeds of the channel's random draws and E episodes. A family is
+        the scenes of one scenario.
         """
         return [(rule, success[setting], success[base]) for rule, success in self.families]
 
@@ -242,8 +261,8 @@ def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
     """Return the mean over families of the difference in success a - b, paired by episode.
 
     A family is the scenes of one scenario. `pairs` has for each how its success is averaged, and
-    the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes. The
-    interval, of confidence `level`, treats all families' episodes together.
+    the success a and b of its episodes, (S, E) each, by S seeds of the channel's random draws and E
+    episodes. The interval, of confidence `level`, treats all families' episodes together.
     """
     parts = []
     for success, a, b in pairs:
@@ -256,9 +275,9 @@ def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
     """Return the mean over families of success a - b in episodes with a danger, or without.
 
     A family is the scenes of one scenario. `pairs` has for each how its success is averaged, and
-    the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes. `dangerous`
-    chooses the episodes with a danger. A danger is a vehicle that would meet an ego which keeps its
-    speed.
+    the success a and b of its episodes, (S, E) each, by S seeds of the channel's random draws and E
+    episodes. `dangerous` chooses the episodes with a danger. A danger is a vehicle that would meet
+    an ego which keeps its speed.
     """
     parts = [known_mean(a - b, 0)[success.dangerous == dangerous] for success, a, b in pairs]
     return paired_difference(parts)
@@ -268,16 +287,17 @@ def p_of_mean(pairs: Pairs) -> float | None:
     """Return the p-value of no mean difference over families; None without an interval.
 
     A family is the scenes of one scenario. `pairs` has for each how its success is averaged, and
-    the success a and b of its episodes, (S, E) each, by S channel seeds and E episodes.
+    the success a and b of its episodes, (S, E) each, by S seeds of the channel's random draws and E
+    episodes.
     """
     return multiplicity.p_value(lambda level: mean_difference(pairs, level))
 
 
 def alike(successes: Sequence[Success]) -> list[Success]:
-    """Return rules of averaging success for several families, one each, which all are of one kind.
+    """Return rules of averaging success for several families, changed to be all of one kind.
 
     They are balanced if every given rule is, and else plain. A family is the scenes of one
-    scenario.
+    scenario, and has one rule.
     """
     balanced = all(success.metric == BALANCED for success in successes)
     return [success if balanced else success.plain for success in successes]

@@ -50,7 +50,8 @@ class SuiteRun:
 
     A family is the scenes of one scenario, as one dataset; `runs` has a run by its name, and `path`
     is the folder that holds the runs' folders. The runs have the same conditions and seeds. A
-    condition is a named set of settings of channel, asking and fusion.
+    condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
 
     path: Path  # the folder that holds the runs' folders
@@ -105,9 +106,10 @@ class SuiteRun:
 
     @cached_property
     def stated_scores(self) -> tuple[Score, ...]:
-        """Return the scores that the folder's `summary.csv` states, which `scores` computes.
+        """Return the means that the suite's `summary.csv` states, to compare with those computed.
 
-        Raises UserError if the file is missing or broken.
+        A mean is that of a metric over the suite's runs. Raises UserError if the file is missing or
+        broken.
         """
         return folder.whole(self.path / SUMMARY, folder.scores_of)
 
@@ -137,26 +139,26 @@ class SuiteRun:
         """Return a metric's mean over families in a condition; None if a family has no value.
 
         A family is the scenes of one scenario; condition and metric are names. A condition is a
-        named set of settings of channel, asking and fusion.
+        named set of settings of the radio, of asking helpers and of fusing their messages.
         """
         of_metric = (s for s in self.scores if (s.condition, s.metric) == (condition, metric))
         return next((s for s in of_metric if s.value is not None), None)
 
 
 def plays(runs: Iterable[Run], headline_metric: str) -> Plays[str]:
-    """Return the success of episodes by condition in runs that are each on another family.
+    """Return the success of episodes by condition in runs that are each on another scenario.
 
-    A family is the scenes of one scenario. `headline_metric` is the name of the metric by which the
-    runs are read: that of plain success or of balanced. A condition is a named set of settings of
-    channel, asking and fusion.
+    The scenes of one scenario are a family. `headline_metric` is the name of the metric by which
+    the runs are read: that of plain success or of balanced. A condition is a named set of settings
+    of the radio, of asking helpers and of fusing their messages.
     """
     return Plays([by_condition(run.grid, run.episodes, headline_metric) for run in runs])
 
 
 def mean(scores: Sequence[Score]) -> Score:
-    """Return the mean of one metric's scores, one of each of several families, with its interval.
+    """Return the mean of one metric's scores over several families of scenes, with its interval.
 
-    A family is the scenes of one scenario.
+    A family is the scenes of one scenario; `scores` has one score of each.
     """
     first = scores[0]
     return Score.of(
@@ -181,9 +183,9 @@ def contents_of(path: Path) -> Contents:
 def read(path: Path) -> SuiteRun:
     """Read a suite's folder and return its runs.
 
-    A suite is a run on each of several scenarios. A condition is a named set of settings of
-    channel, asking and fusion. Raises UserError if it holds no suite, or a run is not finished or
-    has another model, other conditions or other seeds than the first.
+    A suite is a run on each of several scenarios. Raises UserError if the folder holds no suite, or
+    a run is not finished or has another model, other conditions (sets of settings) or other seeds
+    than the first.
     """
     contents = contents_of(path)
     runs = {family: folder.read(path / name) for family, name in contents.families.items()}
@@ -213,7 +215,10 @@ def _shared_settings(run: Run) -> Any:
 
 
 def write(suite: SuiteRun) -> None:
-    """Write a suite's `summary.csv`, the means over families, and then its `suite.json`."""
+    """Write the table of means over a suite's runs, `summary.csv`, and then its `suite.json`.
+
+    A suite is a run on each of several scenarios; the second file marks it as finished.
+    """
     write_whole(suite.path / SUMMARY, csv_text(Score, suite.scores, suite.variant))
     families = {family: run.path.name for family, run in suite.runs.items()}
     contents = Contents(

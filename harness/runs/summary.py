@@ -34,11 +34,11 @@ from harness.runs.reliability import Judged, estimates
 class Figures:
     """Hold all that a run's scores are computed from, for some of its E episodes.
 
-    An episode is played under C conditions, named sets of settings of channel, asking and fusion,
-    and with S seeds of the channel's random numbers. `values` has each metric by name, (C, S, E),
-    and `latency_ms` the latencies of all decisions, an array (n,) for each condition and seed.
-    `judged` has for each condition its decisions with exactly one optimal action; `answers` come
-    with the number of their episode.
+    An episode is played under C conditions, named sets of settings of the radio, of asking helpers
+    and of fusing their messages, and with S seeds of the channel's random numbers. `values` has
+    each metric by name, (C, S, E), and `latency_ms` the latencies of all decisions, an array (n,)
+    for each condition and seed. `judged` has for each condition its decisions with exactly one
+    optimal action; `answers` come with the number of their episode.
     """
 
     grid: Grid  # the conditions, seeds and episodes
@@ -64,7 +64,8 @@ class Figures:
     ) -> "Figures":
         """Compute the figures of a run in a world, `frozen` (recorded scenes) or `closed-loop`.
 
-        A condition is a named set of settings of channel, asking and fusion.
+        A condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
 
         Args:
             world: the kind of world, which says what metrics there are.
@@ -91,7 +92,10 @@ class Figures:
 
     @classmethod
     def joined(cls, parts: Sequence["Figures"]) -> "Figures":
-        """Join the figures of parts of a run, which have different episodes, in their order."""
+        """Return the figures of a run from those of its parts, which have different episodes.
+
+        They are in the order of the parts.
+        """
         episodes = tuple(chain.from_iterable(part.grid.episodes for part in parts))
         values = {}
         for name in parts[0].values:
@@ -150,9 +154,9 @@ def of_conditions(
 def of_latencies(grid: Grid, latency_ms: Sequence[Floats]) -> Iterator[Score]:
     """Yield the scores of each condition's latency percentiles, in ms, as means over seeds.
 
-    `latency_ms` has an array of n decisions, (n,), for each condition and seed: all seeds of the
-    first condition, then of the second. A condition is a named set of settings of channel, asking
-    and fusion.
+    `grid` has the run's conditions and seeds. `latency_ms` has an array of n decisions, (n,), for
+    each condition and seed: all seeds of the first condition, then of the second. A condition is a
+    named set of settings of the radio, of asking helpers and of fusing their messages.
     """
     names = {m.percentile: m.name for m in METRICS.values() if m.percentile}
     all_percentiles = np.array([percentiles(latencies) for latencies in latency_ms])
@@ -170,7 +174,8 @@ def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
     An action is optimal if success is still possible after it, where it is possible at all. `cells`
     has for each of n decisions, (n,), the index of its condition, seed and episode in a flattened
     array (C, S, E) of the C conditions, S seeds and E episodes of `grid` (`Grid.places`). A
-    condition is a named set of settings of channel, asking and fusion.
+    condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
     condition, _, episode = np.unravel_index(cells, grid.shape)
@@ -234,7 +239,7 @@ def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator
 
 
 def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> list[Episode]:
-    """Return the episodes with the columns that are computed from decisions.
+    """Return the episodes' records, completed by what is counted in their decisions.
 
     These are counts and means such as messages, latency in ms and deadline misses. `episodes` and
     the result are in the order of the grid: by condition (named set of settings), channel seed and

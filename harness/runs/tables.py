@@ -56,7 +56,8 @@ class Tables:
     def summary(self) -> "pd.DataFrame":
         """Return `summary.csv`: one row for each condition, metric and kind of interval.
 
-        A condition is a named set of settings of channel, asking and fusion.
+        A condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         return self._csv("summary.csv")
 
@@ -64,7 +65,8 @@ class Tables:
     def episodes(self) -> "pd.DataFrame":
         """Return `episodes.csv`: one row for each episode, condition and seed.
 
-        A condition is a named set of settings of channel, asking and fusion.
+        A condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         return self._csv("episodes.csv")
 
@@ -94,7 +96,8 @@ class Tables:
     def decisions(self) -> "pd.DataFrame":
         """Return `decisions.parquet`: one row for each decision point, condition and seed.
 
-        A condition is a named set of settings of channel, asking and fusion.
+        A condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         return self.source.decisions.frame()
 

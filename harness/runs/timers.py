@@ -57,9 +57,10 @@ class Timer(ABC):
 
     @abstractmethod
     def speed(self, stated_speed: Any) -> Any:
-        """Return the speed that a run's record states, given its plain values, `stated_speed`.
+        """Return how fast a model answers, from the plain values that a run's record states of it.
 
-        A speed is how fast a model answers. Raises ValueError if it is none.
+        They are `stated_speed`; the result is an object of the timer's own. Raises ValueError if
+        they are no speed.
         """
 
     @abstractmethod
@@ -71,17 +72,18 @@ class Timer(ABC):
 
     @abstractmethod
     def changed(self) -> str | None:
-        """Return a phrase on what differs here from what a run stated; None if nothing does.
+        """Return a phrase on what differs here from what a run stated of its timer, or None.
 
         Such is a file of rates that has changed since.
         """
 
     @abstractmethod
     def answer_s(self, speed: Any, answer: "Answer") -> float:
-        """Return the seconds that an answer takes at a speed; NaN if the engine failed.
+        """Return the seconds that an answer takes, given how fast its model answers.
 
-        A repair turn, a second question after a failed answer, is included. The engine is what runs
-        the model. Raises UserError if the answer does not say enough, such as its number of tokens.
+        `speed` is that, an object of the timer's own. A repair turn, a second question after a
+        failed answer, is included. NaN if the engine, which runs the model, failed. Raises
+        UserError if the answer does not say enough, such as its number of tokens.
         """
 
     @abstractmethod
@@ -95,7 +97,8 @@ class Timer(ABC):
     def obstacle(self, point: "OperatingPoint") -> str | None:
         """Return why a condition cannot be played with this timer, as a phrase; None if it can.
 
-        `point` is the condition: its settings of channel, asking and fusion.
+        `point` is the condition: its settings of the radio, of asking helpers and of fusing their
+        messages.
         """
 
     @abstractmethod
@@ -108,18 +111,21 @@ class Timer(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """Return the settings of `chosen_by` that choose this timer, values by name."""
+        """Return the settings of a run that choose this timer, values by name.
+
+        They are those that `chosen_by` names.
+        """
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return what a run's record states of this timer, as plain values by name of a setting.
+        """Return what a run's record states of this timer: what its settings name, by setting.
 
         A value is the content of the file that the setting names, or else the setting's own value.
         """
 
     @abstractmethod
     def files(self) -> Mapping[str, Path]:
-        """Return the files that this timer is made of, by their path in a project."""
+        """Return the files that state the times, such as a device's, by their path in a project."""
 
     @abstractmethod
     def columns(
@@ -128,7 +134,7 @@ class Timer(ABC):
         """Return the columns that this timer adds to n decisions, by name, (n,) each.
 
         An agent is a model, its prompt and how it answers. A condition is a named set of settings
-        of channel, asking and fusion.
+        of the radio, of asking helpers and of fusing their messages.
 
         Args:
             latency: the run's record of times, with each agent's speed.
@@ -148,8 +154,8 @@ class Timer(ABC):
         """Return the joules of each vehicle's answer in n scenes, (n, 1+H), NaN if unknown.
 
         The ego comes first, then the H helpers. `latency` is the run's and `point` the condition,
-        its settings of channel, asking and fusion; `scenes` are `harness.dataset.load.Scene`, and
-        `answers` has the run's answers by id of their request.
+        its settings of the radio, of asking helpers and of fusing their messages; `scenes` are
+        `harness.dataset.load.Scene`, and `answers` has the run's answers by id of their request.
         """
 
     @abstractmethod
@@ -157,9 +163,9 @@ class Timer(ABC):
         """Return the joules of n decisions, (n,): of the answers that were made, and of the radio.
 
         Those of a fusion call, a second question to the ego's model, are left out. `point` is the
-        condition, its settings of channel, asking and fusion; `joules` are of each vehicle's
-        answer, (n, 1+H), the ego's first, then those of H helpers; `heard` says which helpers
-        answered, and what was sent.
+        condition, its settings of the radio, of asking helpers and of fusing their messages;
+        `joules` are of each vehicle's answer, (n, 1+H), the ego's first, then those of H helpers;
+        `heard` says which helpers answered, and what was sent.
         """
 
 
@@ -167,7 +173,7 @@ TIMERS = ShippedChoices[Timer]("swarmdrive.timers", Timer, {})
 
 
 def timer(source: str) -> Timer:
-    """Return the timer of a name, the `source` that a run's latency states.
+    """Return what times answers under a name: the `source` that a run's latency states.
 
     Raises ValueError if there is none of this name, and UserError if the extension that added it is
     not installed.
@@ -180,12 +186,18 @@ def timer(source: str) -> Timer:
 
 
 def options() -> list[str]:
-    """Return what is typed on the command line to choose each timer."""
+    """Return what is typed on the command line to choose each timer, such as an option's name.
+
+    A timer computes how long each answer takes by itself.
+    """
     return [each.option for each in TIMERS.values()]
 
 
 def added_columns() -> dict[str, str]:
-    """Return the columns that timers add to decisions, each with the one that it follows."""
+    """Return the columns that timers add to the table of decisions, each with the one it follows.
+
+    A timer computes how long each answer takes by itself.
+    """
     columns: dict[str, str] = {}
     for each in TIMERS.values():
         columns |= each.adds

@@ -70,7 +70,10 @@ class Tally:
         return f"{'; '.join(words)}: no answer to {self.counts()}"
 
     def counts(self) -> str:
-        """Return a phrase on how many requests got no answer, by role; empty if all got one."""
+        """Return a phrase on how many requests of each role got no answer; empty if all got one.
+
+        A role is who is asked, such as `helper`.
+        """
         roles = dict.fromkeys((*_WHO, *sorted(self.unanswered)))
         return ", ".join(
             f"{self.unanswered[role]} of {self.asked[role]} questions to "
@@ -81,12 +84,18 @@ class Tally:
 
 
 def tally(run: Run) -> Tally:
-    """Return how many requests of a finished run got an answer, and how many an error."""
+    """Return how many requests of a finished run, by role, got an answer, and how many an error.
+
+    A role is who is asked: `ego`, `helper` or `merge` (the ego after it heard messages).
+    """
     return Tally(run.answers)
 
 
 def lacking(run: Run) -> Iterator[Answer]:
-    """Yield the unanswered requests that leave a finished run without a valid result."""
+    """Yield the requests without an answer because of which a finished run has no valid result.
+
+    Each is the record of an answer with an error.
+    """
     missing = tally(run).missing
     if missing:
         yield from (a for a in run.answers if a.error is not None and a.role in missing)
