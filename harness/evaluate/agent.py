@@ -130,8 +130,8 @@ class Agent:
     def samples(self) -> bool:
         """Return whether its answers are texts that are drawn at a temperature.
 
-        Those of a read-out (one letter per action) and of a decision (a typed question) are
-        probabilities.
+        Answers in the modes `readout` (one letter per action) and `decision` (a typed question) are
+        probabilities, of which nothing is drawn.
         """
         return self.can.samples and self.answer not in BARE
 
@@ -149,10 +149,11 @@ class Agent:
         return answer + (self.card.thinking_tokens if self.thinking else 0)
 
     def blank(self, role: Role, actions: tuple[str, ...]) -> Request:
-        """Return a request to the model without all that differs from scene to scene.
+        """Return a request to the model that has all but what differs from scene to scene.
 
-        The caller fills in `id`, `messages` and the like (`Request.alike`). `role` is whom the
-        prompt addresses, `ego` or `helper`; `actions` are the names of the meta-actions, in order.
+        It is made once, and copied for each scene with `id`, `messages` and the like
+        (`Request.alike`). `role` is whom the prompt addresses, `ego` or `helper`; `actions` are the
+        names of the meta-actions, in order.
         """
         return Request(
             id="",
@@ -233,7 +234,7 @@ class Agent:
         heard: Sequence[Mapping[str, Any]],
         words: Mapping[str, str],
     ) -> tuple[Mapping[str, str], ...]:
-        """Return the chat messages that `chats` begins with, before the answer mode changes them.
+        """Return the prompt's chat messages about a scene, before the answer mode changes them.
 
         Args:
             graph: scene graph of the vehicle that is asked: what it knows of the scene.
@@ -246,9 +247,10 @@ class Agent:
         )
 
     def settings(self) -> dict[str, Any]:
-        """Return all that decides this agent's answers, as plain values for a run's record.
+        """Return all that decides the answers of this model and prompt, for a run's record.
 
-        The keys are `model`, `prompt`, `thinking`, `answer`, `image`, `letters`, `sums` and `flip`.
+        They are plain values; the keys are `model`, `prompt`, `thinking`, `answer`, `image`,
+        `letters`, `sums` and `flip`.
         """
         return {
             "model": self.card.record(),
@@ -283,12 +285,12 @@ def in_mode(
     actions: Sequence[str],
     words: Mapping[str, str],
 ) -> tuple[Mapping[str, str], ...]:
-    """Return a prompt's chat messages with the question of the answer mode `answer`.
+    """Return a prompt's chat messages, changed to ask for an answer in the answer mode `answer`.
 
-    In `readout`, the examples answer by a letter, too, and the question is for one. In `decision`,
-    what the chat says of the scene stays, and the scenario's `words` ask. Other modes change
-    nothing. `graph` is what the vehicle knows of the scene, and `actions` are the names of the
-    actions, in order.
+    In `readout`, the question is for one letter, and the examples answer by one, too. In
+    `decision`, what the chat says of the scene stays, and the scenario's `words` ask. Other modes
+    change nothing. `graph` is what the vehicle knows of the scene, and `actions` are the names of
+    the actions, in order.
     """
     if answer == "decision":
         question = decision.question(messages, graph, actions, words)
@@ -299,7 +301,7 @@ def in_mode(
 
 
 def example_actions(prompt: Prompt, role: str, actions: Sequence[str]) -> list[str]:
-    """Return the likeliest action in each example answer that a prompt shows in a role.
+    """Return the likeliest action in each example answer that a prompt shows the model.
 
     `role` is whom the prompt addresses, `ego` or `helper`; `actions` are the names of the
     meta-actions, in order. Raises UserError if such an answer cannot be parsed without repairs.

@@ -9,11 +9,12 @@ from harness.evaluate.walk import Decided
 
 
 def broken_words(decided: Decided[Any]) -> Floats:
-    """Return for n agents' decisions whether each contradicts the plan that the agent sent, `(n,)`.
+    """Return for n decisions whether each contradicts the plan that its vehicle had sent, `(n,)`.
 
-    An agent is a vehicle that decides for itself, and a plan what it says it will do. `decided` has
-    the decisions and what was sent. It is 1 if the action taken is not the likeliest of the plan
-    that some receiver last got, else 0; NaN for an agent whose plan nobody received.
+    It is for scenarios in which several vehicles decide for themselves, and tell each other what
+    they will do. `decided` has the decisions and what was sent. The value is 1 if the action taken
+    is not the likeliest of the plan that some receiver last got, else 0; NaN where nobody received
+    a plan.
     """
     broken, intents = np.full(len(decided.due.at), np.nan), decided.said.intents
     if decided.due.senders is None or intents.plans is None:

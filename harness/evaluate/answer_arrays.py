@@ -75,8 +75,8 @@ def models_of(spec: Spec, scene: Scene, width: int) -> list[int]:
     """Return for each vehicle in a scene the number of the model that answers for it.
 
     The order is that of `Scene.viewers`, the ego first. Number 0 is the ego's model; helpers count
-    from 1, and those with models of their own take these in turn (`Latency.speed`). If the scene
-    has fewer than `width` vehicles, the list is filled up with their indices. `spec` says whether
+    from 1, and those with models of their own take these in turn. If the scene has fewer than
+    `width` vehicles, the list is filled up with their indices. `spec`, the evaluation, says whether
     helpers have models of their own.
     """
     there = range(len(scene.viewers))

@@ -15,7 +15,7 @@ _TEXTS = msgspec.json.Encoder(order="sorted")  # as `canonical_bytes`, where the
 
 
 def answer_of(request: Request, completion: Completion) -> Answer:
-    """Return the answer that a model's completion of a request gives, its text parsed.
+    """Parse a model's completion of a request, and return the answer as a run records it.
 
     It has the completion's facts, too, such as its tokens, its time in s and why it ended. If the
     text cannot be parsed, the status says why.

@@ -98,12 +98,12 @@ def _say_unread(card: Card, prompt: str) -> None:
 class Asker:
     """Ask models for the answers that a run still lacks, and give answers as arrays.
 
-    At each decision point the loop over decision points, `walk.walk`, gets the vehicles' intents
-    from it (`walk.Ask`): the probabilities that each gives to the ego's actions. A question that
-    got no answer is never kept, so that it is asked again when the work goes on.
+    It is what the loop over decision points (`walk.walk`) asks for vehicles' intents: the
+    probabilities that each gives to the ego's actions. A question that got no answer is never kept,
+    so that it is asked again when the work goes on.
 
     Attributes:
-        spec: the evaluation: agents, scenes, conditions and settings.
+        spec: the evaluation: models with their prompts, scenes, conditions and settings.
         answers: answers by request id, in the order of the requests.
         latency: how long the models take to answer.
         tally: how many questions that were asked here got an answer, and how many an error.
@@ -147,11 +147,12 @@ class Asker:
         self._unread: int | None = None if self.answers else 0
 
     def ask(self, requests: Sequence[Request]) -> None:
-        """Ask the requests whose answers are missing, each once, and keep each chunk of answers.
+        """Ask the requests whose answers are missing, each once, and store the answers.
 
-        A chunk, a run of requests, is written to a file at once. Raises Unanswered if a question of
-        the ego or a fusion call got no answer, once all others of these were asked; or if none of
-        the first questions was answered, or none of the last `IN_A_ROW`.
+        They are written to a file in chunks, some requests each. Raises Unanswered if a question of
+        the ego or a fusion call (the ego asked again, with messages) got no answer, once all others
+        of these were asked; or if none of the first questions was answered, or none of the last
+        `IN_A_ROW`.
         """
         if self._kept:  # another process may have asked, too
             recalled = self._recalled(cut=True)
@@ -240,14 +241,17 @@ class Asker:
         return name in self.answers and name not in self._unasked
 
     def asked_answers(self) -> dict[str, Answer]:
-        """Return all answers by request id, without kept ones that nothing asked for here.
+        """Return all answers by request id that belong to the run.
 
-        Kept answers are those of an earlier, stopped run.
+        Answers that an earlier, stopped run kept are left out if nothing asked for them here.
         """
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
     def settle(self) -> None:
-        """Raise Unanswered if too many questions that were asked here got no answer."""
+        """Raise Unanswered if too many questions that were asked here got no answer.
+
+        Results would be invalid then.
+        """
         if self.tally.missing:
             raise Unanswered(str(self.tally))
 
@@ -330,17 +334,19 @@ class Asker:
     def whole(self, scenes: Sequence[Scene]) -> Intents:
         """Return the intents of n scenes, `(n, ...)`, after asking every vehicle in them.
 
-        Helpers are included. An intent is the probabilities that a vehicle gives to the ego's
-        actions; NaN where it failed.
+        Helpers are asked, too. An intent is the probabilities that a vehicle gives to the ego's
+        actions; NaN where its answer failed.
         """
         self._ask_at(scenes)
         return self.laid_out(scenes)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
-        """Return the intents of n scenes where helpers are asked another question, `(n, ...)`.
+        """Return the intents of n scenes, `(n, ...)`, where helpers are asked another question.
 
-        `question` is what they are asked in place of what the ego should do as they see it. Only
-        the scenes at the indices `at` are asked, and only if a run asks all helpers; NaN elsewhere.
+        An intent is the probabilities that a vehicle gives to the ego's actions. `question` is
+        asked in place of what the ego should do as the helper sees it; such is one that shows the
+        helper nothing. Only the scenes at the indices `at` are asked, and only if a run asks all
+        helpers; NaN elsewhere.
         """
         if self.spec.asks_all:
             self._ask_at([scenes[n] for n in at.tolist()], question=question)
@@ -352,7 +358,8 @@ class Asker:
         """Ask some helpers, those marked in `wanted`, `(n, H)`, of n scenes with H helpers.
 
         `question` is what they are asked; by default the plain one, what the ego should do as they
-        see it. Returns the intents of the scenes in which a helper is marked, in their order.
+        see it. Returns the intents (probabilities of the ego's actions) in the scenes in which a
+        helper is marked, in their order.
         """
         scenes, places = wanted_in(scenes, wanted)
         self._ask_at(scenes, places, question)
@@ -364,7 +371,7 @@ class Asker:
         question: Question = PLAIN,
         places: Places | None = None,
     ) -> list[bool]:
-        """Return for each scene whether an answer to a question is missing.
+        """Return for each scene whether some vehicle's answer to a question is missing.
 
         `places` restricts this to some vehicles of each scene, by their index in `Scene.viewers`,
         the ego at 0; None for all. With another `question` than the plain one, what the ego should
@@ -408,10 +415,11 @@ class Asker:
     def laid_out(
         self, scenes: Sequence[Scene], question: Question = PLAIN, width: int = 1
     ) -> Intents:
-        """Return the answers that there are, of n scenes, as arrays `(n, ...)`; nothing is asked.
+        """Return the answers that there are so far to n scenes as arrays, `(n, ...)`.
 
-        They have room for `width` vehicles at least, the ego included. `question` is what helpers
-        were asked; a vehicle without an intent, its probabilities of the ego's actions, has NaN.
+        Nothing is asked. They are intents, probabilities of the ego's actions; NaN for a vehicle
+        without one. Arrays have room for `width` vehicles at least, the ego included. `question` is
+        what helpers were asked.
         """
         answers = [self._answers_in(scene, question) for scene in scenes]
         return intents_of(self.spec, self.latency, scenes, answers, width)
@@ -470,9 +478,9 @@ class Asker:
     ) -> list[Request]:
         """Return the requests that ask egos once more, with each set of messages that one heard.
 
-        `codes`, `(K,)`, has for each of K sets an integer that says in which scene who was heard
-        (`fusion.codes_of`), by index in `scenes`; `rewrites` says how messages are changed and
-        shown.
+        `codes`, `(K,)`, has for each of K sets an integer that says in which of `scenes` who was
+        heard (`fusion.codes_of`); `rewrites` says how attacks and defences change messages, and how
+        they are shown.
         """
         sets = list(heard_sets(scenes, codes, rewrites))
         lacks = [not self._has(fusion_id(*each)) for each in sets]
@@ -492,11 +500,12 @@ class Asker:
         return calls
 
     def answer(self, requests: Sequence[Request]) -> None:
-        """Ask those of these requests whose answers are missing, and keep the answers.
+        """Ask those of some requests whose answers are missing, and keep the answers.
 
-        The function `more`, by which a progress bar learns how much there is to do, is first called
-        with the number of requests. Raises Unanswered if a question of the ego or a fusion call
-        (the ego asked again, with messages) got no answer, or many in a row.
+        It is for requests known beforehand. The function `more`, by which a progress bar learns how
+        much there is to do, is first called with their number. Raises Unanswered if a question of
+        the ego or a fusion call (the ego asked again, with messages) got no answer, or many in a
+        row.
         """
         # Requests whose answers were kept stay, so that the chunks begin at the same places as
         # before.

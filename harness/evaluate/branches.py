@@ -40,13 +40,15 @@ class Decision:
 class Course:
     """Hold one episode under one condition and channel seed, while it is driven.
 
-    `point` is the condition: its settings of channel, asking and fusion. Agents, vehicles that
-    decide for themselves, are numbered by their index among the vehicles of the world; 0 is the
-    ego. `open` has by agent the decision that has not taken effect yet, `last` the latest one, and
-    `skipped` counts those that did not begin, since one was still open.
+    `point` is the condition: its settings of the radio, of asking helpers and of fusing their
+    messages. Agents, vehicles that decide for themselves, are numbered by their index among the
+    vehicles of the world; 0 is the ego. `open` has by agent the decision that has not taken effect
+    yet, `last` the latest one, and `skipped` counts those that did not begin, since one was still
+    open.
     """
 
-    point: OperatingPoint  # the condition: its settings of channel, asking and fusion
+    # the condition: its settings of the radio, of asking helpers and of fusing their messages
+    point: OperatingPoint
     seed: int  # seed of the channel's draws
     # by agent its decision that has not taken effect yet; until then the agent keeps to its last
     # action
@@ -61,8 +63,9 @@ class Trajectory:
     """Hold a simulated world and the episodes that still share it, having acted alike so far.
 
     `number` is that of the layout's episode in the run, and `courses` are the episode under each
-    condition and channel seed that shares the world. A condition is a named set of settings of
-    channel, asking and fusion. A layout is one start situation of a scenario.
+    condition and channel seed that shares the world. A condition is a named set of settings of the
+    radio, of asking helpers and of fusing their messages. A layout is one start situation of a
+    scenario.
     """
 
     number: int  # number of the layout's episode in the run
@@ -95,8 +98,8 @@ class Trajectory:
     def act(self) -> list["Trajectory"]:
         """Apply decisions whose frame has come, and return a trajectory for each way to go on.
 
-        A trajectory is a simulated world that several episodes share. Those that now aim at
-        different speeds or lanes part: the world is copied for each.
+        A trajectory is a simulated world that several episodes share, since they acted alike. Those
+        that now aim at different speeds or lanes part: the world is copied for each.
         """
         world, agents = self.world, tuple(self.world.journeys)
         now = tuple(world.target(agent) for agent in agents)
@@ -136,11 +139,12 @@ class Trajectory:
 
 
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:
-    """Simulate each trajectory to a frame, or to its end, and apply decisions in their frames.
+    """Simulate worlds that episodes share until a frame, and part those that act differently.
 
-    A trajectory is a simulated world that several episodes share; if these take different actions
-    it parts into several. `until_frame` is the number of the simulation frame, from 0. Returns all
-    trajectories that there are then, in the order of those given.
+    Each of `trajectories` is such a world with its episodes. Decisions are applied in their frames;
+    a world in which episodes take different actions is copied for each. `until_frame` is the number
+    of the simulation frame, from 0; an ended world stops before. Returns all trajectories that
+    there are then, in the order of those given.
     """
     running: list[tuple[tuple[int, ...], Trajectory]] = [
         ((n,), t) for n, t in enumerate(trajectories)

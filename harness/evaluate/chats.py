@@ -40,15 +40,18 @@ class Asking:
 
     @classmethod
     def of(cls, scenario: Scenario, prompt: str | None, answer: str) -> "Asking":
-        """Return an `Asking` for a scenario's scenes, with a prompt version by name.
+        """Return how vehicles in scenes of a scenario are asked, given a prompt version by name.
 
-        None is the scenario's own version. `answer` is `json` or `readout`. Raises UserError if
-        there is no such version, or it cannot be used.
+        None is the scenario's own version. `answer` is `json` or `readout`, one letter. Raises
+        UserError if there is no such version, or it cannot be used.
         """
         return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
 
     def chat(self, graph: SceneGraph) -> list[dict[str, str]]:
-        """Return the chat messages, with `role` and `content`, about one vehicle's scene graph."""
+        """Return the chat messages that ask one vehicle about a scene, with `role` and `content`.
+
+        `graph` is the vehicle's scene graph, what it knows of the scene.
+        """
         actions, words = self.scenario.actions, self.scenario.prompt_words
         sent = self.prompt.render(graph, actions, (), words, letter=self.answer == "readout")
         return [{**m} for m in in_mode(self.answer, self.prompt, sent, graph, actions, words)]

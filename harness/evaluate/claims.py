@@ -20,10 +20,11 @@ NEGLIGIBLE_M = 0.01  # how far a simplified line of the map may be off
 
 
 def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
-    """Return the positions and speeds that helpers claim in n scenes, and what the ego sees of it.
+    """Return the positions and speeds that helpers' broadcasts claim, to check them.
 
-    Arrays are `(n, ...)`, with NaN where a scene has fewer helpers than another. `scenario` is that
-    of the scenes. Consensus rules that rate trust, and attacks, use them.
+    What the ego can check them by is returned, too. Arrays are `(n, ...)` for n scenes, with NaN
+    where a scene has fewer helpers than another. `scenario` is that of the scenes. Rules that fuse
+    messages and rate trust, and attacks, use them.
     """
     road, p = scenario.road(), scenario.parameters
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1

@@ -24,19 +24,23 @@ if TYPE_CHECKING:
 
 
 class Follower(Protocol):
-    """Describe what an extension, such as one for a tracker, is told of one run while it goes."""
+    """Describe what follows one run while it goes, such as a tracker's record of experiments.
+
+    Extensions add these.
+    """
 
     def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
-        """Return a function that takes a number of new answers and also calls `progress` with it.
+        """Return a function that is told how many answers a run has got, to count them elsewhere.
 
-        `progress` is what the run would call without this extension.
+        It takes a number of new answers and also calls `progress` with it, which is what the run
+        would call without this extension.
         """
         ...
 
     def end(self, done: "Evaluated") -> None:
-        """Take note that the run is finished and has its page.
+        """Take note that the run is finished and has its page; `done` has its results.
 
-        `done` has its folder, manifest and scores.
+        They are its folder, manifest (settings and origin) and scores.
         """
         ...
 
@@ -76,12 +80,12 @@ class CommandOption(ABC):
     def guard(
         self, value: Any, specs: "Sequence[Spec]", workers: "Workers"
     ) -> AbstractContextManager[Guard | None]:
-        """Enter a context with a function that may stop the evaluations' asking, or None.
+        """Enter a context with a function that may stop the command from asking models, or None.
 
-        The function takes a model's card and backend, and returns the backend wrapped so that it
-        may refuse to ask, by Unanswered. `value` is what is typed, None where nothing is; `specs`
-        are the evaluations, and `workers` what runs them. Raises UserError for a value that is not
-        allowed.
+        It may limit the cost so. The function takes a model's card and backend, and returns the
+        backend wrapped so that it may refuse to ask, by Unanswered. `value` is what is typed, None
+        where nothing is; `specs` are the evaluations, and `workers` what runs them. Raises
+        UserError for a value that is not allowed.
         """
         return nullcontext()
 
@@ -92,10 +96,10 @@ OPTIONS = Shipped[CommandOption]("swarmdrive.options", CommandOption, {})
 def follows(typed: Mapping[str, Any], instead: str = "") -> Sequence[Follow]:
     """Return what is to be told of each run of a command, a function for each option typed.
 
-    A function takes the run's folder and its settings as in `run.json`, and returns a context with
-    a `Follower`. `typed` has the values of extensions' options by name. `instead` names what the
-    command makes in place of whole runs, such as a shard; it is empty for runs. Raises UserError
-    for a value that is not allowed.
+    Such is a tracker's. A function takes the run's folder and its settings as in `run.json`, and
+    returns a context with a `Follower`. `typed` has the values of extensions' options by name.
+    `instead` names what the command makes in place of whole runs, such as a shard (a part of one);
+    it is empty for runs. Raises UserError for a value that is not allowed.
     """
     each_follows = []
     for name, option in OPTIONS.usable().items():
@@ -108,10 +112,11 @@ def follows(typed: Mapping[str, Any], instead: str = "") -> Sequence[Follow]:
 def guarded(
     typed: Mapping[str, Any], specs: "Sequence[Spec]", workers: "Workers"
 ) -> "Iterator[list[Spec]]":
-    """Enter a context with a command's evaluations, to which what may stop their asking is added.
+    """Enter a context with a command's evaluations, changed so that extensions may stop asking.
 
-    `typed` has the values of extensions' options by name (`CommandOption.guard`), and `workers` is
-    what runs the evaluations. Raises UserError for a value that is not allowed.
+    Such an extension may limit the cost. `typed` has the values of extensions' options by name, and
+    `workers` is what runs the evaluations `specs`. Raises UserError for a value that is not
+    allowed.
     """
     guards = list[Guard]()
     with ExitStack() as stack:

@@ -39,9 +39,10 @@ class Asked(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, model: str, completions: Sequence[Completion]) -> "Asked":
-        """Return the token counts of a model's completions; `model` is the name of its card.
+        """Return the token counts of what a model answered, to append to the run's counts of cost.
 
-        A card is the file that describes the model.
+        `model` is the name of its card, the file that describes the model; `completions` are its
+        answers.
         """
         counted = [
             (each.prompt_tokens, each.completion_tokens)
@@ -55,12 +56,12 @@ class Asked(msgspec.Struct, frozen=True):
 def metered(
     cards: Sequence[Card], backends: Sequence[Backend], work: Path | None, guards: Sequence[Guard]
 ) -> list[Backend]:
-    """Return agents' backends, wrapped so that the cost of those with a price is counted.
+    """Return the models' backends, wrapped so that the cost of those with a price is counted.
 
-    A backend is the code that runs a model, an agent the model with its prompt. A price stands in
-    the model's card, the file that describes it; `cards` and `backends` are in the order of the
-    agents. Counts go to a file in the working folder `work`; nothing is counted with None.
-    `guards`, functions that may make a backend refuse to ask, wrap each one, too.
+    A backend is the code that runs a model. A price stands in the model's card, the file that
+    describes it; `cards` and `backends` are in the same order, the ego's first. Counts go to a file
+    in the working folder `work`; nothing is counted with None. `guards`, functions that may make a
+    backend refuse to ask, wrap each one, too.
     """
     models = []
     for card, backend in zip(cards, backends, strict=True):

@@ -27,7 +27,8 @@ def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers
     and the number of the decision in its episode, `(n,)` each; so every condition, prompt and model
     has the same draws. Episodes have at most `steps` decisions, and each decision has draws for the
     links to `helpers` helpers. Whether a link is up is drawn once an episode, jitter at each step.
-    A condition is a named set of settings of channel, asking and fusion.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
     """
     seeds, seed_index = np.unique(seed, return_inverse=True)
     layouts, layout_index = np.unique(layout_seed, return_inverse=True)

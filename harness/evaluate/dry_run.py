@@ -69,9 +69,10 @@ def lacking(
 ) -> dict[str, int]:
     """Return how many questions about some scenes have no answer yet, by role.
 
-    `scenes` are ids of scenes of the dataset, `answers` the ids of requests that have one. All
+    It is asked before a stored run is scored again. `scenes` are ids of scenes of the dataset,
+    `answers` the ids of requests that have one; a role is who is asked, such as `helper`. All
     questions count that any condition may ask there, whoever is heard. A condition is a named set
-    of settings of channel, asking and fusion.
+    of settings of the radio, of asking helpers and of fusing their messages.
     """
     lacks, sends = (
         Counter[str](),

@@ -34,10 +34,10 @@ def mirror_request(request: Request) -> Request:
 
 
 def compared(answer: Answer, mirror: Answer) -> Answer:
-    """Return `answer` with `flipped` set: whether its likeliest action differs in `mirror`.
+    """Return `answer` with a note on whether its likeliest action differs in a reversed list.
 
-    `mirror` is the answer to the same question with the list of actions reversed. `answer` stays as
-    it is if either did not parse.
+    `mirror` is the answer to the same question with the list of actions reversed; the note is the
+    field `flipped`. `answer` stays as it is if either did not parse.
     """
     if answer.intent is None or mirror.intent is None:
         return answer

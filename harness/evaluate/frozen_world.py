@@ -86,19 +86,19 @@ class FrozenSource:
         return self.dataset.episodes
 
     def first(self, count: int) -> "FrozenSource":
-        """Return this source with at most `count` of its episodes, from the first."""
+        """Return this source of scenes with at most `count` of its episodes, from the first."""
         numbers, limit = self.dataset.episodes[:count], self.limit
         if len(numbers) < len(self.dataset.episodes):
             limit = len(numbers)
         return FrozenSource(self.dataset.of_episodes(frozenset(numbers)), limit, self.choice)
 
     def layouts(self, n_asked: int) -> list[Layout]:
-        """Return how hard each layout is, of those asked and of others that might have been asked.
+        """Return how hard each start situation is, of those asked and of others of the dataset.
 
-        A layout is one start situation of the scenario, with one episode. How hard it is, is the
-        success of reference policies in it, by which a run's success is corrected where the layouts
-        asked are harder than the others. Those asked are the first `n_asked` of the source. The
-        list is empty if there are no others, or too few were asked to correct anything.
+        Such a situation, a layout, has one episode. How hard it is, is the success of reference
+        policies in it, by which a run's success is corrected where the layouts asked are harder
+        than the others. Those asked are the first `n_asked` of the source. The list is empty if
+        there are no others, or too few were asked to correct anything.
         """
         if n_asked < LEAST:
             return []
@@ -161,9 +161,10 @@ class FrozenWorld(SceneWorld):
     """Play recorded scenes: go through the decision tree of each layout under all conditions.
 
     A decision tree has every scene that decisions can lead to from one start situation, the layout,
-    and how each course ends. A condition is a named set of settings of channel, asking and fusion;
-    there is one course (walk) for each episode, condition and channel seed. An action takes effect
-    one decision lag of the dataset after its scene, however long the decision took.
+    and how each course ends. A condition is a named set of settings of the radio, of asking helpers
+    and of fusing their messages; there is one course (walk) for each episode, condition and channel
+    seed. An action takes effect one decision lag of the dataset after its scene, however long the
+    decision took.
     """
 
     def __init__(
@@ -184,10 +185,10 @@ class FrozenWorld(SceneWorld):
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return a condition's decisions in the scenes just shown, one for each course still open.
+        """Return the decisions due under a condition in the scenes just shown, one an open episode.
 
-        There is a course for each episode and channel seed; `point` is the condition, its settings
-        of channel, asking and fusion.
+        Each episode is played once for each seed of the channel's draws. `point` is the condition,
+        its settings of the radio, of asking helpers and of fusing their messages.
         """
         walks, forest = self._walks[point], self._forest
         undecided = walks.at >= 0
@@ -214,11 +215,11 @@ class FrozenWorld(SceneWorld):
         return self._luck
 
     def leave_out(self, point: OperatingPoint, at: Bools) -> None:
-        """End the courses of a condition at some of the scenes just shown, and drop their results.
+        """End the episodes that are at some of the scenes just shown, and drop their results.
 
-        There is a course for each episode and channel seed. `point` is the condition, and the mask
-        `at` says of each scene whether it is one of them. A condition is a named set of settings of
-        channel, asking and fusion.
+        It is for scenes without an answer, under one condition and all channel seeds. `point` is
+        the condition, and the mask `at` says of each scene whether it is one of them. A condition
+        is a named set of settings of the radio, of asking helpers and of fusing their messages.
         """
         walks = self._walks[point]
         undecided = walks.at >= 0
@@ -266,15 +267,16 @@ class FrozenWorld(SceneWorld):
 
     @property
     def numbers(self) -> Ints:
-        """Return the number of each of the E episodes, `(E,)`."""
+        """Return the numbers of the E episodes that are played, as the dataset has them, `(E,)`."""
         return self._forest.episodes
 
     def ends(self, point: OperatingPoint) -> dict[str, Floats]:
         """Return how each episode of a condition ended, by name of a metric, `(S, E)`.
 
-        Values are 0 or 1, by S channel seeds and E episodes; NaN where one was left out. Success
-        with a danger is NaN in episodes without one, and the other way round. `point` is the
-        condition, its settings of channel, asking and fusion.
+        Values are 0 or 1, by S seeds of the channel's random draws and E episodes; NaN where one
+        was left out. Success with a danger is NaN in episodes without one, and the other way round.
+        `point` is the condition, its settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])

@@ -73,9 +73,10 @@ class FusionAnswers:
 def codes_of(on_time: Bools, points: Ints, attackers: Bools | None = None) -> Ints:
     """Return an integer for each of n decisions, `(n,)`, that says where it is and who was heard.
 
-    `on_time`, `(n, H)`, says which of H helpers were heard in time, and `points`, `(n,)`, is the
-    index of the decision's scene in a list of the caller's. With `attackers`, `(n, H)`, the integer
-    also says which of those heard attack. `heard_in` decodes it.
+    Equal integers are one question to the ego's model, when that is asked again with what was
+    heard. `on_time`, `(n, H)`, says which of H helpers were heard in time, and `points`, `(n,)`, is
+    the index of the decision's scene in a list of the caller's. With `attackers`, `(n, H)`, the
+    integer also says which of those heard attack. `heard_in` decodes it.
     """
     flags = on_time if attackers is None else np.concatenate([on_time, on_time & attackers], axis=1)
     return np.asarray(points << flags.shape[1] | flags @ (1 << np.arange(flags.shape[1])))
@@ -190,10 +191,10 @@ def marks_of(key: str) -> Marks:
 
 
 def source_of(scene: str, senders: Sequence[str]) -> str:
-    """Return the id of the scene whose helpers sent what an ego heard, by the messages' keys.
+    """Return the id of the scene from which an ego's messages came.
 
-    `senders` are these keys (`key_of`). The scene is `scene`, the ego's own, unless a key says
-    otherwise.
+    `senders` are the keys of the messages, texts such as `v2` or `v2!objects&from:00012-3`
+    (`key_of`). It is `scene`, the ego's own, unless a key says otherwise, as in a control.
     """
     changes = (change for key in senders for change in key.partition(REWRITTEN)[2].split("&"))
     return next((change.removeprefix(FROM) for change in changes if change.startswith(FROM)), scene)

@@ -31,10 +31,11 @@ class KeptAnswers:
         self._read_b, self._on_disk_s = 0, -math.inf  # bytes that were read or written here
 
     def recall(self, cut: bool = False) -> dict[str, Answer]:
-        """Return the answers in the file by request id; none if nothing is new since the last call.
+        """Return the answers of a stopped run by request id; none if nothing is new since then.
 
-        `cut` removes a chunk at the end that was written in part. Engine errors do not count as
-        answers. Raises UserError if the file is damaged.
+        That is, since the last call. `cut` removes a chunk at the file's end that was written in
+        part. Errors of the engine, which runs the model, do not count as answers. Raises UserError
+        if the file is damaged.
         """
         if not self.file.is_file() or (size_b := self.file.stat().st_size) == self._read_b:
             return {}
@@ -55,7 +56,7 @@ class KeptAnswers:
         return {answer.id: answer for answer in answers if answer.error is None}
 
     def append(self, answers: Sequence[Answer]) -> None:
-        """Append answers as one chunk, which a later `recall` reads whole or not at all."""
+        """Append answers to the file as one chunk, which later reads take whole or not at all."""
         lines = _ENCODER.encode_lines(answers)
         chunk = lines[:-1].replace(b"\n", MORE_FOLLOWS) + lines[-1:]
         with appending(self.file) as file:

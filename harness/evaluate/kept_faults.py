@@ -18,10 +18,10 @@ SUMMED = ("prompt_tokens", "completion_tokens", "seconds", "slow_s")  # over the
 
 
 def fault(spec: Spec, request: Request, answer: Answer) -> str | None:
-    """Return what an answer that a stopped run kept states and cannot be, as a phrase, or None.
+    """Return why a stopped run cannot have got an answer that its folder has, or None.
 
-    Such an answer may have been written by anybody. `spec` is the evaluation and `request` the
-    question. The phrase follows "the answer", as in "the answer has ...".
+    Anybody may have written it. The phrase follows "the answer", as in "the answer has ...". `spec`
+    is the evaluation and `request` the question.
     """
     if digests(request) != (answer.prompt_sha256, answer.image_sha256):
         return "is to another prompt or picture than is asked"

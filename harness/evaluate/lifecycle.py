@@ -48,7 +48,10 @@ class RunStart(work.WorkStart, frozen=True, kw_only=True):
         msgspec.structs.force_setattr(self, "versions", formats.versions(self.versions))
 
     def facts(self) -> dict[str, Any]:
-        """Return what must be equal in all shards (parts) of a run, by its name for errors."""
+        """Return what must be equal in all parts of a run that are made apart, by name for errors.
+
+        Such parts are shards; each begins with a record like this.
+        """
         versions = {
             f"version of {name}": v for name, v in self.versions.items() if name != "platform"
         }
@@ -114,7 +117,7 @@ def begin(
 
 
 def another_model(spec: Spec) -> str:
-    """Return a phrase for errors: the model is not the one that a run began with, and how so.
+    """Return a phrase for errors: a stopped run's model is another now, and in what.
 
     `spec` is the evaluation, whose models it names.
     """
@@ -145,10 +148,10 @@ def as_finished(spec: Spec, run_start: RunStart, looks: InterimLooks | None = No
 
 
 def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
-    """Return the record of a stopped run in a folder, which it began with; None if there is none.
+    """Return what a stopped run in a folder began with; None if there is no such run.
 
-    `spec` is the evaluation now; `shard` is the part of the run, such as `1/3`, empty for all of
-    it. Raises UserError if it is a run with other settings.
+    `spec` is the evaluation now, `out` the folder, and `shard` the part of the run, such as `1/3`,
+    empty for all of it. Raises UserError if it is a run with other settings.
     """
     run_start = work.start_of(out, RunStart)
     if run_start:
@@ -175,18 +178,18 @@ def _options(spec: Spec, command: str) -> str:
 
 
 def rules(versions: Mapping[str, str]) -> dict[str, str]:
-    """Return, of `versions` by name, those of the rules that make decisions of answers.
+    """Return, of `versions` by name, those of the rules that turn answers into decisions.
 
-    Parts of a run have the same.
+    Shards, parts of a run that are made apart, must have the same.
     """
     return {f"version of {name}": versions[name] for name in formats.VERSIONS}
 
 
 def resumable(spec: Spec, out: Path) -> bool:
-    """Return whether this command can go on with the work in `out`, and no process works there.
+    """Return whether this command can go on with the work in a folder, where no process works.
 
-    `spec` is the command's evaluation. The work is that of this run, stopped, or of any run that
-    was stopped before its first answer.
+    `spec` is the command's evaluation. The work in `out` is that of this run, stopped, or of any
+    run that was stopped before its first answer.
     """
     try:
         return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)

@@ -57,8 +57,8 @@ class LiveSource:
     # name of the scenario, with settings as they are typed, such as `NAME:beacon_loss=0.3`
     scenario_name: str = scenarios.DEFAULT
     choice: Choice | None = None  # what chose some of the episodes, such as a sample; None for all
-    name: ClassVar[str] = "drive"
-    kind: ClassVar[metric.World] = "closed-loop"
+    name: ClassVar[str] = "drive"  # word for the scenes in the names of runs' folders
+    kind: ClassVar[metric.World] = "closed-loop"  # the kind of world: a simulated one
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -90,7 +90,10 @@ class LiveSource:
         )
 
     def first(self, count: int) -> "LiveSource":
-        """Return this source with at most `count` episodes, from the first; it has no `choice`."""
+        """Return at most `count` of these episodes to drive, from the first.
+
+        Nothing chooses among them any more.
+        """
         return replace(self, episodes=min(count, self.episodes))
 
     def settings(self) -> DriveSettings:
@@ -118,9 +121,9 @@ class LiveSource:
 class LiveWorld(SceneWorld):
     """Simulate the episodes of layouts under all conditions and channel seeds.
 
-    A condition is a named set of settings of channel, asking and fusion. Episodes of one layout, a
-    start situation, that have acted alike so far share a simulation. A decision takes effect in the
-    first frame after its latency.
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages. Episodes of one layout, a start situation, that have acted alike so far share a
+    simulation. A decision takes effect in the first frame after its latency.
     """
 
     def __init__(
@@ -290,8 +293,8 @@ def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episod
     seed. A success is late if it takes too long against a driver that sees everything and whose
     decisions act after the lag (the dataset's time from a decision to its action). Where several
     agents decide nobody is late: no such driver exists for all of them together. A condition is a
-    named set of settings of channel, asking and fusion. An agent is a vehicle that decides for
-    itself.
+    named set of settings of the radio, of asking helpers and of fusing their messages. An agent is
+    a vehicle that decides for itself.
     """
     if agent_share(scenario):
         alone_s = alone(scenario, list(dict.fromkeys(t.world.seed for t in trajectories)))
@@ -308,11 +311,11 @@ def ended(scenario: Scenario, trajectories: Sequence[Trajectory]) -> list[Episod
 
 
 def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> Scene:
-    """Return the scene in which one agent of a simulated world decides now.
+    """Return the scene in which one vehicle of a simulated world decides now.
 
-    An agent is a vehicle that decides for itself; `agent` is its index among the world's vehicles,
-    0 the ego. `number` is the episode's, and `step` that of the decision. With `ego_alone` the
-    scene lacks what helpers know, their scene graphs.
+    `agent` is its index among the world's vehicles, 0 the ego. `number` is the episode's, and
+    `step` that of the decision. With `ego_alone` the scene lacks what helpers know, their scene
+    graphs.
     """
     [scene] = looks([(world, agent, number)], step, ego_alone)
     return scene

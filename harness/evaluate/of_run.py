@@ -45,17 +45,19 @@ def spec_of(run: Run, source: Source) -> Spec:
 
 
 def card_here(card: Card) -> Card:
-    """Return the card of a run's model: the run's own, or of a rule-based driver the one here.
+    """Return the description (card) of a run's model: the run's own, but of a rule the one here.
 
-    A card is what a file says of a model, such as its engine and weights.
+    A card is what a file says of a model, such as its engine and weights. A rule is a driver
+    without a model.
     """
     return cards.load(card.name) if card.engine == DRIVER else card
 
 
 def points_of(run: Run) -> dict[str, OperatingPoint]:
-    """Return the settings of a run's conditions, of channel, asking and fusion, by condition name.
+    """Return the settings of a run's conditions, each an operating point, by condition name.
 
-    Raises UserError if a channel, network, schedule or other file that they name has changed since.
+    They are of the radio, of asking helpers and of fusing their messages. Raises UserError if a
+    channel, network, schedule or other file that they name has changed since.
     """
     manifest = run.manifest
     points = {}
@@ -106,10 +108,10 @@ def _check_recorded(
 
 
 def records_otherwise(run: Run) -> Iterator[str]:
-    """Yield which channel profiles are described otherwise in run.json than here.
+    """Yield a sentence for each fact on a radio that `run.json` has otherwise than its file here.
 
-    That is, what they are held against, from where, and within which limits; `points_of` compares
-    what they do.
+    The facts are words: the description, the source, how well it is supported, and the limits for
+    which its model is validated. What the radio does is compared elsewhere (`points_of`).
     """
     for name, recorded in run.manifest.channels.items():
         if name not in CHANNELS:
@@ -148,10 +150,11 @@ def _plain(recorded: Any) -> Any:
 
 
 def model_of(run: Run, agent_record: Mapping[str, Any]) -> Card:
-    """Return the card of an agent's model, as a run states it in `agent_record`.
+    """Return the description (card) of a model that answered in a run, from the run's record.
 
-    A card is what a file says of a model, such as its engine. Raises UserError if the record is
-    none, or the engine is not installed.
+    `agent_record` is the record of the model with its prompt; a card is what a file says of a
+    model, such as its engine. Raises UserError if the record is none, or the engine is not
+    installed.
     """
     where = f"{printable(run.path)}: its model"
     card = convert(agent_record["model"], Card, where)

@@ -21,11 +21,11 @@ MOVING_MPS = 0.1  # a slower vehicle counts as standing
 
 
 def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
-    """Return how much the egos of n scenes see of where a danger may come from, `(n, ...)`.
+    """Return how much n egos see of where a danger may come from, and what helpers would add.
 
-    A danger is a vehicle that would meet an ego which keeps its speed. It also says what helpers
-    would add. The road's R sectors, or regions, are where a danger may come from; on a road with
-    fewer of them than others, the rest counts as seen. Schedules, rules for whom to ask, use it.
+    Rules for whom to ask, schedules, use it. A danger is a vehicle that would meet an ego which
+    keeps its speed; it may come from each of the road's R sectors, or regions. Arrays are
+    `(n, ...)`; on a road with fewer regions than others, the rest counts as seen.
     """
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario).items()]

@@ -47,7 +47,7 @@ def blank(size_px: tuple[int, int]) -> Image:
 
 
 def another(spec: Spec, scene: Scene) -> Scene:
-    """Return a random scene of another episode, to show its picture as a control.
+    """Return a random scene of another episode, whose picture a control shows in place of the own.
 
     It is as many decisions into its episode, and always the same for a scene's id. Raises UserError
     if there is none.

@@ -60,16 +60,19 @@ def quoted(raw: str) -> str:
 
 
 def as_text(text: str) -> str:
-    """Return a text in which no chat template finds a special token: a space is put into each."""
+    """Return a text in which no chat template finds a special token: a space is put into each.
+
+    So a quoted answer cannot end its turn.
+    """
     return _CONTROL.sub(lambda begins: f"{begins[0]} ", text)
 
 
 def together(first: Answer, second: Answer) -> Answer:
-    """Return the answer of a repair turn, with the first one's text, and both ones' costs in sum.
+    """Return the answer to a second question, with the failed first one's text and cost added.
 
-    A repair turn is a second question, after an answer that cannot be parsed. Costs are tokens,
-    time and retries. The times to the first and between tokens describe one request, so they are
-    left out.
+    The second question, a repair turn, is asked after an answer that cannot be parsed. Costs are
+    tokens, time and retries. The times to the first and between tokens describe one request, so
+    they are left out.
     """
     turn = FirstTurn(**{name: getattr(first, name) for name in FirstTurn.__struct_fields__})
     return structs.replace(

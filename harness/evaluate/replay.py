@@ -106,14 +106,18 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
 def due_frame(world: World, decision: Decision) -> int:
     """Return the number of the simulation frame, from 0, in which a decision begins.
 
-    Its vehicle may decide later than others, by an offset that the world's seed fixes.
+    A vehicle may decide later than others, by an offset that the world's seed fixes. `decision` is
+    a recorded one of the episode that `world` simulates.
     """
     offset = offset_of(world.scenario, world.seed, _place(world, decision.agent))
     return world.scenario.parameters.due_frame(decision.step) + offset
 
 
 def actions_by_frame(played: ReplayedEpisode) -> dict[int, list[Decision]]:
-    """Return an episode's decisions that took effect, by simulation frame, in order of time."""
+    """Return an episode's decisions that took effect, by the number of the simulation frame.
+
+    They are in order of time. `played` is the recorded episode.
+    """
     p, acting = played.scenario.parameters, dict[int, list[Decision]]()
     for decision in sorted(
         (d for d in played.decisions if d.acted), key=lambda d: acting_frame(d, p)

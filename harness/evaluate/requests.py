@@ -33,9 +33,10 @@ def requests(
 ) -> Iterator[Request]:
     """Yield the requests to the models of vehicles in scenes, the ego's first in each scene.
 
-    With another `question` than the plain one, what the ego should do as they see it, only helpers
-    are asked. `places` has for each scene the indices in `Scene.viewers` of the vehicles to ask,
-    the ego at 0; None asks all.
+    `spec` is the evaluation: which model answers for whom, by which prompt. With another `question`
+    than the plain one, what the ego should do as they see it, only helpers are asked. `places` has
+    for each scene the indices in `Scene.viewers` of the vehicles to ask, the ego at 0; None asks
+    all.
     """
     agents, actions = spec.agents, spec.actions
     privileged, sees = (
@@ -143,12 +144,12 @@ def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 def heard_sets(
     scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites
 ) -> Iterator[tuple[Scene, list[str]]]:
-    """Yield for each set of heard messages the ego's scene and the keys of the messages.
+    """Yield for each set of messages that an ego heard its scene and the messages' keys.
 
-    `codes`, `(K,)`, has for each of K sets an integer that says in which scene, by index in
-    `scenes`, which helpers were heard (`fusion.codes_of`). `rewrites` says how the messages are
-    changed and shown. A key is a text that names a message: its sender, and how it is shown
-    (`fusion.key_of`).
+    They are what a fusion call (the ego's model asked again) is to show. `codes`, `(K,)`, has for
+    each of K sets an integer that says in which scene, by index in `scenes`, which helpers were
+    heard (`fusion.codes_of`). `rewrites` says how the messages are changed and shown. A key is a
+    text that names a message: its sender, and how it is shown.
     """
     helpers = max(len(scene.viewers) for scene in scenes) - 1
     for code in codes.tolist():

@@ -35,10 +35,8 @@ if TYPE_CHECKING:
 def spec(settings: Settings, source: Source) -> Spec:
     """Return the evaluation that a run's settings describe, with all files that they name opened.
 
-    `source` has the scenes: recorded ones of a dataset, or layouts to drive. A layout is one start
-    situation of a scenario.
-
-    Raises UserError for a name that there is not, or settings that are not allowed together.
+    `source` has the scenes: recorded ones of a dataset, or start situations to drive from. Raises
+    UserError for a name that there is not, or settings that are not allowed together.
     """
     ego, helpers = agents(settings, source.scenario)
     return Spec(
@@ -146,10 +144,10 @@ def points(
 ) -> tuple[OperatingPoint, ...]:
     """Return the conditions that texts name, each once, with the counterparts of these.
 
-    A condition is a set of settings of radio, asking and fusion, such as `6g:window_s=0.4`; a
-    counterpart differs from it in one setting, such as a control, which replaces what helpers say.
-    `settings` are a run's settings of extensions, values by name. Raises UserError for an unknown
-    name.
+    A condition is a set of settings of the radio, of asking helpers and of fusing their messages,
+    such as `6g:window_s=0.4`; a counterpart differs from it in one setting, such as a control,
+    which replaces what helpers say. `settings` are a run's settings of extensions, values by name.
+    Raises UserError for an unknown name.
     """
     named = [named_point(name) for name in dict.fromkeys(conditions)]
     return tuple(dict.fromkeys((*named, *counterparts(named, settings or {}))))

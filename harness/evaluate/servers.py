@@ -16,12 +16,15 @@ FILE = "servers.jsonl"
 
 
 def lines(served: Iterable[Served]) -> bytes:
-    """Return one JSON line for each answer, with the server that gave it, as bytes."""
+    """Return, as lines of JSON, which server gave each answer: bytes to append to a file."""
     return msgspec.json.Encoder().encode_lines(list(served))
 
 
 def keep(work: Path, served: Iterable[Served] | bytes) -> None:
-    """Append which server gave each answer, or such JSON lines, to a file in a working folder."""
+    """Append which server gave each answer to a file in a working folder.
+
+    `served` has these facts, or lines of JSON with them; `work` is the folder.
+    """
     if data := served if isinstance(served, bytes) else lines(served):
         with appending(work / FILE) as file:
             file.write(data)

@@ -77,30 +77,36 @@ class Source(Protocol):
 
     @property
     def numbers(self) -> Sequence[int]:
-        """Return the numbers of the episodes to evaluate, of which a run that stops early has some.
+        """Return the numbers of the episodes to evaluate.
 
-        These are the first.
+        A run that stops early has the first of them.
         """
         ...
 
     @property
     def choice(self) -> Choice | None:
-        """Return what chose some of the episodes; None if it is all of them, or the first."""
+        """Return what chose some of the episodes, such as a sample; None if nothing did.
+
+        Then they are all, or the first.
+        """
         ...
 
     def first(self, count: int) -> "Source":
-        """Return this source with at most `count` of its episodes, from the first."""
+        """Return these scenes cut to at most `count` episodes, from the first."""
         ...
 
     @property
     def layout_seeds(self) -> Iterable[int]: ...
 
     def record(self) -> FrozenScenes | ClosedLoop:
-        """Return the source's record for a run's manifest."""
+        """Return what a run's manifest states of its scenes.
+
+        The manifest is the record of a run's settings and origin.
+        """
         ...
 
     def settings(self) -> FrozenSettings | DriveSettings:
-        """Return the run settings that select this source."""
+        """Return the settings of a run that select this source of scenes."""
         ...
 
     def trial(self, most: int, ego_alone: bool) -> Iterator[Scene]:
@@ -118,16 +124,17 @@ class Spec:
 
     It holds opened what `settings`, those typed, name: `ego` and `helpers` are models with their
     prompts, the latter empty if the ego's answers for helpers, `source` has the scenes, and
-    `points` are the conditions, each a named set of settings of channel, asking and fusion. `seeds`
-    are of the channel's random numbers. `timer` times each answer by itself, and `stopping_rule`
-    may end the run early, None without; `interim_looks` says when a run that it ended was looked
-    at. `guards` may refuse to ask. Raises UserError for what is not allowed, or does not go
-    together.
+    `points` are the conditions, each a named set of settings of the radio, of asking helpers and of
+    fusing their messages. `seeds` are of the channel's random numbers. `timer` times each answer by
+    itself, and `stopping_rule` may end the run early, None without; `interim_looks` says when a run
+    that it ended was looked at. `guards` may refuse to ask. Raises UserError for what is not
+    allowed, or does not go together.
     """
 
     ego: Agent  # the agent that answers for the ego: a model, its prompt and how it is asked
     source: Source  # the scenes: a dataset's, or those of layouts to drive
-    # the conditions, each a named set of settings of channel, asking and fusion
+    # the conditions, each a named set of settings of the radio, of asking helpers and of fusing
+    # their messages
     points: tuple[OperatingPoint, ...]
     seeds: tuple[int, ...]  # seeds of the channel's draws
     # the agents that answer for the helpers. Helpers take them in turn, in the order in which they
@@ -334,7 +341,8 @@ class Spec:
         """Return why the ego's prompt cannot show helpers' messages, as a phrase; None if it can.
 
         It must, where a condition asks the ego's model again with the messages (fusion call). A
-        condition is a named set of settings of channel, asking and fusion.
+        condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         if bare := [agent.answer for agent in self.agents if agent.answer in BARE]:
             return f"a {bare[0]} gives no messages to fuse; use --answer json or constrained"
@@ -355,7 +363,8 @@ class Spec:
     def scenario_of(self, scene: Scene) -> Scenario:
         """Return the scenario from the view of the vehicle that decides in a scene.
 
-        Its words are those of that vehicle's prompt.
+        Where several vehicles decide, its words and roads are that vehicle's own, with it as the
+        ego.
         """
         return scene.seat or self.scenario
 
@@ -397,7 +406,8 @@ class Spec:
         """Return whether all helpers are asked, not only those whose answers a condition uses.
 
         It is so with `ask = "all"`, with a timer, which counts what all answers cost, and for a
-        driver (`ego_alone`). A condition is a named set of settings of channel, asking and fusion.
+        driver (`ego_alone`). A condition is a named set of settings of the radio, of asking helpers
+        and of fusing their messages.
         """
         return self.settings.ask == "all" or self.ego_alone or self.timer is not None
 
@@ -434,15 +444,18 @@ class Spec:
     def stopped(self, looks: InterimLooks) -> "Spec":
         """Return this evaluation cut to the episodes after which its stopping rule ended a run.
 
-        `looks` says after how many layouts the run was looked at. A layout is one start situation
-        of a scenario.
+        Such a rule looks, after some of a run's layouts (start situations, one an episode), whether
+        these are enough; `looks` says after how many it did.
         """
         looks = replace(looks, layouts=len(self.source.numbers))
         return replace(self, source=self.source.first(looks.at[-1]), interim_looks=looks)
 
     @property
     def world(self) -> FrozenScenes | ClosedLoop:
-        """Return the record of the scenes for a run's manifest, with what may stop the run."""
+        """Return what a run's manifest states of its scenes, and of what may stop the run early.
+
+        The manifest is the record of a run's settings and origin.
+        """
         world = self.source.record()
         if self.stopping_rule is None:
             return world
@@ -450,7 +463,10 @@ class Spec:
         return structs.replace(world, interim_looks=self.stopping_rule.record(looks))
 
     def record(self) -> dict[str, Any]:
-        """Return the settings and a record of all opened files, values by name, for `run.json`."""
+        """Return all settings, and a record of every file that they opened, for a run's `run.json`.
+
+        Values are plain, by name.
+        """
         settings = msgspec.to_builtins(self.settings)
         profiles = [point.radio.profile for point in self.points]
         schedules = {
@@ -534,9 +550,9 @@ class Spec:
 
     @property
     def ties(self) -> str:
-        """Return which of equally likely actions is taken: one `drawn`, or the `first`.
+        """Return which of equally likely actions the ego takes: one `drawn`, or the `first`.
 
-        By default it is as in the run that is replayed.
+        By default it is as in the run that is replayed, if there is one.
         """
         if self.settings.ties is not None:
             return self.settings.ties
@@ -545,7 +561,10 @@ class Spec:
 
     @property
     def opening(self) -> dict[str, Any]:
-        """Return the options with which models are opened: `device`, `dtype` and `batch_size`."""
+        """Return the options with which models are opened, by name.
+
+        They are `device`, `dtype` (number format of weights) and `batch_size`.
+        """
         return {name: getattr(self.settings, name) for name in ("device", "dtype", "batch_size")}
 
     @property
@@ -561,8 +580,8 @@ class Spec:
 def replayed(ego: Agent) -> Manifest | None:
     """Return the manifest of the run whose answers the ego's model replays; None for others.
 
-    A replay scores a run's stored answers again. Also None for what is no run, which is refused
-    when it is opened.
+    A replay scores a run's stored answers again, and a manifest is the record of a run's settings
+    and origin. None also for what is no run, which is refused when it is opened.
     """
     if not ego.can.own_latency:
         return None

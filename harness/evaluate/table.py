@@ -18,14 +18,14 @@ from harness.runs.decisions import Decisions, Labels, by_action, by_message
 def busy_ratio(point: OperatingPoint) -> float:
     """Return the share of time, 0 to 1, that a condition's channel is busy with others' packets.
 
-    `point` is the condition, its settings of channel, asking and fusion. NaN if the channel model
-    does not know it.
+    `point` is the condition, its settings of the radio, of asking helpers and of fusing their
+    messages. NaN if the channel model does not know it.
     """
     return point.physical.busy_ratio() if point.physical else float("nan")
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:
-    """Return the numeric columns of the decision table for n decisions of one condition.
+    """Return what n decisions under one condition came to, as numeric columns of a table.
 
     `decided` has the decisions, with their exchange of messages and results. Arrays are `(n,)`, by
     column name, such as `messages`, `triggered`, `entropy_nats` and `latency_ms`; NaN where
@@ -57,11 +57,12 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
 def table(
     decided: Sequence[Decided[Scene]], more: Mapping[str, Any], actions: Sequence[str]
 ) -> Decisions:
-    """Return a row for each decision, sorted by episode, step, decision point, condition and seed.
+    """Return the table of decisions, sorted by episode, step, scene, condition and seed.
 
-    `decided` has n decisions in parts of one condition each, in any order; `more` has further
-    columns by name, `(n,)`, in that order. `actions` are the names of the meta-actions, in order. A
-    condition is a named set of settings of channel, asking and fusion.
+    There is a row for each. `decided` has n decisions in parts of one condition each, in any order;
+    `more` has further columns by name, `(n,)`, in that order. `actions` are the names of the
+    meta-actions, in order. A condition is a named set of settings of the radio, of asking helpers
+    and of fusing their messages.
     """
     points_by_id = {id(part.decision_points): part.decision_points for part in decided}
     lengths = [len(decision_points) for decision_points in points_by_id.values()]
@@ -139,8 +140,8 @@ def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) 
     """Return one table of several, which have the same episodes under different channel seeds.
 
     Rows are sorted by episode, step, decision point, condition and seed; `points` are the
-    conditions, in the order of the rows. A condition is a named set of settings of channel, asking
-    and fusion.
+    conditions, in the order of the rows. A condition is a named set of settings of the radio, of
+    asking helpers and of fusing their messages.
     """
     if len(tables) == 1:
         return tables[0]

@@ -39,8 +39,8 @@ def refuse_others(run: Run) -> None:
 def others(run: Run) -> Iterator[tuple[Answer, str]]:
     """Yield each answer of a run that states what its raw text does not say, and in which field.
 
-    Texts are parsed again. The field is the first of those that differ. Raises UserError if a
-    prompt of the run is neither here nor kept in it.
+    Anybody may have written the run, so texts are parsed again. The field is the first of those
+    that differ. Raises UserError if a prompt of the run is neither here nor kept in it.
     """
     if gone := lacking(run):
         raise UserError(
@@ -87,10 +87,10 @@ def refuse_other_kept(
 
 
 def same(name: str, stated_answer: Answer, here: Answer | Parsed) -> bool:
-    """Return whether a stated and a newly parsed answer have the same value in the field `name`.
+    """Return whether a recorded answer and the same text parsed again agree in one field.
 
-    It is one of `OF_TEXTS`, the fields that are read in a text; numbers are compared up to
-    rounding. `here` is the one that was parsed.
+    The field, `name`, is one of `OF_TEXTS`, those that are read in a text; numbers are compared up
+    to rounding. `here` is the one that was parsed now.
     """
     a, b = getattr(stated_answer, name), getattr(here, name)
     if a is UNSET:

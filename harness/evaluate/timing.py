@@ -46,7 +46,7 @@ def load_a_core() -> float | None:
 
 
 def spread_over(scenes: Sequence[Scene]) -> Sequence[Scene]:
-    """Return at most `SCENES` of these scenes, evenly spread."""
+    """Return some of these scenes, evenly spread, to time a model on: at most `SCENES`."""
     return scenes[:: max(1, len(scenes) // SCENES)][:SCENES]
 
 

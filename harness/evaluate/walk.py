@@ -43,12 +43,13 @@ AskedPoint = TypeVar("AskedPoint", contravariant=True)
 class Due:
     """Hold the n decisions to be made now under one condition, in all episodes and seeds.
 
-    A condition is the settings of radio, asking and fusion; each episode is played under it once
-    for each seed of the channel's random draws. Of each decision, `at` (n,) is the index of its
-    point, such as a scene, among those that `World.observe` returned last; `episode` (n,) is its
-    episode's number and `seed` (n,) that of the channel. `draws` has the channel's random numbers
-    for its H helpers. `senders` (n, H) is the index among these n of the decision that a helper,
-    which here decides for itself, makes now, -1 for none; it is None where messages hold no plans.
+    A condition is the settings of the radio, of asking helpers and of fusing their messages; each
+    episode is played under it once for each seed of the channel's random draws. Of each decision,
+    `at` (n,) is the index of its point, such as a scene, among those that `World.observe` returned
+    last; `episode` (n,) is its episode's number and `seed` (n,) that of the channel. `draws` has
+    the channel's random numbers for its H helpers. `senders` (n, H) is the index among these n of
+    the decision that a helper, which here decides for itself, makes now, -1 for none; it is None
+    where messages hold no plans.
     """
 
     # index of each decision's point, such as its scene, among those that `World.observe` returned
@@ -65,7 +66,7 @@ class Due:
     def episodes(self) -> list[tuple[int, int]]:
         """Return of each decision the number of its episode and the seed of the channel's draws.
 
-        Together they name one course of an episode under the condition.
+        Together the two tell which play of an episode it belongs to, under this condition.
         """
         return list(zip(self.episode.tolist(), self.seed.tolist(), strict=True))
 
@@ -74,11 +75,12 @@ class Due:
 class Decided(Generic[DecisionPoint]):
     """Hold the n decisions that were made at one step under one condition.
 
-    A step is one round of decisions in all episodes, and a condition, `point`, the settings of
-    radio, asking and fusion. `decision_points` are the situations to decide in, scenes as a rule.
-    `due` says which decision is about which of them, in which episode and with which seed; `result`
-    has what was decided, such as the index of each action, (n,), and `said` the probabilities of
-    actions that vehicles sent over the channel, attackers' lies included.
+    A step is one round of decisions in all episodes, and a condition, `point`, the settings of the
+    radio, of asking helpers and of fusing their messages. `decision_points` are the situations to
+    decide in, scenes as a rule. `due` says which decision is about which of them, in which episode
+    and with which seed; `result` has what was decided, such as the index of each action, (n,), and
+    `said` the probabilities of actions that vehicles sent over the channel, attackers' lies
+    included.
     """
 
     point: OperatingPoint  # the condition
@@ -107,7 +109,8 @@ class World(Protocol[DecisionPoint]):
     def due(self, point: OperatingPoint) -> Due:
         """Return the decisions due at the points that `observe` returned last, under one condition.
 
-        `point` is the condition: the settings of radio, asking and fusion.
+        `point` is the condition: the settings of the radio, of asking helpers and of fusing their
+        messages.
         """
         ...
 
@@ -120,16 +123,18 @@ class World(Protocol[DecisionPoint]):
         ...
 
     def outlook(self) -> Outlook | None:
-        """Return how much egos see of where a danger may come from at the points last observed.
+        """Return how much egos see of where a danger may come from, at the points last observed.
 
-        Arrays are `(n, ...)`. None in a world without positions.
+        A danger is a vehicle that would meet an ego which keeps its speed. What helpers would add
+        is in it, too. Arrays are `(n, ...)`. None in a world without positions.
         """
         ...
 
     def claims(self) -> Claims | None:
-        """Return the positions and speeds that helpers claim at the n last observed points.
+        """Return the positions and speeds that helpers' broadcasts claim, to check them.
 
-        Arrays are `(n, ...)`. None in a world without positions.
+        They are of the n points last observed, `(n, ...)`; rules that rate trust check them. None
+        in a world without positions.
         """
         ...
 
@@ -188,11 +193,11 @@ class SceneWorld:
 
 
 class Fuses(Protocol):
-    """Describe the ego's answers when its model is asked again with the messages that it heard.
+    """Describe a function that has the ego's answers after it heard messages, at some points.
 
-    It is a function that has the answers at some decision points to each set of messages that was
-    stated beforehand (`Ask.fusion_call`). It takes the indices of n decisions' points, (n,), and
-    who attacks, and returns a function of who was heard, (n, H).
+    The ego's model is asked again with the messages that the ego heard (a fusion call); all sets of
+    messages were stated beforehand (`Ask.fusion_call`). The function takes the indices of n
+    decisions' points, (n,), and who attacks, and returns a function of who was heard, (n, H).
     """
 
     def __call__(self, decision_points: Ints, attackers: Bools | None = None, /) -> FusionCall:
@@ -206,7 +211,7 @@ class Fuses(Protocol):
 
 
 class Ask(Protocol[AskedPoint]):
-    """Describe the source of intents when a run is played: it asks the models, or has answers.
+    """Describe what gives vehicles' intents when a run is played: it asks models, or has answers.
 
     An intent is the probabilities of the ego's actions that one vehicle's model answers.
     """
@@ -219,9 +224,11 @@ class Ask(Protocol[AskedPoint]):
         ...
 
     def others(self, points: Sequence[AskedPoint], /, question: Question, at: Ints) -> Intents:
-        """Return the intents at n points, `(n, ...)`, where helpers are asked another question.
+        """Return vehicles' intents at n points, `(n, ...)`, if helpers are asked another question.
 
-        Only the points at the indices `at` need values; `question` is not the ordinary one.
+        An intent is the probabilities that a vehicle gives to the ego's actions. `question` is not
+        the ordinary one, what the ego should do; such is one that shows helpers nothing. Only the
+        points at the indices `at` need values.
         """
         ...
 
@@ -275,8 +282,8 @@ def walk(
 
     Args:
         world: gives the decision points, and is told the decisions.
-        points: the conditions: settings of radio, asking and fusion. Every episode is played under
-            each.
+        points: the conditions: settings of the radio, of asking helpers and of fusing their
+            messages. Every episode is played under each.
         ask: gives what vehicles intend, by asking their models.
         ties: which of equally likely actions is taken: the `first`, or one that is `drawn`.
     """
@@ -472,24 +479,29 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
 
 
 class Memory:
-    """Keep the memory of a condition's consensus rule between the decisions of each episode.
+    """Keep what a consensus rule remembers from one decision of an episode to the next.
 
-    The rule fuses intents; its memory is numbers of its own, such as its trust in each helper. Each
-    episode and seed of the channel's draws has its own.
+    The rule fuses vehicles' answers; its memory is numbers of its own, such as its trust in each
+    helper. Each episode and seed of the channel's draws has its own, and a `Memory` is of one
+    condition.
     """
 
     def __init__(self) -> None:
         self._state: dict[tuple[int, int], Floats] = {}
 
     def recall(self, due: Due) -> Floats | None:
-        """Return the rule's memory for n decisions, K numbers each, `(n, K)`; None at the first.
+        """Return what the rule that fuses messages remembers for n decisions, `(n, K)`.
 
-        `due` has the decisions, each with its episode and seed.
+        It is K numbers for each; None at the first decision. `due` has the decisions, each with its
+        episode and seed.
         """
         return np.array([self._state[place] for place in due.episodes]) if self._state else None
 
     def keep(self, due: Due, state: Floats) -> None:
-        """Store the rule's memory after n decisions, `state`, `(n, K)`; nothing if K is 0."""
+        """Store what the rule that fuses messages remembers after n decisions; nothing if K is 0.
+
+        `state`, `(n, K)`, is K numbers for each, and `due` has the decisions.
+        """
         if state.shape[-1]:
             self._state |= dict(zip(due.episodes, state, strict=True))
 
@@ -541,12 +553,11 @@ def heard_codes(
 
 
 def places_of(point: OperatingPoint, due: Due, n: int) -> Ints:
-    """Return for each decision the number of its decision point that stands in codes, `(m,)`.
+    """Return where each of m decisions is, as a number for the integers of `codes_of`, `(m,)`.
 
-    A code is an integer that says where a decision is made and who was heard (`codes_of`). There
-    are m decisions due under the condition `point`, and `n` decision points. The number is the
-    point's index, or where messages come from another point, as in a control, `n` times that plus
-    the other's index.
+    Such an integer also says who was heard there. The decisions are due under the condition
+    `point`, at `n` decision points. The number is the index of the decision's point; where messages
+    come from another point, as in a control, it is `n` times that index plus the other point's.
     """
     return due.at * n + due.at[_sources(point, due)] if point.rewrites.elsewhere else due.at
 
