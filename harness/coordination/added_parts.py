@@ -16,7 +16,7 @@ GROUP = "swarmdrive.parts"
 def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
     """Return the groups of settings that installed extensions add to operating points, by name.
 
-    An operating point is the settings that a decision depends on; each group of these, a part, is a
+    An operating point is the settings that a decision depends on. Each group of these, a part, is a
     subclass of `Part`. Those that ship with the harness come first. `taken` has the names of
     settings in use already. A part that cannot be loaded, repeats a setting or refuses its own
     defaults is left out, and a line on stderr says why. The result has the classes by the parts'

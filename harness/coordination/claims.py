@@ -19,8 +19,8 @@ class Claims:
     length 1+H index 0 is the ego and 1+h is helper h; on one of length H, index h is helper h.
     """
 
-    # claimed places, m to the east and to the south of the centroid of the conflict zone, `(...,
-    # 1+H, 2)`; NaN for a helper that is absent
+    # claimed places, m to the east and to the south of the centroid of the conflict zone,
+    # `(..., 1+H, 2)`; NaN for a helper that is absent
     xy_m: Floats
     speed_mps: Floats  # each helper's claimed speed, m/s, `(..., H)`
     time_s: Floats  # when the claims were made, s since the start of the episode, `(...)`
@@ -36,11 +36,17 @@ class Claims:
 
     @cached_property
     def off_road_m(self) -> Floats:
-        """Return how far each claimed place is from the nearest lane's middle, m, `(..., H)`."""
+        """Return how far each place that a helper claims is from the nearest lane, m, `(..., H)`.
+
+        It is the distance to the lane's middle; a large one speaks against the helper.
+        """
         return self.from_road_m(self.xy_m[..., 1:, :])
 
     def take(self, at: Any) -> "Claims":
-        """Return the claims of the decisions at `at`, indices or a mask of the leading axis."""
+        """Return what helpers claim in some of the decisions: those at `at` of the leading axis.
+
+        `at` is an array of indices or a mask.
+        """
         return Claims(
             self.xy_m[at],
             self.speed_mps[at],
@@ -51,9 +57,10 @@ class Claims:
         )
 
     def of_helpers(self, places: Ints) -> "Claims":
-        """Return the claims of other helpers: in each decision those that `places` names.
+        """Return the claimed positions and speeds with the helpers reordered, chosen or repeated.
 
-        `places`, `(..., H')`, are indices of helpers here, from 0; one may be repeated.
+        `places`, `(..., H')`, says for each decision which of the H helpers here, by index from 0,
+        stands at each of H' places.
         """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         return replace(
@@ -64,10 +71,10 @@ class Claims:
         )
 
     def moved(self, movers: Bools, xy_m: Floats) -> "Claims":
-        """Return the claims with the claimed positions of some helpers replaced.
+        """Return the claims with other positions for some helpers, as liars among them state.
 
-        `movers`, `(..., H)`, says which helpers; `xy_m`, `(..., H, 2)`, has their new positions in
-        m.
+        `movers`, `(..., H)`, says which helpers; `xy_m`, `(..., H, 2)`, has their new positions, m
+        to the east and to the south of the centroid of the conflict zone.
         """
         ego, helpers = np.split(self.xy_m, [1], axis=-2)
         return replace(

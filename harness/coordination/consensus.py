@@ -93,37 +93,39 @@ class Rule(Protocol):
 
 @dataclass(frozen=True)
 class Pool:
-    """Make a consensus rule without memory of a function `pool` of (intents, weights).
+    """Make a consensus rule without memory of a function that averages probabilities.
 
-    `pool` takes the intents of the ego and H helpers over A actions, `(..., 1+H, A)`, and their
-    weights, `(..., 1+H)`, which sum to 1 and are 0 for a helper not heard. It returns policies,
-    `(..., A)`: the probabilities of the ego's actions.
+    The function, `pool`, takes the intents of the ego and H helpers over A actions,
+    `(..., 1+H, A)`, and their weights, `(..., 1+H)`, which sum to 1 and are 0 for a helper not
+    heard. It returns policies, `(..., A)`: the probabilities of the ego's actions.
     """
 
+    # takes intents, `(..., 1+H, A)`, and weights, `(..., 1+H)`; returns policies, `(..., A)`
     pool: Callable[[Floats, Floats], Floats]
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
-        """Return the memory of a rule that keeps nothing: zeros of shape `(*batch, 0)`.
+        """Return the rule's memory before an episode: nothing, as zeros of shape `(*batch, 0)`.
 
-        `batch` is the shape of the episodes; the numbers of helpers and actions in each do not
-        matter.
+        `batch` is the shape of the episodes that are fused together; the numbers of helpers and
+        actions in each do not matter.
         """
         return np.zeros((*batch, 0))
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the pool of the messages' intents and weights; `state` is passed on unchanged.
+        """Return the policies that the function makes of the messages, with the vehicles' weights.
 
-        The messages are of one decision of each episode; `state`, `(..., 0)`, is the memory of a
-        rule that keeps nothing.
+        A policy is the probabilities of the ego's actions. The messages are of one decision of each
+        episode; `state`, `(..., 0)`, is the memory of a rule that keeps nothing, and is passed on.
         """
         return Fused(self.pool(messages.intents, messages.weights), messages.weights, state)
 
 
 def inverse_distance_weights(distance_m: Floats, heard: Bools, min_distance_m: float) -> Floats:
-    """Return the weight of each vehicle, `(..., 1+H)`, summing to 1 (paper Eq. 2).
+    """Return how much each vehicle counts in fusion by its distance d, `(..., 1+H)`, summing to 1.
 
-    It falls with the distance. It is 0 for a helper not heard. If no helper is heard, the ego's
-    weight is exactly 1: the paper's fall-back to its own intent.
+    It is Eq. 2 of the paper that this harness follows: weights are 1/d, scaled. It is 0 for a
+    helper not heard. If no helper is heard, the ego's weight is exactly 1, so that its own intent
+    decides.
 
     Args:
         distance_m: distance to the centroid of the conflict zone of the ego (index 0) and H
@@ -157,7 +159,9 @@ def capped(weights: Floats, most: float) -> Floats:
 
 
 def linear_pool(p: Floats, weights: Floats) -> Floats:
-    """Return the weighted mean of intents, `(..., A)` (paper Eq. 1; opinion pool of Stone 1961).
+    """Return the weighted mean of vehicles' intents, `(..., A)`, the linear opinion pool.
+
+    It is Eq. 1 of the paper that this harness follows (Stone 1961).
 
     Args:
         p: intents, the probabilities that the ego (index 0) and H helpers give to A actions of the
@@ -233,10 +237,11 @@ def _pick(values: Floats, reached: Bools) -> Floats:
 
 
 def scaled(pooled: Floats, p: Floats, weights: Floats) -> Floats:
-    """Return the pooled probabilities of A actions, scaled to sum to 1, `(..., A)`.
+    """Return fused probabilities of A actions, `(..., A)`, scaled to sum to 1.
 
-    A row of zeros in `pooled`, `(..., A)`, becomes the linear pool: the mean of the intents `p`,
-    `(..., 1+H, A)`, which the ego and H helpers give to these actions, by `weights`, `(..., 1+H)`.
+    `pooled`, `(..., A)`, are not scaled yet, as medians are not. A row of zeros becomes the linear
+    pool: the mean of the intents `p`, `(..., 1+H, A)`, which the ego and H helpers give to these
+    actions, by `weights`, `(..., 1+H)`.
     """
     total = np.sum(pooled, axis=-1, keepdims=True)
     return np.where(total > 0, pooled / np.where(total > 0, total, 1.0), linear_pool(p, weights))

@@ -68,7 +68,7 @@ class Call:
     def words(self, evidence: str) -> str:
         """Return one helper's free text (`evidence`) as the line that the ego's prompt shows.
 
-        Here it is the text in one line; a package's call may write it in another way.
+        Here it is the text in one line; a package's kind of question may write it in another way.
         """
         return " ".join(evidence.split())
 
@@ -76,10 +76,10 @@ class Call:
 class Content:
     """Describe what helpers' messages hold: the setting `content` of an operating point.
 
-    An operating point is the settings of radio, asking and fusion. Messages hold helpers' intents
-    with their words, words alone, lists of detected objects, or senders' own plans. An intent is
-    probabilities of the ego's actions. Methods of this base class are right for an intent with its
-    words.
+    An operating point is the settings of the radio, of asking helpers and of fusing their messages.
+    Messages hold helpers' intents with their words, words alone, lists of detected objects, or
+    senders' own plans. An intent is probabilities of the ego's actions. Methods of this base class
+    are right for an intent with its words.
     """
 
     holds: frozenset[str]  # the kinds of what such a message holds, some of `KINDS`
@@ -89,7 +89,7 @@ class Content:
 
     @property
     def of_agents(self) -> bool:
-        """Return whether senders decide for themselves, and send what they plan to do."""
+        """Return whether the senders decide for themselves, and send their own plans."""
         return PLANS in self.holds
 
     @property
@@ -100,8 +100,9 @@ class Content:
     def obstacle(self, point: "OperatingPoint", run: "RunFacts") -> str | None:
         """Return why this content cannot be used under an operating point in a run, or None.
 
-        It is one line, which also says what to do instead. `point` is the settings of radio, asking
-        and fusion; `run` has the run's models and prompts, its scenario and its world.
+        It is one line, which also says what to do instead. `point` is the settings of the radio, of
+        asking helpers and of fusing their messages; `run` has the run's models and prompts, its
+        scenario and its world.
         """
         return None
 
@@ -113,7 +114,8 @@ class Content:
         are None.
 
         Args:
-            point: the operating point: the settings of radio, asking and fusion.
+            point: the operating point: the settings of the radio, of asking helpers and of fusing
+                their messages.
             intents: what the ego and H helpers intend in each of the n decisions.
             senders: where messages hold plans, the row, among the n, of the decision that each
                 helper makes itself at this time, `(n, H)`; -1 for none.
@@ -140,16 +142,16 @@ class OfIntent(Content):
 
 
 class Contents(Plugins[Content]):
-    """Hold all contents of messages by name, those of installed packages included.
+    """Hold what helpers' messages can carry, each a `Content`, by name, those of packages included.
 
-    A content says what helpers' messages hold, such as `intent`.
+    Such is `intent`: the probabilities that the helper gives to the ego's actions, with its words.
     """
 
     def check(self, name: str, plugin: Content) -> None:
-        """Raise ValueError if the content `plugin` of a package contradicts itself.
+        """Raise ValueError if what a package's messages carry, `plugin`, contradicts itself.
 
-        Such as one that holds a plan and something beside it. `name` is the one under which the
-        package offers it.
+        Such is one that carries a sender's own plan and something beside it. `name` is the one
+        under which the package offers it.
         """
         if not NAME.fullmatch(name) or name == WHOLE:
             raise ValueError("its name is no plain word")
@@ -196,19 +198,20 @@ def _own_calls() -> frozenset[str]:
 
 
 def is_ours(call: Call) -> bool:
-    """Return whether `call`, a second question to the ego's model, is the harness's own.
+    """Return whether a second question to the ego's model is the harness's own, not a package's.
 
-    It is that of a content of messages that ships, rather than a package's.
+    `call` is that question, of a content: what messages carry. Only one that ships is trusted
+    unchecked.
     """
     return call.name in _own_calls()
 
 
 def of_any_model() -> list[str]:
-    """Return the names of contents of messages that work with every backend.
+    """Return what messages can carry whatever answers for vehicles, by name, such as `objects`.
 
-    A content says what helpers' messages hold, and a backend is what answers for vehicles. One that
-    is no language model, such as a rule, reads no words: contents whose words the ego's model must
-    read are left out, and so are plans.
+    Such a name is a value of the setting `content`. What answers may be no language model but a
+    rule, which reads no words: what the ego's model must read is left out, and so are senders' own
+    plans.
     """
     names = []
     for name, content in CONTENTS.usable().items():

@@ -36,8 +36,9 @@ def obstacle(point: "OperatingPoint", run: "RunFacts") -> str | None:
     """Return why what messages hold at an operating point cannot be used in a run, or None.
 
     Call it in place of `Content.obstacle`, which a package may have written. The text is one line.
-    `point` is the settings of radio, asking and fusion; `run` has the run's models and prompts, its
-    scenario and its world. Raises UserError if a package's content fails or returns no text.
+    `point` is the settings of the radio, of asking helpers and of fusing their messages; `run` has
+    the run's models and prompts, its scenario and its world. Raises UserError if a package's
+    content fails or returns no text.
     """
     content, prompt = point.content, run.agents[0].prompt
     if point.has_fusion_call and content.call and content.call.in_words and not prompt.shows_words:
@@ -58,7 +59,8 @@ def able(point: "OperatingPoint", intents: Intents, senders: Ints | None) -> Int
     changes anything else.
 
     Args:
-        point: the settings of radio, asking and fusion, with the content of messages.
+        point: the settings of the radio, of asking helpers and of fusing their messages, with the
+            content of messages.
         intents: what the ego and H helpers intend in each of the n decisions.
         senders: where messages hold plans, the row, among the n, of the decision that each helper
             makes itself at this time, `(n, H)`; -1 for none.

@@ -113,7 +113,8 @@ def coordinate(
     Raises UserError if a package's plug-in fails.
 
     Args:
-        point: the operating point: the settings of radio, asking and fusion.
+        point: the operating point: the settings of the radio, of asking helpers and of fusing their
+            messages.
         intents: what the ego and up to H helpers intend over A actions in each decision.
         draws: the channel's random numbers.
         fusion: what else is needed; required where the point makes a fusion call (the ego's model
@@ -131,7 +132,8 @@ def fuse(
     package's rule fails.
 
     Args:
-        point: the operating point: the settings of radio, asking and fusion.
+        point: the operating point: the settings of the radio, of asking helpers and of fusing their
+            messages.
         heard: what `exchange` returned for this point and these intents: who was asked and heard.
         intents: what the ego and up to H helpers intend over A actions in each decision.
         fusion: what else is needed; raises ValueError if the point makes a fusion call (the ego's

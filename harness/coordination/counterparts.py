@@ -19,13 +19,14 @@ COUNTERPARTS = Plugins[Callable[[str], str]]("swarmdrive.counterparts", Callable
 def counterparts(
     points: Sequence[OperatingPoint], settings: Mapping[str, Any]
 ) -> Iterator[OperatingPoint]:
-    """Yield for each operating point those that differ from it in one setting, its counterparts.
+    """Yield for each operating point the ones to compare it with, which differ in one setting.
 
-    An operating point is the settings under which a run's decisions are played. `settings` are a
-    run's settings of extensions, values by name; each text of one that is in `COUNTERPARTS` stands
-    for one setting that a counterpart has in addition, such as `loss=1`. Counterparts are in the
-    order of these texts, and within one in that of the points. A point without a channel has none,
-    nor one that states the setting itself. Raises UserError for a text that is not allowed.
+    So a run scores, beside `6g`, the same with lost messages or under attack. An operating point is
+    the settings under which a run's decisions are played. `settings` are a run's settings of
+    extensions, values by name; each text of one that is in `COUNTERPARTS` stands for one setting
+    that a counterpart has in addition, such as `loss=1`. Counterparts are in the order of these
+    texts, and within one in that of the points. A point without a channel has none, nor one that
+    states the setting itself. Raises UserError for a text that is not allowed.
     """
     additions = dict[str, None]()  # each once, in their order
     for name in COUNTERPARTS:

@@ -25,7 +25,9 @@ class Encoding(Protocol):
     """
 
     def packet_bits(self, holds: Held, headers: bool, **counts: Floats | float) -> Floats:
-        """Return the size of messages in bits, 0 where none is sent, in the shape of `counts`.
+        """Return the size in bits of messages as this standard encodes them, 0 where none is sent.
+
+        The result has the shape of `counts`.
 
         Args:
             holds: what they are: an `intent` with its words, a list of `objects`, or a `request`.
@@ -36,9 +38,9 @@ class Encoding(Protocol):
         """
 
     def beacon_bytes(self, rate_hz: float) -> int:
-        """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second.
+        """Return the mean size in bytes of the messages in which a vehicle broadcasts its pose.
 
-        A beacon is what a vehicle broadcasts about itself: pose and speed.
+        They are beacons, sent `rate_hz` times a second; the channel's load follows from it.
         """
 
 
@@ -91,7 +93,7 @@ def object_bits(encoding: str, intents: Intents, headers: bool) -> Floats:
 
 
 def request_bits(encoding: str, helpers: int, headers: bool) -> float:
-    """Return the size in bits of one request of the ego that asks so many helpers.
+    """Return the size in bits of the message in which the ego asks so many helpers.
 
     `encoding` is one of `ENCODINGS`, not `json`. `headers` says whether those of network and
     transport count.
@@ -100,10 +102,10 @@ def request_bits(encoding: str, helpers: int, headers: bool) -> float:
 
 
 def beacon_bytes(encoding: str, rate_hz: float) -> int:
-    """Return the mean size in bytes of a vehicle's beacons, sent `rate_hz` times a second.
+    """Return the mean size in bytes of the messages in which a vehicle broadcasts its pose.
 
-    A beacon is what a vehicle broadcasts about itself. `encoding` is one of `ENCODINGS`, not
-    `json`.
+    They are beacons, sent `rate_hz` times a second; the channel's load follows from it. `encoding`
+    is one of `ENCODINGS`, the standards by which messages are written, not `json`.
     """
     return ENCODINGS[encoding].beacon_bytes(rate_hz)
 

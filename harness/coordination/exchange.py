@@ -101,24 +101,21 @@ class Exchange:
 
     @cached_property
     def messages(self) -> Ints:
-        """Return the number of scheduled replies of all rounds, `(...)`.
+        """Return how many replies were asked for in each decision, in all rounds, `(...)`.
 
-        Each helper that is asked has one a round, whether or not it arrives. Like the paper, this
-        counts no requests.
+        Each helper that is asked has one a round of asking, whether or not it arrives. Requests are
+        not counted, as in the paper that this harness follows.
         """
         return count_of(self.asked) + self.repeats
 
     @cached_property
     def lost(self) -> Ints:
-        """Return the number of asked helpers whose reply did not reach the ego, `(...)`."""
+        """Return how many helpers were asked whose reply did not reach the ego, `(...)`."""
         return count_of(self.asked & ~self.delivered)
 
     @cached_property
     def late(self) -> Ints:
-        """Return the number of replies that came after the decision window, `(...)`.
-
-        They are not fused.
-        """
+        """Return how many replies came after the decision window, too late to be fused, `(...)`."""
         return count_of(self.delivered & ~self.on_time)
 
     @cached_property
@@ -140,11 +137,12 @@ def exchange(
     what `intents` or `draws` lack, or if a package's plug-in fails.
 
     Args:
-        point: the operating point: the settings of radio, asking and fusion.
+        point: the operating point: the settings of the radio, of asking helpers and of fusing their
+            messages.
         intents: what the ego and its H helpers intend, how far they are and how long they infer.
         draws: the channel's random numbers.
-        asked_helpers: mask of the helpers to ask, as far as they are in the ego's radius,
-            `(..., H)`; None leaves the choice to the point's schedule, the rule for whom to ask.
+        asked_helpers: mask of the helpers to ask, as far as they are in the ego's radius, `(...,
+            H)`; None leaves the choice to the point's schedule, the rule for whom to ask.
     """
     own_failed, inputs = _base_knowledge(point, intents)
     in_radius = inputs.may_ask
@@ -187,14 +185,14 @@ def exchange(
 
 
 def needed(point: OperatingPoint, intents: Intents, draws: Draws) -> Bools:
-    """Return a mask of the helpers whose answers can change each decision's outcome, `(..., H)`.
+    """Return which helpers' answers can change a decision's outcome, to ask no others, `(..., H)`.
 
-    `point` has the settings, `intents` what vehicles intend as far as their models were asked, and
-    `draws` the channel's random numbers. It is for asking models lazily: once the models of all
-    these have answered, the answers of others change nothing. They are the helpers that are asked;
-    all in the radius, if the channel's load or the schedule depends on who would answer; and all
-    present ones, if a part (such as an attack) needs them. A helper whose model was not asked yet
-    counts as one with a valid answer.
+    Once the models of all these have answered, the answers of others change nothing. They are the
+    helpers that are asked; all in the radius, if the channel's load or the schedule (the rule for
+    whom to ask) depends on who would answer; and all present ones, if a group of settings (such as
+    an attack's) needs them. `point` has the settings, `intents` what vehicles intend as far as
+    their models were asked, and `draws` the channel's random numbers. A helper whose model was not
+    asked yet counts as one with a valid answer.
     """
     nobody = np.zeros(intents.range_m.shape, dtype=bool)
     if not point.asks:
@@ -283,11 +281,12 @@ def _worth(point: OperatingPoint, inputs: ScheduleInputs) -> Floats:
 
 
 def known_of(point: OperatingPoint, intents: Intents, draws: Draws) -> ScheduleInputs:
-    """Return what the ego knows before it asks anybody, the input of the point's schedule.
+    """Return what the ego knows before it asks anybody, by which a schedule says whom to ask.
 
-    The schedule of the operating point `point` is the rule for whom to ask. `intents` has what
-    vehicles intend, of which the ego knows its own, and `draws` the channel's random numbers.
-    Raises UserError if it needs positions and the decisions have none, as in the paper's study.
+    The schedule is that of the operating point `point`. `intents` has what vehicles intend, of
+    which the ego knows its own, and `draws` the channel's random numbers. Raises UserError if it
+    needs positions and the decisions have none, as in the study of the paper that this harness
+    follows.
     """
     return _with_schedule_needs(point, _base_knowledge(point, intents)[1], intents, draws)
 

@@ -69,9 +69,9 @@ class Intents:
     own_text_bytes: Floats | None = None  # bytes of the text in it, `(...)`; else None
 
     def take(self, at: Any) -> "Intents":
-        """Return some decisions: those at `at` of the leading axis of all arrays.
+        """Return what vehicles intend in some of the decisions: those at `at` of the leading axis.
 
-        `at` is an array of indices or a mask.
+        `at` is an array of indices or a mask, by which all arrays are indexed.
         """
         return replace(
             self,
@@ -83,10 +83,10 @@ class Intents:
         )
 
     def replaced(self, at: Ints, newer: "Intents") -> "Intents":
-        """Return a copy in which the decisions at indices `at`, `(k,)`, have the arrays of `newer`.
+        """Return a copy in which some decisions have newer answers, as after helpers are asked.
 
-        `newer` has k decisions, in that order. `site`, `outlook`, `claims` and `plans` stay those
-        of this object.
+        The decisions at indices `at`, `(k,)`, get the arrays of `newer`, which has k decisions in
+        that order. `site`, `outlook`, `claims` and `plans` stay those of this object.
         """
         arrays = {name: array.copy() for name, array in self.arrays().items()}
         for name, values in newer.arrays().items():
@@ -150,10 +150,10 @@ class Intents:
 
     @classmethod
     def joined(cls, parts: "Sequence[Intents]") -> "Intents":
-        """Return the decisions of several objects, `parts`, as one, along the leading axis.
+        """Return what vehicles intend in the decisions of several objects, one after another.
 
-        All must have the same numbers of helpers and actions, the same optional arrays, and None as
-        `site`, `outlook`, `claims` and `plans`.
+        `parts` are the objects. All must have the same numbers of helpers and actions, the same
+        optional arrays, and None as `site`, `outlook`, `claims` and `plans`.
         """
         arrays = [part.arrays() for part in parts]
         joint: dict[str, Any] = {}
@@ -162,9 +162,9 @@ class Intents:
         return cls(**joint)
 
     def of_first(self, helpers: int) -> "Intents":
-        """Return the same decisions with only the first `helpers` helpers of each.
+        """Return the same decisions with only the first `helpers` helpers, as a smaller scene has.
 
-        Its `site`, `outlook` and `claims` must be None.
+        `site`, `outlook` and `claims` must be None.
         """
         cut = {
             name: array[..., : helpers + (name in WITH_EGO)]
@@ -176,8 +176,8 @@ class Intents:
     def of_helpers(self, places: Ints) -> "Intents":
         """Return the same n decisions with other helpers: in each those that `places` names.
 
-        `places`, `(n, H')`, are indices of the H helpers here, from 0. One may be repeated: one
-        vehicle then speaks with several voices.
+        `places`, `(n, H')`, are indices of the H helpers here, from 0. One may be repeated, as an
+        attacker is that sends as several vehicles.
         """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
         selected = {
@@ -197,9 +197,10 @@ class Intents:
         )
 
     def arrays(self) -> dict[str, Any]:
-        """Return the arrays that are not None, by the name of the field.
+        """Return the arrays of what vehicles intend, by name of the field, without those at None.
 
-        Left out are `site`, `outlook`, `claims` and `plans`, which are records of arrays.
+        It is for code that does the same to each, such as indexing. `site`, `outlook`, `claims` and
+        `plans`, which are records of arrays, are left out.
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {

@@ -31,8 +31,8 @@ CLOUD = OperatingPoint("cloud", cloud=Cloud(round_trip_s=0.51))
 def named_point(text: str) -> OperatingPoint:
     """Return the operating point that a text states, as `6g:consensus=ego-prompt,window_s=0.4`.
 
-    An operating point is the settings of radio, asking and fusion, under which a run's decisions
-    are played.
+    An operating point is the settings of the radio, of asking helpers and of fusing their messages,
+    under which a run's decisions are played.
 
     Before the colon is the name of one of the paper's points, or of a channel profile, which stands
     for a point with that profile and the defaults. Behind it are settings by name; one may have its
@@ -93,11 +93,12 @@ def named_point(text: str) -> OperatingPoint:
 
 
 def misnamed(settings: Mapping[str, Any]) -> list[str]:
-    """Return the names of a condition's recorded settings that its own name does not stand for.
+    """Return which recorded settings of a condition are not those that its name stands for.
 
-    `settings` has the values by name, and among them the condition's own `name`, such as
-    `6g:window_s=0.4`: a text from which `named_point` would make other values of the settings
-    returned. The list is empty for a name that it cannot read, as of a point made in Python.
+    A name such as `6g:window_s=0.4` states settings, so a run whose record has others is not what
+    it says. `settings` has the values by name, and among them the condition's own `name`. Returned
+    are the names of the settings that `named_point` makes otherwise of it; none for a name that it
+    cannot read, as of a condition made in Python.
     """
     name = str(settings["name"])
     try:
@@ -115,9 +116,9 @@ SHORT = {"tau": ("tau_nats", 1.0), "window": ("window_s", 1e-3), "latency": ("la
 
 
 def setting_of(key: str, text: str) -> object:
-    """Return the value of an operating point's setting from its text, in the type of its default.
+    """Return a setting's value from the text that a user typed, such as the number of `0.5`.
 
-    `key` is the setting's name, such as `tau_nats`. A text that cannot be converted is returned as
-    it is, and refused where the point is made.
+    `key` is the setting's name; its default says of which type the value is. A text that cannot be
+    converted is returned as it is, and refused where the settings are put together.
     """
     return value_of(POINTS["6g"].setting(key), text)

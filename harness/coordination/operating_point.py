@@ -79,13 +79,17 @@ class Rewrites(NamedTuple):
     of the key under which its answer is kept.
     """
 
-    question: str = ""  # name of the question that helpers were asked; empty for the ordinary one
-    changes: Changes = Changes()  # names of the changes that attacks and defences make to messages
-    # name of the second question that the content, what messages carry, puts to the ego's model
-    # (`contents.Call`); empty if it has none
+    # name of the question that helpers were asked, such as one that shows them nothing; empty for
+    # the ordinary one, what the ego should do
+    question: str = ""
+    # names of the changes that attacks, and defences against these, make to messages
+    changes: Changes = Changes()
+    # name of the second question to the ego's model, if messages carry what the first cannot show,
+    # such as lists of objects; empty for none
     call: str = ""
     whole: bool = True  # whether the prompt shows all of each message
-    elsewhere: bool = False  # whether messages come from other scenes, as in a control
+    # whether messages come from other scenes, to test whether what they say matters
+    elsewhere: bool = False
 
 
 AS_SENT = Rewrites()
@@ -110,7 +114,8 @@ class OperatingPoint:
     fusion: Fusion = Fusion()  # noqa: RUF009
     # how far away the ego's model is, if not in the vehicle
     cloud: Cloud = Cloud()  # noqa: RUF009
-    # extensions' parts that differ from their defaults, in the order of `more_parts`
+    # groups of settings that extensions add, those that differ from their defaults, in the order of
+    # `more_parts`
     more: tuple[Part, ...] = ()
 
     def __post_init__(self) -> None:
@@ -195,9 +200,9 @@ class OperatingPoint:
 
     @staticmethod
     def types() -> dict[str, Any]:
-        """Return the type of each value in the table that `record` returns, by key.
+        """Return the type of each setting by its name, such as `float` for `tau_nats`.
 
-        A type is an annotation, such as `float`.
+        The names are the keys of the table that `record` returns; a type is an annotation.
         """
         hints = {part: get_type_hints(kind) for part, kind in {**PARTS, **more_parts()}.items()}
         types: dict[str, Any] = {"name": str}
@@ -206,10 +211,10 @@ class OperatingPoint:
         return types
 
     def record(self) -> dict[str, Any]:
-        """Return a table for run files: `name`, and all settings by flat name.
+        """Return all settings as a table for run files, by flat name, with the `name`.
 
-        `from_dict` makes an equal point of it. Settings of an extension's part that has only its
-        defaults are left out, so that runs without that extension can be read where it is not
+        `from_dict` makes an equal object of it. An extension's group of settings that has only its
+        defaults is left out, so that runs without that extension can be read where it is not
         installed.
         """
         active = {type(part) for part in self.more}
@@ -300,12 +305,12 @@ class OperatingPoint:
 
     @cached_property
     def physical(self) -> Physical | None:
-        """Return the channel if its losses follow from vehicles' positions, else None."""
+        """Return the radio channel if its losses follow from where vehicles are, else None."""
         return self.channel if isinstance(self.channel, Physical) else None
 
     @property
     def antennas(self) -> Collection[Antenna]:
-        """Return the antennas on no vehicle whose links the channel needs, such as by the road.
+        """Return the antennas beside the road and the like whose radio links are to be computed.
 
         There are none where the channel is not `physical`, since links then have no positions.
         """
@@ -335,7 +340,8 @@ class OperatingPoint:
     def idle(self, setting: str | None) -> str | None:
         """Return why changing one setting of this point cannot change a result; None if it may.
 
-        The reason is a part of a sentence, such as "it has no channel".
+        A sweep refuses such a setting. The reason is a part of a sentence, such as "it has no
+        channel".
 
         Args:
             setting: name of a setting of the point or of its channel; None for the number of
@@ -377,11 +383,11 @@ class OperatingPoint:
         return None
 
     def prepared(self, intents: Intents) -> Intents:
-        """Return what vehicles intend in n decisions after extensions' parts have corrected it.
+        """Return what vehicles intend in n decisions, corrected as a calibration says.
 
-        An intent is the probabilities of the actions; a part is a group of settings, such as those
-        of a calibration. This is done
-        first, before a fallback replaces a failed answer, a helper is asked, or intents are fused.
+        An intent is the probabilities of the actions; any group of an extension's settings may
+        correct it. This is done first, before a fallback replaces a failed answer, a helper is
+        asked, or intents are fused.
         """
         for part in self.more:
             intents = prepared(part, intents)
@@ -438,14 +444,17 @@ class OperatingPoint:
 
     @property
     def content(self) -> Content:
-        """Return what helpers' messages hold, such as an intent with words, by `ask.content`."""
+        """Return what helpers' messages carry, such as probabilities of actions with words.
+
+        The setting `content` names it.
+        """
         return CONTENTS[self.ask.content]
 
     @property
     def request_bits(self) -> float:
-        """Return the size in bits of the request that an ego sends to helpers.
+        """Return the size in bits of the message by which an ego asks helpers.
 
-        It follows from how messages are encoded.
+        It is the setting, or follows from the standard by which messages are encoded.
         """
         if self.radio.encoding == JSON:
             return self.ask.request_bits
@@ -458,26 +467,28 @@ class OperatingPoint:
 
     @property
     def asks_again(self) -> bool:
-        """Return whether the settings ask the ego's model a second time, with what it has heard.
+        """Return whether these settings ask the ego's model a second time, with what it has heard.
 
-        That is so with the consensus `ego-prompt` or a content that has a call, even if the point
-        has no channel over which the ego could hear anything.
+        That is so with the consensus `ego-prompt`, or if messages carry what only a second prompt
+        can show, such as objects. It is so even without a channel over which the ego could hear
+        anything.
         """
         return self.fusion.consensus == EGO_PROMPT or self.content.call is not None
 
     @property
     def asks_twice(self) -> str:
-        """Return in words which setting causes a second question to the ego's model."""
+        """Return in words, for a message, which setting asks the ego's model a second time."""
         if self.content.call:
             return f"content is {self.ask.content}"
         return f"consensus is {EGO_PROMPT}"
 
     @cached_property
     def question(self) -> Question:
-        """Return the question that helpers are asked: the ordinary one unless a part has another.
+        """Return the question that helpers' models are asked under these settings.
 
-        The ordinary one is what the ego should do, as the helper sees it. Raises UserError if a
-        package's part returns a question that is not in its `questions`.
+        The ordinary one is what the ego should do, as the helper sees it; an extension's group of
+        settings may have another. Raises UserError if a package's returns one that is not in its
+        `questions`.
         """
         if self.radio.profile is None:
             return PLAIN
@@ -505,9 +516,10 @@ class OperatingPoint:
 
     @property
     def rewrites(self) -> "Rewrites":
-        """Return how fusion calls under this point show helpers' messages to the ego's model.
+        """Return how helpers' messages are shown when the ego's model is asked a second time.
 
-        A fusion call is a second question to that model, with what the ego has heard.
+        That is with what the ego has heard (a fusion call). It says which attacks and defences
+        change them.
         """
         call = self.content.call
         name = call.name if call else ""
@@ -517,9 +529,9 @@ class OperatingPoint:
 
     @property
     def shows_words(self) -> bool:
-        """Return whether the prompt of a fusion call has messages or words, not only objects.
+        """Return whether the ego's model reads messages or words of helpers, not only objects.
 
-        A fusion call is a second question to the ego's model, with what the ego has heard.
+        It reads them in a fusion call, a second question with what the ego has heard.
         """
         call = self.content.call
         return self.fusion.consensus == EGO_PROMPT or (call is not None and call.in_words)
@@ -536,10 +548,9 @@ class OperatingPoint:
         return Changes(of_attackers, tuple(chain(*(changes.of_all for changes in each))))
 
     def speaker(self) -> Speaker:
-        """Return a new object that decides what helpers send in one walk through a run's episodes.
+        """Return a new object that decides what helpers send, the truth or what attackers say.
 
-        It is that of a part, such as attackers, or one that sends the true intents. It may keep
-        state, so each walk needs its own.
+        It is for one walk through a run's episodes; it may keep state, so each walk needs its own.
         """
         for part in self.more:
             if speaker := speaker_of(part):
@@ -599,9 +610,9 @@ class OperatingPoint:
 def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
     """Return what a run must store of the things that its operating points name.
 
-    Such a thing is the calibration of a model. The outer key is a folder of the run, the inner one
-    a name in it. Raises UserError if a package's part fails, or gives a name that is no plain file
-    name.
+    An operating point is a set of settings; such a thing is the calibration of a model. The outer
+    key is a folder of the run, the inner one a name in it. Raises UserError if a package's code
+    fails, or gives a name that is no plain file name.
     """
     kept: dict[str, dict[str, Kept]] = {}
     for point in points:
@@ -617,11 +628,12 @@ def kept_of(points: Iterable[OperatingPoint]) -> dict[str, dict[str, Kept]]:
 
 
 def as_here(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's recorded settings without extensions' parts that do nothing.
+    """Return a condition's recorded settings without those of extensions that do nothing.
 
-    A condition is an operating point of a run; `settings` are values by flat name. A part, a group
-    of settings, does nothing if all of it are at their defaults. Raises UserError for a setting
-    that does something and whose extension is not installed.
+    So a run of a version with more extensions can be read. A condition is an operating point of a
+    run, a set of settings; `settings` are values by flat name. A part, an extension's group of
+    them, does nothing if all are at their defaults. Raises UserError for a setting that does
+    something and whose extension is not installed.
     """
     here = without_gone(settings)
     for kind in more_parts().values():

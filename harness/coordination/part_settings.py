@@ -43,18 +43,19 @@ PARTS: dict[str, type[Part]] = {
 def more_parts() -> Mapping[str, type[Part]]:
     """Return the groups of settings that installed extensions add to operating points, by name.
 
-    An operating point is all settings of radio, asking and fusion that a decision depends on. Each
-    is a subclass of `Part`. Imports the extensions' packages.
+    An operating point is all settings of the radio, of asking helpers and of fusing their messages
+    that a decision depends on. Each group is a subclass of `Part`, a class. The extensions'
+    packages are imported.
     """
     return added_parts([key for kind in PARTS.values() for key in kind.__struct_fields__])
 
 
 @cache
 def part_of_settings() -> Mapping[str, str]:
-    """Return the name of the part that each setting of an operating point belongs to.
+    """Return which group each setting of an operating point belongs to, by the setting's name.
 
-    A part is a group of settings, such as `radio` or `fusion`. The keys are the settings' names, in
-    the order of the records in manifests and run files.
+    A group, or part, is such as `radio` or `fusion`; the values are its name. The order is that of
+    the settings in manifests and run files.
     """
     part_of = [(key, part) for part, kind in PARTS.items() for key in kind.__struct_fields__]
     behind: dict[str, set[str]] = {}  # parts that stand behind the same setting, in their order
@@ -69,7 +70,7 @@ def part_of_settings() -> Mapping[str, str]:
 
 @cache
 def typed_settings() -> tuple[str, ...]:
-    """Return the names of the settings that can be typed in a condition, such as `tau_nats`.
+    """Return the names of the settings that a user can type in a condition, such as `tau_nats`.
 
     A condition is the text of an operating point, such as `6g:tau_nats=0.5`.
     """
@@ -78,14 +79,22 @@ def typed_settings() -> tuple[str, ...]:
 
 @cache
 def settings_alone() -> Collection[str]:
-    """Return the names of an operating point's settings that act on an ego without a radio, too."""
+    """Return the names of the settings that matter even to an ego that has no radio.
+
+    They are settings of an operating point, all that a decision depends on besides scene and model,
+    such as `fallback`, what replaces a failed answer.
+    """
     core = ("fallback", "round_trip", "round_trip_s", "window_s")
     of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_ego]
     return {*core, *chain(*of_extensions)}
 
 
 def settings_of_radio() -> tuple[str, ...]:
-    """Return the names of the settings that mean nothing to an operating point without channel."""
+    """Return the names of the settings that mean nothing to an ego that has no radio.
+
+    They are settings of an operating point, all that a decision depends on besides scene and model,
+    such as `loss`, the probability that a transmission is lost.
+    """
     of_extensions = [kind.__struct_fields__ for kind in more_parts().values() if kind.of_radio]
     return (*OVERRIDES, *chain(*of_extensions))
 
@@ -105,11 +114,10 @@ def change_of(text: str) -> Change:
 
 @cache
 def calls() -> Mapping[str, Call]:
-    """Return the second questions that contents of messages ask the ego's model, by name.
+    """Return the second questions that show the ego's model what the ego has heard, by name.
 
-    A content is what messages hold, such as intents. It may have the ego's model asked again, with
-    what the ego has heard; such a question is a call. A package's call is left out if some part
-    already changes messages by that name.
+    They belong to what messages carry, such as lists of objects, which the first prompt cannot
+    show. A package's is left out if some group of settings already changes messages by that name.
     """
     by_name: dict[str, Call] = {}
     for content in CONTENTS.usable().values():
@@ -125,10 +133,10 @@ def _changes_messages(text: str) -> bool:
 
 @cache
 def questions() -> Mapping[str, Question]:
-    """Return the questions that helpers may be asked by installed parts, by name.
+    """Return the questions that helpers' models may be asked, by name.
 
-    A part is a group of settings, such as a control's.
-    The ordinary one, what the ego should do as the helper sees it, has the name "".
+    The ordinary one, what the ego should do as the helper sees it, has the name ""; extensions add
+    others, such as one that shows the helper nothing, as a control.
     """
     others = chain(*(kind.questions for kind in more_parts().values()))
     return {"": PLAIN, **{question.name: question for question in others}}
@@ -137,9 +145,9 @@ def questions() -> Mapping[str, Question]:
 def question_under(settings: Mapping[str, Any]) -> Question:
     """Return the question that helpers were asked under a condition, as a run has recorded it.
 
-    A condition is all settings of radio, asking and fusion, in groups called parts. `settings` are
-    the values of the condition's settings by name, such as `tau_nats`. Settings that belong to no
-    installed part are ignored.
+    A condition is all settings of the radio, of asking helpers and of fusing their messages, in
+    groups called parts. `settings` are the values of the condition's settings by name, such as
+    `tau_nats`. Settings that belong to no installed part are ignored.
     """
     for kind in more_parts().values():
         part_settings = {key: settings[key] for key in kind.__struct_fields__ if key in settings}
@@ -149,10 +157,11 @@ def question_under(settings: Mapping[str, Any]) -> Question:
 
 
 def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a condition's settings without those of extensions that are not installed.
+    """Return a recorded condition's settings without those of extensions that are not installed.
 
-    `settings` are values by name, such as `tau_nats`. Raises UserError if such a setting has
-    another value than the one that does nothing.
+    So its run can be read here. A condition is a set of settings that a run scores; `settings` are
+    values by name, such as `tau_nats`. Raises UserError if such a setting has another value than
+    the one that does nothing.
     """
     kept: dict[str, Any] = {}
     for key, value in settings.items():
@@ -165,16 +174,17 @@ def without_gone(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def gone_setting(setting: str) -> OfExtension | None:
-    """Return the extension that a setting belongs to, if it is one that is not installed.
+    """Return the extension that a setting belongs to, if it is not installed here; else None.
 
-    `setting` is the name of a condition's setting. None for every other one.
+    `setting` is the name of a setting of a condition, the settings under which a run is scored.
     """
     return None if setting in part_of_settings() else setting_of_extension(setting)
 
 
 def lacking_setting(setting: str, value: object, gone: OfExtension) -> str:
-    """Return one line for an error on a condition's setting whose extension is not installed.
+    """Return the error text on a condition's setting whose extension is not installed, one line.
 
-    `value` is what the condition has for `setting`; `gone` is the extension that it belongs to.
+    A condition is a set of settings that a run scores. `value` is what it has for `setting`; `gone`
+    is the extension that it belongs to.
     """
     return f"setting {setting}={printable(value)} of a condition is {part_of(gone.extension)}"

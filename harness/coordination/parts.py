@@ -58,10 +58,10 @@ class Kept(NamedTuple):
 
 @dataclass(frozen=True)
 class Question:
-    """Describe the question that a helper's model is asked: what the ego should do, as it sees it.
+    """Describe what a helper's model is asked: what the ego should do, as the helper sees it.
 
-    Subclasses ask it with a changed scene graph, what the helper knows of the scene, as a control
-    that shows nothing does.
+    Subclasses ask it with a changed scene graph, what the helper knows of the scene. Such is a
+    control that shows the helper nothing, to test whether what it sees matters.
     """
 
     # its name, empty for the ordinary question; it ends the key under which its answers are kept,
@@ -71,9 +71,9 @@ class Question:
     pictured: bool = True  # whether the prompt may have the picture of the helper's camera
 
     def shown(self, graph: "SceneGraph") -> "SceneGraph":
-        """Return the scene graph to put in the helper's prompt, given the helper's own.
+        """Return what the helper's prompt shows of the scene, given what the helper knows.
 
-        A scene graph is what one vehicle knows of a scene.
+        Both are scene graphs, what one vehicle knows of a scene. Here it is unchanged.
         """
         return graph
 
@@ -82,14 +82,17 @@ PLAIN = Question()
 
 
 class Change(Protocol):
-    """Describe a change of helpers' messages before a fusion call shows them, such as an attack.
+    """Describe how an attack, or a defence, changes messages before the ego's model reads them.
 
-    A fusion call is a second question to the ego's model, which shows it what it has heard.
+    The model is asked a second time, with the messages that the ego heard (a fusion call).
     """
 
     @property
     def adds(self) -> bool:
-        """Return whether this change adds text that no other may touch, and so is applied last."""
+        """Return whether this change to messages adds text that no other change may touch.
+
+        It is then applied last.
+        """
 
     def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         """Return a helper's message, a record with its `intent`, as the prompt is to show it.
@@ -107,23 +110,26 @@ class Change(Protocol):
 
 
 class Changes(NamedTuple):
-    """Hold the names of the changes that a part makes to messages before a fusion call shows them.
+    """Name how attacks and defences change messages before the ego's model reads them.
 
-    A fusion call is a second question to the ego's model, which shows it what it has heard. The
+    The model is asked a second time, with the messages that the ego heard (a fusion call). The
     names become part of the key under which its answer is kept, so they hold no `+` and no `&`.
     """
 
-    # names of the changes to messages of attackers, several joined by `&`; empty for none
+    # name of the change to messages of helpers that attack, such as `liar:share=1/3`; several are
+    # joined by `&`; empty for none
     of_attackers: str = ""
-    # names of the changes to messages of all helpers, in the order in which they are made
+    # names of the changes to messages of all helpers, such as `quoted`, in the order in which they
+    # are made
     of_all: tuple[str, ...] = ()
 
 
 class ActsOn(NamedTuple):
-    """Describe a setting that needs messages of certain kinds, such as intents or words.
+    """Describe a setting that only matters if messages carry certain things, such as words.
 
-    It is refused where the operating point's messages hold nothing of these kinds. The content is
-    what messages hold.
+    A text attack, for example, needs words. Where the operating point's messages carry none of
+    `kinds`, the setting is refused. An operating point is the set of settings that a decision
+    depends on.
     """
 
     setting: str  # name of the setting
@@ -137,9 +143,9 @@ class ActsOn(NamedTuple):
 
 
 class RunFacts(Protocol):
-    """Describe the run in which a condition is to be played, so that a part can refuse it.
+    """Describe the run in which settings are to be used, so that they can be refused for it.
 
-    A condition is all settings of radio, asking and fusion, and a part one group of them.
+    Settings are those of a condition, which the run scores.
     """
 
     @property
@@ -151,19 +157,22 @@ class RunFacts(Protocol):
 
     @property
     def scenario(self) -> Any:
-        """Return the run's scenario, a `harness.world.scenario.Scenario`."""
+        """Return the run's scenario, a kind of traffic situation.
+
+        It is a `harness.world.scenario.Scenario`.
+        """
 
     @property
     def ego_alone(self) -> bool:
-        """Return whether the model answers only for the ego, and helpers have other answers."""
+        """Return whether the run's model answers only for the ego, so that no helper is asked."""
 
     @property
     def several_decide(self) -> bool:
-        """Return whether vehicles beside the ego decide for themselves, too."""
+        """Return whether, in the run, vehicles beside the ego decide for themselves, too."""
 
     @property
     def frozen(self) -> bool:
-        """Return whether scenes are recorded (`harness eval`), not simulated (`harness drive`)."""
+        """Return whether the run's scenes are recorded (`harness eval`), not simulated."""
 
 
 class Part(Struct, frozen=True, kw_only=True):
@@ -211,9 +220,10 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @property
     def acts_on(self) -> Collection[ActsOn]:
-        """Return the settings, with their values now, that need messages of some kind.
+        """Return which of these settings, as they are now, only matter if messages carry some kind.
 
-        A kind is what messages hold, such as intents or words.
+        A kind is what messages carry, such as probabilities of actions, words or objects; each is
+        refused where there is none of its kinds.
         """
         return ()
 
@@ -231,17 +241,19 @@ class Part(Struct, frozen=True, kw_only=True):
         """
 
     def carried(self, point: "OperatingPoint", channel: Channel) -> Channel:
-        """Return the channel that carries messages under `point`, given that without this part.
+        """Return the radio channel that carries messages, changed by this group of settings.
 
-        `channel` is the latter: the profile's, with the point's settings and what earlier parts
-        return. Only a part that ships may return another, such as one with a second path.
+        `channel` is that without it: the profile's, with the settings of `point` and what earlier
+        groups return. Only a group that ships may return another, such as one with a second path.
         """
         return channel
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
-        """Return why this group of settings cannot be used in `run`; None if it can.
+        """Return why a run cannot use these settings; None if it can.
 
-        `point` is the operating point, all settings. The text also says what to do instead.
+        The text also says what to do instead. `run` has the run's models, scenario and world;
+        `point` is the operating point: all settings that a decision depends on, of which these are
+        a group.
         """
 
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
@@ -264,7 +276,7 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @property
     def needs_all(self) -> bool:
-        """Return whether this part needs the intents of all helpers present.
+        """Return whether these settings need the answers of all helpers, as an attack's may.
 
         Otherwise those of the helpers that are asked are enough.
         """
@@ -272,47 +284,49 @@ class Part(Struct, frozen=True, kw_only=True):
 
     @property
     def antennas(self) -> Collection[Antenna]:
-        """Return the antennas on no vehicle whose links the channel needs, as one by the road.
+        """Return the antennas beside the road and the like whose radio links these settings need.
 
-        Only those of a part that ships are used, and only where losses follow from positions.
+        Only those of a group that ships are used, and only where losses follow from positions.
         """
         return ()
 
     @property
     def question(self) -> Question:
-        """Return the question that helpers' models are asked: one of `questions`, or `PLAIN`.
+        """Return the question that helpers' models are asked under these settings.
 
-        The latter is the ordinary one: what the ego should do, as the helper sees it.
+        It is one of `questions`, or `PLAIN`, the ordinary one: what the ego should do, as the
+        helper sees it.
         """
         return PLAIN
 
     @property
     def elsewhere(self) -> bool:
-        """Return whether the ego hears helpers of other scenes than its own, a control.
+        """Return whether the ego hears helpers of other scenes than its own.
 
-        Then `sources` says of which.
+        It is a control, to test whether what messages say matters; `sources` says of which scenes.
         """
         return False
 
     def speaker(self) -> "Speaker | None":
-        """Return a new object that decides what helpers send; None if they send the truth.
+        """Return a new object that decides what helpers send, as attackers do; None for the truth.
 
         Each walk through a run's episodes asks for one of its own, which may keep state.
         """
 
     def changes(self, words: bool, objects: bool) -> Changes:
-        """Return the names of the changes to messages before a fusion call shows them.
+        """Return the names of the changes to messages before the ego's model reads them.
 
-        A fusion call is a second question to the ego's model, which shows it what it has heard;
-        `words` and `objects` say whether it shows messages' words, and their objects.
+        That is in a fusion call, in which the model is asked a second time with what the ego has
+        heard; `words` and `objects` say whether it shows messages' words, and their objects.
         """
         return Changes()
 
     @classmethod
     def change(cls, text: str) -> Change | None:
-        """Return the change that a text, such as `liar:share=1/3`, names.
+        """Return the change to messages that a text such as `liar:share=1/3` names, or None.
 
-        The text is one of the names that `changes` returned. None if this part has no such change.
+        The text is one of the names that `changes` returned, read back from the key of a stored
+        answer.
         """
 
     def after_call(self, fused: "Floats", intents: "Floats", heard: "Bools") -> "Floats":
@@ -384,8 +398,9 @@ class Part(Struct, frozen=True, kw_only=True):
     def before(self, intents: "Intents") -> "Intents":
         """Return what vehicles intend in n decisions, corrected before anything else uses it.
 
-        A calibration does so. Of `intents` only `own`, `(n, A)`, and `helpers`, `(n, H, A)`, the
-        probabilities of actions, may change; a failed or missing answer is a row of NaN.
+        A calibration corrects probabilities so. Of `intents` only `own`, `(n, A)`, and `helpers`,
+        `(n, H, A)`, the probabilities of actions, may change; a failed or missing answer is a row
+        of NaN.
         """
         return intents
 
@@ -395,26 +410,28 @@ PACKAGES_PARTS: dict[type[Part], str] = {}
 
 
 def is_ours(part: Part) -> bool:
-    """Return whether a part of an operating point ships with the harness, not with a package.
+    """Return whether a group of settings ships with the harness, not with a package.
 
-    A part is a group of settings; only one that ships is trusted unchecked.
+    `part` is such a group, of an operating point; only one that ships is trusted unchecked.
     """
     return type(part) not in PACKAGES_PARTS
 
 
 def worded_part(part: Part) -> AbstractContextManager[None]:
-    """Return a context in which what fails in a package's part becomes a one-line UserError.
+    """Return a context in which an error of a package's settings becomes a one-line UserError.
 
-    It is to be entered around each call of a hook of `part`. For a part that ships, errors pass.
+    It is to be entered around each call of a hook (a method to override) of `part`, a group of
+    settings. For a part that ships, errors pass.
     """
     return worded(PACKAGES_PARTS.get(type(part), ""), built_in=is_ours(part))
 
 
 @contextmanager
 def telling(part: Part) -> Iterator[None]:
-    """Enter a context in which what fails in a package's part becomes a one-line UserError.
+    """Enter a context in which an error of a package's settings becomes a one-line UserError.
 
-    A ValueError passes as it is: by it a part refuses its settings.
+    `part` is the group of settings. A ValueError passes as it is: by it a part refuses its
+    settings.
     """
     refused = None
     with worded_part(part):
@@ -427,7 +444,7 @@ def telling(part: Part) -> Iterator[None]:
 
 
 def wrong(key: str, value: object, allowed: str) -> ValueError:
-    """Return, for the caller to raise, the ValueError on a setting's value that is not allowed.
+    """Build the ValueError for a setting whose value is not allowed; the caller raises it.
 
     It says that the setting `key` is `value` and must be what `allowed` says in words.
     """
@@ -507,9 +524,10 @@ class Ask(Part, frozen=True, kw_only=True):
 
     @property
     def above(self) -> float:
-        """Return the worth of asking above which the ego asks a helper.
+        """Return the least worth of asking a helper at which the ego does not yet ask.
 
-        It is nats under the schedule `entropy`, else in the unit of the schedule.
+        A schedule, the rule for whom to ask, computes the worth: in nats under the schedule
+        `entropy`, else in a unit of its own.
         """
         if self.schedule == PAPER:
             return self.tau_nats
@@ -526,9 +544,11 @@ class Radio(Part, frozen=True, kw_only=True):
     profile: Text | None = None  # name of the channel profile, such as `6g`; None disables V2V
     # probability that one transmission is lost; None keeps that of the profile or of the link
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")] | None = None
-    latency_s: Seconds | None = None  # nominal seconds of one exchange; None keeps the profile's
-    density_coupled: Flag = False  # whether loss follows the number of active vehicles
-    # whether a helper whose entropy is above tau opens a round of its own, which loads the channel
+    # seconds that one request with its replies takes, without losses; None keeps the profile's
+    latency_s: Seconds | None = None
+    density_coupled: Flag = False  # whether loss grows with the number of vehicles in the scene
+    # whether a helper that is unsure itself (entropy above `tau_nats`) asks others, too, which
+    # loads the channel
     helper_rounds: Flag = False
     # how messages are encoded, which is their size (`harness.coordination.encodings`)
     encoding: Text = JSON

@@ -46,9 +46,9 @@ if TYPE_CHECKING:
 def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
     """Return why a part of an operating point cannot be used in a run, or None if it can.
 
-    The text is one line. `point` is the operating point, the settings of radio, asking and fusion;
-    `run` has the run's agents (models with their prompts), its scenario and its world. Raises
-    UserError if a package's part fails or returns no text.
+    The text is one line. `point` is the operating point, the settings of the radio, of asking
+    helpers and of fusing their messages; `run` has the run's agents (models with their prompts),
+    its scenario and its world. Raises UserError if a package's part fails or returns no text.
     """
     if is_ours(part):
         return part.obstacle(point, run)
@@ -57,11 +57,11 @@ def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
 
 
 def prepared(part: Part, intents: Intents) -> Intents:
-    """Return what vehicles intend in n decisions as a part's `before` corrects it.
+    """Return what vehicles intend in n decisions, corrected by one group of settings.
 
-    A part is a group of settings, as a calibration's. `intents` has probabilities of actions;
-    `before` is the part's hook that may correct them. Raises UserError if a package's part fails,
-    changes more than `own` and `helpers`, or returns no distribution for an answer.
+    The group, `part`, is such as a calibration's, and `intents` has probabilities of actions. What
+    a package's code returns is checked. Raises UserError if it fails, changes more than `own` and
+    `helpers`, or returns no distribution for an answer.
     """
     if is_ours(part):
         return part.before(intents)
@@ -151,11 +151,11 @@ def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floa
 
 @dataclass(frozen=True)
 class ChangeOfPart:
-    """Wrap a package's change of helpers' messages, such as an attack's, and check what it returns.
+    """Guard a package's change of helpers' messages, such as an attack's: check what it returns.
 
     Messages are changed before a fusion call, a second question to the ego's model, shows them.
-    `what` is how messages on errors call the part, and `change` is the package's own. Raises
-    UserError if it fails, or returns what is no such message or scene graph.
+    `what` names the package's group of settings in errors, and `change` is the package's own
+    object. Raises UserError if it fails, or returns what is no such message or scene graph.
     """
 
     what: str  # what messages on errors call the part
@@ -192,8 +192,8 @@ class ChangeOfPart:
 def change_by(kind: type[Part], text: str) -> Change | None:
     """Return the change of helpers' messages that a text, such as `liar:share=1/3`, names.
 
-    `kind` is the class of the part, a group of settings such as an attack's, that is asked for it.
-    None if it has no change by that name.
+    `kind` is the class of the group of settings (such as an attack's) that is asked for it. None if
+    it has no change by that name.
     """
     what = PACKAGES_PARTS.get(kind)
     if what is None:

@@ -26,22 +26,25 @@ class Plans:
     row: Ints
     # each agent's number among the vehicles of its world, `(..., 1+H)`; -1 for one without a plan
     vehicle: Ints
-    # seconds until each is at the centroid of the conflict zone if it keeps its speed, `(...,
-    # 1+H)`; inf for one that stands or has passed it, NaN without a plan
+    # seconds until each is at the centroid of the conflict zone if it keeps its speed,
+    # `(..., 1+H)`; inf for one that stands or has passed it, NaN without a plan
     reaches_s: Floats
     # seconds by which each is later than at the speed that it had in the beginning, `(..., 1+H)`,
     # at least 0; NaN without a plan
     lost_s: Floats
 
     def take(self, at: Any) -> "Plans":
-        """Return the plans of the decisions at `at`, indices or a mask of the leading axis."""
+        """Return what agents say of their motion in some decisions: those at `at`.
+
+        `at` is an array of indices, or a mask, of the leading axis.
+        """
         return Plans(self.row[at], self.vehicle[at], self.reaches_s[at], self.lost_s[at])
 
     def of_helpers(self, places: Ints) -> "Plans":
-        """Return the plans with other senders: in each decision those that `places` names.
+        """Return what agents say of their motion, with the senders reordered, chosen or repeated.
 
-        `places`, `(..., H')`, are indices of the H others here, from 0; one may be repeated. The
-        agent's own plan stays first.
+        `places`, `(..., H')`, says for each decision which of the H others here, by index from 0,
+        stands at each of H' places. The agent's own plan stays first.
         """
         at = np.insert(places + 1, 0, 0, axis=-1)
 
@@ -52,10 +55,11 @@ class Plans:
         return Plans(row, of(self.vehicle), of(self.reaches_s), of(self.lost_s))
 
     def among(self, senders: Ints) -> "Plans":
-        """Return the plans that n agents hear from each other, `(n, 1+H)`.
+        """Return what n agents hear of each other's motion, `(n, 1+H)`.
 
-        These plans have each agent's own alone, `(n, 1)`. `senders`, `(n, H)`, has the row of each
-        of the H others that an agent hears, among these n agents; -1 for one without a plan.
+        This object has what each says of itself alone, `(n, 1)`. `senders`, `(n, H)`, has the row
+        of each of the H others that an agent hears, among these n agents; -1 for one without a
+        plan.
         """
 
         def heard(values: Any, unknown: float) -> Any:

@@ -35,10 +35,11 @@ class Heads(Pool):
     by_distance: ClassVar[bool] = False
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the pool with equal weights of all heard, or a majority's mean intent.
+        """Return the fused probabilities, in which no single helper can turn the decision.
 
-        The latter where the pool's likeliest action is another than that of a majority: all but at
-        most one of the vehicles heard, the ego among them, at least two. `messages` are of one
+        They are the pool of all vehicles heard, with equal weights; or, where the pool's likeliest
+        action is another than that of a majority, the majority's mean intent. A majority is all but
+        at most one of the vehicles heard, the ego among them, at least two. `messages` are of one
         decision of each episode; `state`, the memory of a rule that keeps nothing, is passed on
         unchanged.
         """
@@ -52,11 +53,11 @@ class Heads(Pool):
 
 
 def outvoted(policy: Floats, p: Floats, voices: Bools, votes: Ints) -> Floats:
-    """Return the policy, replaced where a majority of votes wants another action, `(..., A)`.
+    """Return policies, replaced where a majority of vehicles wants another action, `(..., A)`.
 
-    The replacement is the mean intent of the vehicles in the majority, which counts only if the ego
-    is in it. An intent is the probabilities that a vehicle gives to the ego's actions; it votes for
-    the likeliest.
+    So no single liar turns a decision. The replacement is the mean intent of the vehicles in the
+    majority, which counts only if the ego is in it. An intent is the probabilities that a vehicle
+    gives to the ego's actions; it votes for the likeliest.
 
     Args:
         policy: the fused probabilities of A actions to check, `(..., A)`.

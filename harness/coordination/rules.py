@@ -26,11 +26,11 @@ EGO_PROMPT = "ego-prompt"
 
 
 def reads(name: str) -> frozenset[str]:
-    """Return the kinds of content, such as intents, any one of which a consensus can use.
+    """Return what messages may carry for a consensus rule to use them: any one of these kinds.
 
-    The content is what messages hold; `contents.KINDS` lists its kinds. `name` is a value of the
-    setting `consensus`: the name of a rule that fuses, or `ego-prompt`, by which the ego's model is
-    asked again with the messages.
+    A consensus rule fuses what the ego hears. The kinds, such as intents or words, are listed in
+    `contents.KINDS`. `name` is a value of the setting `consensus`: the name of a rule, or
+    `ego-prompt`, by which the ego's model is asked again with the messages.
     """
     if name == EGO_PROMPT:
         return frozenset((WORDS, PLANS))

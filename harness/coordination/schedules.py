@@ -31,6 +31,8 @@ class Schedules(FilesAndPlugins[Schedule]):
     """
 
     folder = "schedules"
+    # what packages' schedules must have, by attribute: a test of its value, and words for what is
+    # allowed
     stated: ClassVar = {
         "threshold": (_is_threshold, "a finite number, or None"),
         "needs": tuple_of(one_of(*NEEDS)),
@@ -49,7 +51,11 @@ class Schedules(FilesAndPlugins[Schedule]):
         return READERS[self.folder](file)
 
     def file_sha256(self, name: str) -> str | None:
-        """Return the SHA-256 hex digest of the file of schedule `name`; None if it has none."""
+        """Return the SHA-256 hex digest of the file that describes a schedule; None without one.
+
+        A schedule is a rule for whom the ego asks, here that of this `name`. A run records the
+        digest.
+        """
         file = self.file(name)
         return sha256_file(file) if file else None
 

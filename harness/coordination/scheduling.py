@@ -34,16 +34,17 @@ class Outlook:
     to_zone_s: Floats
 
     def take(self, at: Any) -> "Outlook":
-        """Return the outlooks of some decisions: those at `at` of the leading axis of all arrays.
+        """Return what egos and helpers see in some of the decisions: those at `at`.
 
-        `at` is an array of indices or a mask.
+        `at` is an array of indices, or a mask, of the leading axis of all arrays.
         """
         return Outlook(self.unseen[at], self.added[at], self.to_zone_s[at])
 
     def of_helpers(self, places: Ints) -> "Outlook":
-        """Return the outlook with other helpers: in each decision those that `places` names.
+        """Return what the ego and helpers see, with the helpers reordered, chosen or repeated.
 
-        `places`, `(..., H')`, are indices of the H helpers here, from 0; one may be repeated.
+        `places`, `(..., H')`, says for each decision which of the H helpers here, by index from 0,
+        stands at each of H' places.
         """
         return replace(self, added=np.take_along_axis(self.added, places[..., None], axis=-2))
 
@@ -87,9 +88,10 @@ class Schedule(Protocol):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return which of `in_time`, `outlook` and `lot` it uses.
+        """Return what this schedule reads of `in_time`, `outlook` and `lot`.
 
-        Those that it does not name may be None in `ScheduleInputs`.
+        They are fields of `ScheduleInputs`: the probability of a reply in time, how much of the
+        road is in view, and a random draw. Those that it does not name may be None.
         """
 
     @property
@@ -101,11 +103,11 @@ class Schedule(Protocol):
         """
 
     def worth(self, known: ScheduleInputs) -> Floats:
-        """Return what asking each helper is worth, in the schedule's own unit, `(..., H)`.
+        """Return what asking each helper is worth, in a unit of the schedule's own, `(..., H)`.
 
-        `known` has what the ego knows in decisions `(...)` before it asks. The result is `(..., 1)`
-        if it is the same for all helpers. If helpers differ, it is NaN for one that may not be
-        asked.
+        The unit is such as nats for a schedule by entropy. `known` has what the ego knows in
+        decisions `(...)` before it asks. The result is `(..., 1)` if it is the same for all
+        helpers. If helpers differ, it is NaN for one that may not be asked.
         """
 
 
@@ -145,10 +147,11 @@ def never(inputs: ScheduleInputs) -> Floats:
 
 
 def entropy(inputs: ScheduleInputs) -> Floats:
-    """Return how unsure the ego is as the worth of asking anybody, `(..., 1)` (paper Eq. 3).
+    """Return how unsure the ego is, in nats, as what asking anybody is worth, `(..., 1)`.
 
-    It is the formula of schedule `entropy`: the entropy, in nats, of the ego's intent, its
-    probabilities of the actions. `inputs` is what the ego knows in decisions `(...)`.
+    It is the formula of schedule `entropy` (Eq. 3 of the paper that this harness follows): the
+    entropy of the ego's intent, its probabilities of the actions. `inputs` is what the ego knows in
+    decisions `(...)`.
     """
     return inputs.entropy_nats[..., None]
 

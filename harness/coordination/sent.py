@@ -12,9 +12,10 @@ from harness.radio.channel import Draws
 
 @dataclass(frozen=True)
 class SentIntents:
-    """Hold what the ego is sent in n decisions, by H voices: senders as the ego hears them.
+    """Hold what the ego is sent in n decisions, which under an attack is not what helpers think.
 
-    A helper has one voice; an attacker may have several, each with its own message.
+    It comes from H voices, senders as the ego hears them: a helper has one voice; an attacker may
+    have several, each with its own message.
     """
 
     intents: Intents  # the voices' intents and claims, in the place of the helpers'
@@ -34,17 +35,21 @@ class Speaker(Protocol):
     """
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
-        """Return what the voices send in n decisions of one step, given the vehicles' true intents.
+        """Return what is sent to the ego in n decisions of one step, given vehicles' true intents.
 
-        `truth` has the intents and `draws` the channel's random numbers for the link to each
-        helper; `episode` and `seed`, `(n,)`, are each decision's episode number and seed of these
-        draws. The number of voices may differ from that of the helpers in `truth`.
+        `truth` has the intents (probabilities of the ego's actions) and `draws` the channel's
+        random numbers for the link to each helper; `episode` and `seed`, `(n,)`, are each
+        decision's episode number and seed of these draws. The number of voices, senders as the ego
+        hears them, may differ from that of the helpers in `truth`: an attacker may have several.
         """
         ...
 
 
 class Honest:
-    """Send every helper's true intent in one message: the `Speaker` without attackers."""
+    """Send every helper's true answer in one message, as is the case without attackers.
+
+    It is the usual `Speaker`, which decides what helpers send.
+    """
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         return SentIntents(truth, draws, np.zeros(truth.valid.shape, dtype=bool))

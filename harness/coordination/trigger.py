@@ -25,6 +25,7 @@ def normalised_entropy(p: Floats) -> Floats:
 def triggered(p: Floats, tau_nats: float) -> Bools:
     """Return whether intents are unsure enough to ask helpers: entropy above `tau_nats`, `(...)`.
 
-    It is the paper's Eq. 3. `p` are intents, probabilities of A actions, `(..., A)`.
+    It is Eq. 3 of the paper that this harness follows. `p` are intents, probabilities of A actions,
+    `(..., A)`.
     """
     return entropy_nats(p) > tau_nats

@@ -34,16 +34,20 @@ CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, tim
 class Trust:
     """Learn during an episode which helpers to trust, and fuse only the intents of those.
 
-    A consensus rule. A helper's claimed place and speed, and its intents, its probabilities of the
-    ego's actions, count for or against it (the module's description has the checks).
-
-    All numbers were chosen on tune layouts (`benchmarks/measured/trust.md`).
+    It is a consensus rule. An intent is the probabilities of the ego's actions. These count against
+    a helper: it moves otherwise than its claimed speeds say, or stands off the road or in another
+    vehicle; the ego sees it elsewhere than it claims; its last intent contradicts the ego's own
+    now, or its intent is far from that of every other vehicle. What counts fades with time. All
+    default numbers were chosen on start situations for tuning (`benchmarks/measured/trust.md`).
     """
 
-    # what counts for, and what against, a helper before its first message
+    # evidence for, and evidence against, a helper before its first message, as in a beta
+    # distribution
     faith: tuple[float, float] = (2.5, 0.5)
-    kept: float = 0.6  # share of what counts for and against a helper that is left at the next step
-    contradiction: float = 4.0  # how much more a full contradiction counts than a full agreement
+    # share of the evidence for and against a helper that is left at the next decision
+    kept: float = 0.6
+    # how many times as much a full contradiction counts as a full agreement
+    contradiction: float = 4.0
     # how far a helper's claimed distance to the conflict zone may be from the one that the ego's
     # sensors give, m
     place_tolerance_m: float = 5.0
@@ -69,8 +73,9 @@ class Trust:
         return state.reshape(*batch, -1)
 
     def fuse(self, messages: Messages, state: Floats) -> Fused:
-        """Return the linear pool of the helpers that are trusted after this decision's checks.
+        """Return the policies by the intents of trusted helpers alone, and the trust in each.
 
+        The intents are averaged by weight. Each decision first counts for or against each helper.
         `messages` are of one decision of each episode, and `state`, `(..., K)`, is the memory that
         `start` or the episode's last decision returned. `Fused.trust` has each helper's reputation,
         from 0 to 1, with the present message counted.
