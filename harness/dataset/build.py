@@ -65,7 +65,7 @@ class Audit(Protocol):
     """
 
     def ready(self) -> None:
-        """Raise UserError if a package that the audit needs is missing."""
+        """Raise UserError if a package that the audit of a dataset needs is missing."""
         ...
 
     def found(
@@ -364,15 +364,15 @@ def _entry(name: str) -> ZipInfo:
 
 
 def part_of(episode: int) -> str:
-    """Return the file name of a layout in a working folder: `00042.zip` for episode 42.
+    """Return the name of an episode's file while a dataset is built: `00042.zip` for episode 42.
 
-    A layout is the start situation of an episode, whose number it has.
+    It has the decision tree of the episode's start situation, and lies in the working folder.
     """
     return f"{episode:05d}.zip"
 
 
 def named(episode: int) -> str:
-    """Return how messages name a layout, the start of an episode: `layout 42` for episode 42."""
+    """Return how messages name an episode's start situation: `layout 42` for episode 42."""
     return f"layout {episode}"
 
 

@@ -39,9 +39,9 @@ KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool
 
 @dataclass(frozen=True)
 class Table:
-    """Describe a Parquet table of a published dataset: its source, size and reference results.
+    """Describe a published table, a Parquet file made of a dataset: its source, size and results.
 
-    A decision point is a moment at which a vehicle decides.
+    A row is a decision point, a moment at which a vehicle decides.
     """
 
     manifest: Manifest  # manifest of the dataset that it was made of

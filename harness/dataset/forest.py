@@ -68,10 +68,10 @@ class Forest:
     def of(
         cls, trees: Sequence[Tree], actions: tuple[str, ...], parameters: Parameters
     ) -> "Forest":
-        """Return the arrays of the decision trees `trees`, all of one scenario.
+        """Return decision trees as arrays, to compute what actions are worth.
 
-        `actions` are the names of its actions, in order, and `parameters` its settings, such as the
-        time that an episode may last.
+        `trees` are those of a dataset, all of one scenario. `actions` are the names of its actions,
+        in order, and `parameters` its settings, such as the time that an episode may last.
         """
         action_index = {action: n for n, action in enumerate(actions)}
         points: list[Branching] = []
@@ -117,7 +117,10 @@ class Forest:
 
     @cached_property
     def place(self) -> Mapping[str, int]:
-        """Return the number of each decision point, from 0, by the id of its scene."""
+        """Return the number that each decision point has in the arrays, by its scene's id.
+
+        Numbers count from 0.
+        """
         return {name: n for n, name in enumerate(self.ids)}
 
     @cached_property
@@ -280,7 +283,7 @@ class Forest:
         return last
 
     def visited(self, chosen: Ints) -> Ints:
-        """Return the indices of the decision points that a fixed policy visits, ascending.
+        """Return the indices of the decision points that a fixed policy goes through, ascending.
 
         `chosen` has the index of the action taken at each of N decision points, (N,).
         """
@@ -304,7 +307,7 @@ class Forest:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
 
     def end(self, edge: int) -> End:
-        """Return how the episode ends at an edge, an index in `edges` of one that ends it.
+        """Return how the episode ends with an edge that ends it, an index in `edges`.
 
         An edge is what an action does, up to the next decision or the end.
         """
@@ -320,7 +323,10 @@ class Forest:
         return self._success(self.drivers[driver])
 
     def constant_success(self, action: str) -> Bools:
-        """Return whether an ego that always takes one action succeeds in E episodes, (E,)."""
+        """Return whether an ego that always takes one action succeeds in E episodes, (E,).
+
+        `action` is the action's name.
+        """
         return self._success(np.full(len(self.tree), self.actions.index(action)))
 
     def sequence_success(self, actions: Sequence[str]) -> Bools:
@@ -343,17 +349,18 @@ class Forest:
         return self.succeeds(self.last_edge(chosen), np.arange(len(self.root)))
 
     def uniform_success(self) -> Floats:
-        """Return the probability of success in each of E episodes, (E,), if actions are drawn.
+        """Return the probability of success in each of E episodes, (E,), of random actions.
 
-        They are drawn uniformly.
+        Each action is drawn with the same probability.
         """
         return np.asarray(self.worth[self.root].mean(axis=-1))
 
     @cached_property
     def worth(self) -> Floats:
-        """Return the probability of success after each action, (N, A), if later ones are drawn.
+        """Return the probability of success after each action, (N, A), if later ones are random.
 
-        There are N decision points and A actions, and all are drawn with the same probability.
+        There are N decision points and A actions; every later action is drawn with the same
+        probability.
         """
         return self.chance(np.ones(self.child.shape))
 

@@ -56,7 +56,8 @@ class Scene:
     record: Record  # state and scene graphs, as a dataset has them
     # results computed from the scene, by name, kept so that they are computed once
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
-    # the scenario with the agent that decides as its ego; None where that is the scenario's own ego
+    # the scenario as the vehicle that decides here plays it, with itself as the ego; None where
+    # that is the scenario's own ego
     seat: Scenario | None = None
     agent: int = 0  # index of who decides among the vehicles that can be asked; the ego has 0
     several: bool = False  # whether vehicles beside the ego can decide in this scenario
@@ -107,10 +108,10 @@ class Scene:
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
-    """Group scenes by who decides in them: return their indices in `scenes` by scenario.
+    """Group scenes by which vehicle decides: return their indices in `scenes` by scenario.
 
-    A key is the scenario as the agent that decides plays it, with itself as the ego: `scenario`
-    itself for that one's own ego. An agent is a vehicle that decides.
+    A key is the scenario as that vehicle plays it, with itself as the ego: `scenario` itself for
+    the scenario's own ego. Where several vehicles decide, each needs its own words and roads.
     """
     return places_by(scene.seat or scenario for scene in scenes)
 
@@ -146,7 +147,9 @@ class Dataset:
     sha256: str  # hex digest of the manifest, which pins every file
     trees: Trees  # the decision trees of its layouts, in the order of the episodes
     trusted: bool = False  # whether it is a released dataset, whose digests vouch for its scenes
+    # scenes that were read, by id
     _scenes: dict[str, Scene] = field(default_factory=dict, repr=False, compare=False)
+    # ids of scenes whose content was found sound
     _checked: set[str] = field(default_factory=set, repr=False, compare=False)
 
     def __reduce__(self) -> Any:
@@ -205,7 +208,10 @@ class Dataset:
         return int(before_any[first_edges].all(axis=1).sum())
 
     def of_episodes(self, numbers: Collection[int]) -> "Dataset":
-        """Return this dataset restricted to the episodes with these numbers, in its own order."""
+        """Return this dataset restricted to the episodes with these numbers, in its own order.
+
+        Nothing is read again.
+        """
         if len(numbers) == len(self.episodes) and set(numbers) == set(self.episodes):
             return self
         trees = Trees((number for number in self.episodes if number in numbers), self.trees.read)
@@ -213,7 +219,7 @@ class Dataset:
 
     @property
     def whole(self) -> "Dataset":
-        """Return this dataset with all episodes of its folder."""
+        """Return this dataset with all episodes of its folder, if some were left out."""
         return replace(self, trees=Trees(range(self.manifest.episodes), self.trees.read))
 
     def reference_success(self) -> dict[str, Floats]:
@@ -310,9 +316,10 @@ class Dataset:
         return self.scenes(matches)[0]
 
     def courses(self) -> tuple[str, ...]:
-        """Return the ids of all decision points that some reference driver visits, in order.
+        """Return the ids of all decision points that some rule-based driver goes through, in order.
 
-        Such a driver is a rule that decides without a model.
+        They are those that reasonable driving leads to. Such a driver is a rule that decides
+        without a model.
         """
         forest = self.forest
         visited = [forest.visited(chosen) for chosen in forest.drivers.values()]
@@ -358,7 +365,10 @@ def argument(path: Path) -> str:
 
 
 def released() -> dict[str, str]:
-    """Return the manifest digest of each released dataset by name (`datasets/released.toml`)."""
+    """Return the digest of the manifest of each dataset that is released, by its name.
+
+    They are pinned in `datasets/released.toml`, so that no released dataset can change.
+    """
     pins = folder("datasets") / "released.toml"
     return tomllib.loads(text_of(pins)) if pins.is_file() else {}
 

@@ -45,10 +45,10 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
 
 
 def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
-    """Raise UserError if a dataset shares a first scene with `others`, on which results are
-    reported.
+    """Raise UserError if a dataset to learn from shares a start with data to report results on.
 
-    Scenes are equal if all numbers of their vehicles, rounded to 0.01, are, whatever their seeds.
+    `others` are the datasets to report on. Starts, first scenes of episodes, are equal if all
+    numbers of their vehicles, rounded to 0.01, are, whatever their seeds.
     """
     starts = _starts(dataset)
     for other in others:
@@ -63,11 +63,11 @@ def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
 
 
 def differences(dataset: Dataset) -> Iterator[str]:
-    """Yield a line if layouts of a dataset are not those of the seeds that it states.
+    """Yield a line if start situations of a dataset are not what the seeds that it states give.
 
-    A layout is the start situation of an episode, drawn by its seed. The first scene of up to
-    `BEGUN` layouts is rebuilt, then up to `REBUILT` whole decision trees (all that decisions lead
-    to). Nothing is yielded if the simulator is not installed.
+    A layout is such a situation, drawn by its seed. The first scene of up to `BEGUN` layouts is
+    rebuilt, then up to `REBUILT` whole decision trees (all that decisions lead to). Nothing is
+    yielded if the simulator is not installed.
     """
     if find_spec("highway_env") is None:
         return
@@ -85,7 +85,7 @@ def differences(dataset: Dataset) -> Iterator[str]:
 
 
 def drawn(dataset: Dataset, count: int) -> list[int]:
-    """Draw up to `count` episode numbers of a dataset, always the same on one machine."""
+    """Draw up to `count` episodes of a dataset to rebuild, by number; the same on one machine."""
     return spot_check(dataset.episodes, dataset.sha256, count)
 
 

@@ -22,7 +22,7 @@ NONE = "none"  # the `danger` of layouts without one
 
 @dataclass(frozen=True)
 class Choice:
-    """State which episodes a run uses, where something chooses them.
+    """State which episodes of a dataset a run uses, where something chooses them, as a sample.
 
     `numbers` are those of the episodes that are used, `pool` of those that they were chosen from,
     both ascending, and `given` has the settings that chose them, by name, as a run states them.
@@ -76,7 +76,7 @@ def recorded(record: Mapping[str, Any]) -> Selection | None:
 
 
 def lacking(record: Mapping[str, Any]) -> str | None:
-    """Return the name of the extension that chose a run's episodes if it is not installed.
+    """Return the extension that chose a run's episodes, by name, if it is not installed.
 
     `record` is the `selection` that the run states, values by name; None if there is none, or the
     extension is installed.

@@ -64,10 +64,10 @@ def named(text: str) -> Suite | None:
 
 
 def datasets(text: str) -> Sequence[str]:
-    """Return the dataset names that `--dataset` gives: those of a suite `suite:NAME`, or the one.
+    """Return the names of the datasets that a user means by `--dataset`: one, or a suite's.
 
-    `text` is what was typed there. Raises UserError if there is no such suite, or two, or its table
-    is wrong.
+    A suite, `suite:NAME`, is datasets of several scenarios. `text` is what was typed there. Raises
+    UserError if there is no such suite, or two, or its table is wrong.
     """
     suite = named(text)
     return suite.datasets if suite else (text,)

@@ -108,7 +108,10 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
 
 
 def scenario_of(manifest: Manifest) -> Scenario:
-    """Return the scenario that a dataset's manifest names, with the parameters that it states."""
+    """Return the scenario that a dataset was built from, with its parameters, by its manifest.
+
+    The manifest is the record of what the dataset was built from.
+    """
     return scenarios.of_manifest(manifest.scenario, manifest.parameters)
 
 
@@ -245,14 +248,18 @@ def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
 
 
 def tree_name(episode: int) -> str:
-    """Return the name of an episode's decision tree in `layouts.zip`, by the episode's number."""
+    """Return the name of the file with an episode's decision tree in `layouts.zip`.
+
+    `episode` is the episode's number.
+    """
     return f"{episode:05d}/tree.json"
 
 
 def level_name(episode: int, step: int) -> str:
-    """Return the name, in `layouts.zip`, of the file with the scenes of one step of an episode.
+    """Return the name of the file with the scenes of one decision of an episode.
 
-    `episode` is its number, and `step` the number of the decision in it, from 0.
+    It is in `layouts.zip`. `episode` is the episode's number, and `step` that of the decision, from
+    0.
     """
     return f"{episode:05d}/{step}.jsonl"
 
