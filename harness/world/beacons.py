@@ -56,11 +56,11 @@ ROUNDING_S = 1e-9
 
 
 def last_heard(state: WorldState, sender: str, receiver: str) -> Beacon | None:
-    """Return the newest beacon of `sender` that `receiver` has at the state's time.
+    """Return the newest beacon that one vehicle has from another at the state's time.
 
-    `sender` and `receiver` are ids of vehicles. A beacon is what a vehicle broadcasts about itself:
-    pose and speed, with an age and errors. None if there is no such beacon: nobody sends any under
-    perfect knowledge, and no vehicle hears itself.
+    A beacon is what a vehicle broadcasts about itself: pose and speed, with an age and errors.
+    `sender` and `receiver` are ids of vehicles. None if there is no such beacon: nobody sends any
+    under perfect knowledge, and no vehicle hears itself.
     """
     heard = [b for b in state.beacons if b.sender == sender and receiver in b.heard_by]
     return max(
@@ -98,11 +98,12 @@ def estimated(vehicle: VehicleState, beacon: Beacon | None, time_s: float) -> Ve
 
 
 def lead_in(p: Parameters, poses: Floats) -> Floats:
-    """Extrapolate poses at the start of an episode back in time, to when its beacons begin.
+    """Return where vehicles were before an episode starts, as far back as their beacons begin.
 
-    `poses` are x and y (m), heading (rad) and speed (m/s) of V vehicles, (V, 4), which have driven
-    at constant speed until then. The result is (F, V, 4): poses in each of F frames, the start
-    last. `p` has the scenario's rate and delay of beacons and the frames a second.
+    So beacons are already heard at the start. `poses` are x and y (m), heading (rad) and speed
+    (m/s) of V vehicles at the start, (V, 4), which have driven at constant speed until then. The
+    result is (F, V, 4): poses in each of F frames, the start last. `p` has the scenario's rate and
+    delay of beacons and the frames a second.
     """
     x, y, heading, speed = poses.T
     time_s = np.arange(-_lead_frames(p), 1)[:, None] / p.simulation_hz

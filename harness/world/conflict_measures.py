@@ -64,7 +64,10 @@ class Conflicts:
     box: Floats = field(default_factory=lambda: np.empty((4, 0)))
 
     def anew(self) -> "Conflicts":
-        """Return a copy with both times inf, to measure from a decision on; past poses are kept."""
+        """Return a copy that measures from now on: both times are inf, past poses are kept.
+
+        It is for the next decision of the vehicle.
+        """
         return replace(self, ttc_s=np.inf, pet_s=np.inf)
 
     def collided(self) -> "Conflicts":
@@ -87,9 +90,9 @@ class Conflicts:
 
 
 def rounded(measure_s: float) -> float | None:
-    """Return a time of conflict, `measure_s` (s), rounded for a file; None if it is not finite.
+    """Return a time to collision or post-encroachment time, s, rounded for a file.
 
-    It is a time to collision or a post-encroachment time.
+    None if `measure_s` is not finite: nothing was near.
     """
     return round(measure_s, DECIMALS) if np.isfinite(measure_s) else None
 

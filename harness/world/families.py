@@ -48,7 +48,10 @@ class Family(Protocol):
         ...
 
     def joined(self, name: str, settings: Sequence[str]) -> str:
-        """Return a name with settings, each such as `decisions=5`, added: `split`'s inverse."""
+        """Return a scenario's text: its name with settings, each such as `decisions=5`, added.
+
+        `split` takes such a text apart again.
+        """
         ...
 
     def allow(self, name: str) -> str | None:
@@ -64,10 +67,10 @@ FAMILIES = Shipped[Family]("swarmdrive.families", Family, {})  # of none but ext
 
 
 def family_of(text: str) -> Family | None:
-    """Return the family that a scenario's name begins with, as in `env:merge-v0`; None without.
+    """Return what makes scenarios of names such as `env:merge-v0`; None for other names.
 
-    A family is an extension's reader of such names; `text` is the name, with or without settings.
-    Raises UserError if the family is of an extension that is not installed.
+    It is a family, an extension's reader of such names; `text` is the name, with or without
+    settings. Raises UserError if the family is of an extension that is not installed.
     """
     name, colon, _ = text.partition(":")
     if not colon:

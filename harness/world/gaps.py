@@ -8,10 +8,10 @@ from harness.world.state import rectangle, separation_m
 
 
 def least_gaps_m(poses: Floats, sizes_m: Floats, least_m: Floats) -> Floats:
-    """Return the least gap between the outlines of the ego and any other vehicle, (W,) m.
+    """Return the least gap so far between the ego's outline and any other vehicle's, (W,) m.
 
-    It is of each of W simulated episodes over F frames. `poses` are x and y (m) and heading (rad),
-    then anything, of V vehicles, (W, F, V, 3 or more), the ego first, NaN where there is no
+    It is of each of W simulated episodes, over F more frames. `poses` are x and y (m) and heading
+    (rad), then anything, of V vehicles, (W, F, V, 3 or more), the ego first, NaN where there is no
     vehicle. `sizes_m` are their lengths and widths, (W, V, 2). `least_m`, (W,), is the least gap of
     earlier frames; no result exceeds it.
     """

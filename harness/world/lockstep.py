@@ -298,7 +298,10 @@ class Fleet:
         self.section[at] = v.route.index(v.target_lane_index)
 
     def keep(self, rows: Bools) -> None:
-        """Drop the episodes, rows of all arrays, for which the mask `rows`, (B,), is false."""
+        """Drop the episodes that are simulated no more, rows for which `rows` is false.
+
+        The mask is (B,), one of each of the B episodes.
+        """
         self.worlds = [
             world for world, kept in zip(self.worlds, rows.tolist(), strict=True) if kept
         ]
@@ -308,7 +311,7 @@ class Fleet:
         self._index()
 
     def write(self, row: int, world: "World") -> set[str]:
-        """Copy the vehicles of one row of the arrays back into `world`, the episode's simulation.
+        """Copy the vehicles of one row of the arrays back into the object of its episode, `world`.
 
         `row` is the episode's index among the B. Returns the ids of vehicles that had crashed
         before the last frame.

@@ -35,8 +35,8 @@ class Draft:
     """Hold one random draw of an episode's start, not yet checked for who sees the danger.
 
     A danger is the vehicle that would meet an ego which keeps its speed; a sector is a direction
-    that it may come from. Lookouts are helpers that see a danger wherever it comes from; blind
-    seats are places from which none can be seen.
+    that it may come from. Lookouts are helpers that see a danger wherever it comes from. Blind
+    seats are places for cars from which none can be seen, by which fewer helpers see it.
     """
 
     layout: Layout  # the start situation, with lookouts as helpers and nobody in the blind seats
@@ -90,11 +90,11 @@ def witnesses(scenario: str, parameters: Parameters, seed: int) -> int | None:
 
 
 def radios(scenario: Scenario, seed: int, danger: str | None) -> dict[str, Any]:
-    """Return the columns `witnesses` (a count) and `danger_radio` (a bool) of a layout's table row.
+    """Return how many helpers see an episode's danger at first, and whether the danger has a radio.
 
-    They say how many helpers have the danger in sight at the first decision, and whether the danger
-    itself sends beacons. The layout, a start situation, is the one that `seed` draws; `danger` is
-    the sector (direction) that its danger comes from, None without one. A value is None where the
+    They are columns of a table's row: `witnesses` (a count) and `danger_radio` (a bool: whether the
+    danger broadcasts its pose). The start situation is the one that `seed` draws; `danger` is the
+    sector (direction) that its danger comes from, None without one. A value is None where the
     scenario's parameters declare none.
     """
     p = scenario.parameters
@@ -127,10 +127,11 @@ def queue(
 
 
 def has_radio(scenario: str, parameters: Parameters, seed: int, vehicle: str = DANGER) -> bool:
-    """Return whether a vehicle that is no helper sends beacons.
+    """Return whether a vehicle that does not help broadcasts its pose, as drawn for an episode.
 
-    It is drawn by the layout seed, with probability `parameters.radio_share`. `scenario` is the
-    scenario's name, and `vehicle` the vehicle's id, or `DANGER` for the layout's danger.
+    It is drawn by the layout seed `seed`, with probability `parameters.radio_share`. `scenario` is
+    the scenario's name, and `vehicle` the vehicle's id, or `DANGER` for the one that would meet the
+    ego.
     """
     draw = noise.uniforms((1,), scenario, seed, "radio", vehicle)[0]
     return bool(draw < parameters.radio_share)

@@ -63,9 +63,9 @@ class Outcome:
     def judged(self, reference: "Outcome", danger: str | None, parameters: Parameters) -> "Outcome":
         """Return this outcome, changed to `late` if the ego reached its goal too late.
 
-        That is later, by more than `parameters.allowance_s(danger)`, than the full-view driver: the
-        reference driver that sees everything, whose outcome in the same layout is `reference`.
-        `danger` is the sector that the layout's danger comes from, None without one.
+        That is later, by more than `parameters.allowance_s(danger)`, than the reference driver that
+        sees everything, whose outcome from the same start is `reference`. `danger` is the sector
+        (direction) that a vehicle on collision course comes from, None without one.
         """
         if (
             not self.success

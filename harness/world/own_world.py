@@ -20,7 +20,10 @@ class OwnWorld(World):
     @classmethod
     @abstractmethod
     def begun(cls, scenario: Scenario, seed: int) -> "World":
-        """Start the scenario's episode of a layout seed, before its first decision."""
+        """Start the episode of a layout seed, before its first decision.
+
+        `seed` fixes how the episode starts, in the scenario `scenario`.
+        """
 
     @classmethod
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> World:
@@ -39,7 +42,10 @@ class OwnWorld(World):
 
     @abstractmethod
     def snapshot(self) -> ActionsTaken:
-        """Return the actions so far and their frames, which lead here from the seed again."""
+        """Return what leads from the seed to the present state again: the actions so far.
+
+        Each comes with the frame in which it was taken.
+        """
 
     @classmethod
     def examine(cls, scenario: Scenario, seed: int) -> None:

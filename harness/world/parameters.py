@@ -158,8 +158,8 @@ class Parameters:
     def stated(self) -> dict[str, Any]:
         """Return the parameters by name, as the manifest of a dataset or run states them.
 
-        Some were added to the harness later (`LATER`). One of these is left out while it has the
-        value under which all is as before it was added.
+        Some were added to the harness later (`LATER`). One of these is left out while its value
+        says that all is as before it was added, so that older digests stay valid.
         """
         return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
 

@@ -203,10 +203,10 @@ def _sequences(
 
 
 def levels(sequences: Sequence[tuple[str, ...]]) -> Ints:
-    """Return by how many levels each decision changes the ego's target speed, (n, decisions).
+    """Return by how many steps of target speed each decision changes the ego's, (n, decisions).
 
-    `sequences` are n sequences of meta-actions, equally long. A level is an index in the scenario's
-    target speeds: FASTER is 1, SLOWER -1, and all else 0.
+    `sequences` are n sequences of meta-actions, equally long. A step leads to the next of the
+    scenario's target speeds: FASTER is 1, SLOWER -1, and all else 0.
     """
     return _changes(sequences, SPEED)
 

@@ -77,11 +77,11 @@ def finish(worlds: Sequence[World], drivers: Sequence[str]) -> list[Outcome]:
 
 
 def turns(worlds: Sequence[World], drivers: Sequence[str]) -> list[dict[int, list[str]]]:
-    """Drive worlds, simulated episodes of one scenario, to their ends; return the actions taken.
+    """Drive simulated episodes to their ends with rules as drivers; return the actions taken.
 
-    For each world these are the meta-actions, in order, of each agent, a vehicle that decides, by
-    the agent's index among the vehicles (0 is the ego). `drivers` has the name of each world's
-    reference driver, a rule such as `brake`.
+    `worlds` are the episodes, all of one scenario. For each, the result has the meta-actions, in
+    order, of each agent, a vehicle that decides, by the agent's index among the vehicles (0 is the
+    ego). `drivers` has the name of each world's reference driver, a rule such as `brake`.
     """
     scripts: list[dict[int, list[str]]] = []
     for world in worlds:
@@ -163,10 +163,11 @@ def in_chunks(
     workers: Workers,
     progress: Callable[[int], None],
 ) -> list[T]:
-    """Return `drives(seeds)` in order, computed by workers in chunks of `together` layout seeds.
+    """Compute something for many layout seeds on workers, in chunks; return results in order.
 
-    `drives` takes layout seeds and returns one result for each. `progress` is called with the
-    number of seeds of each finished chunk.
+    A layout seed draws the start of an episode. `drives` takes some seeds and returns one result
+    for each; it gets `together` of them at a time. `progress` is called with the number of seeds of
+    each finished chunk.
     """
     chunks = [seeds[at : at + together] for at in range(0, len(seeds), together)]
     # all but the last have one size, so the order of completion is no matter

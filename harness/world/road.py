@@ -90,7 +90,7 @@ class Path:
 
     @cached_property
     def columns(self) -> Floats:
-        """Return the points' coordinates, x in row 0 and y in row 1, (2, n) m.
+        """Return the coordinates of the path's n points, x in row 0 and y in row 1, (2, n) m.
 
         Rows are contiguous in memory, which is faster to read.
         """
@@ -98,14 +98,14 @@ class Path:
 
     @cached_property
     def headings_rad(self) -> Floats:
-        """Return the direction of travel at each point (rad, from +x towards +y), (n,)."""
+        """Return the path's direction at each of its n points, rad from +x towards +y, (n,)."""
         along = np.gradient(self.points, axis=0)
         heading: Floats = np.arctan2(along[:, 1], along[:, 0])
         return heading
 
     @cached_property
     def bends(self) -> Floats:
-        """Return the absolute curvature at each point in 1/m, (n,)."""
+        """Return the path's absolute curvature at each of its n points, 1/m, (n,)."""
         reach = round(BEND_M / float(self.arc_m[1]))
         turned = np.unwrap(self.headings_rad)
         padded = np.pad(turned, reach, mode="edge")
@@ -117,7 +117,7 @@ class Path:
 
     @cached_property
     def uneven_m(self) -> float:
-        """Return the largest distance, m, of a point from its place if all were evenly spaced.
+        """Return how far a point of the path is from its place in an even spacing, at most, m.
 
         It is along the path. Points count as evenly spaced if their arc lengths are whole multiples
         of the first spacing; then it is 0.
@@ -126,7 +126,10 @@ class Path:
 
     @cached_property
     def kink_rad(self) -> float:
-        """Return the largest change of the heading (rad) from one point to the next."""
+        """Return the largest change of the path's heading (rad) from one point to the next.
+
+        A large one shows that lanes do not join smoothly.
+        """
         return float(np.abs(np.diff(np.unwrap(self.headings_rad))).max())
 
     # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene
@@ -204,9 +207,10 @@ class Path:
         )
 
     def points_at(self, arc_m: Floats) -> Floats:
-        """Return positions on the path, (n, 2) m to the east and south of the road's origin.
+        """Return positions on the path at some distances from its beginning, (n, 2) m.
 
-        They are at `arc_m`, (n,), distances from the path's beginning, m.
+        The distances are `arc_m`, (n,), m; positions are m to the east and south of the road's
+        origin.
         """
         return np.stack(self.places(arc_m)[:2], axis=-1)
 
@@ -308,11 +312,11 @@ class Road:
         return self.ground(far_m) if self.ground else ground(self.network(), far_m, self.origin_m)
 
     def beside(self, key: PathKey, arc_m: float | None = None) -> dict[Side, PathKey]:
-        """Return the keys of the ego's paths side by side: `key` as `own`, its `left` and `right`.
+        """Return the keys of the paths to which the ego may change its lane, by side.
 
-        They are the paths between which the ego may change, as between lanes. A side without a path
-        is left out. With `arc_m`, a distance along the path `key`, so is one whose path shares the
-        lane there.
+        They are of paths side by side: `key` itself as `own`, its `left` and `right`. A side
+        without a path is left out. With `arc_m`, a distance along the path `key`, so is one whose
+        path shares the lane there. A key is (approach, route).
         """
         if key not in self.ways:
             return {"own": key}
@@ -363,12 +367,19 @@ class Road:
 
     @cached_property
     def zone_arc_m(self) -> float:
-        """Return how far along the ego's path, m, the point nearest to the conflict zone is."""
+        """Return how far along the ego's path the conflict zone is, m.
+
+        It is the point of the path that is nearest to the zone's centre, where others may meet the
+        ego.
+        """
         return self.ego_path.project(*self.zone_m)[0]
 
     @cached_property
     def watched(self) -> Floats:
-        """Return the points of all sectors, where a danger may come from, (points, 2) m."""
+        """Return the points of the road from which a danger may come, (points, 2) m.
+
+        They are those of all sectors, directions of danger.
+        """
         return np.concatenate(list(self.sectors.values()))
 
 

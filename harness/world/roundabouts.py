@@ -115,10 +115,10 @@ class Roundabout:
         return Path.along(self.network(), approach, route, lanes, roles, priority)
 
     def mound(self, radius_m: float) -> list[tuple[float, float, float, float]]:
-        """Return three boxes that together approximate a disc around the origin, to block sight.
+        """Return three boxes that together stand for a round mound on the island, to block sight.
 
-        Each is its walls' positions west, north, east and south, m; its corners lie on the circle
-        of radius `radius_m`.
+        Each is its walls' positions west, north, east and south, m from the centre; its corners lie
+        on the circle of radius `radius_m`.
         """
         boxes = []
         for degrees in (22.5, 45.0, 67.5):

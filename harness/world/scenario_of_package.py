@@ -94,7 +94,10 @@ def put_doors(scenario: Scenario) -> None:
 
 
 def is_ours(function: Callable[..., Any]) -> bool:
-    """Return whether a function, or the one inside a `partial`, is the harness's own."""
+    """Return whether a function is the harness's own, and not another package's.
+
+    Of a `functools.partial` it is the function inside that counts.
+    """
     return is_in_harness(getattr(function, "func", function))
 
 

@@ -12,11 +12,11 @@ BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
 
 
 def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float | None]]:
-    """Yield the numbers of a scene graph as pairs of name and value; None where it is unknown.
+    """Yield what one vehicle knows of a scene as numbers, for models that learn from vectors.
 
-    They are of the ego, of each lane and of each direction of danger. All graphs of one `road` give
-    the same names in the same order, so the values form a feature vector. Units are in the names,
-    such as `ego speed_mps`.
+    They are pairs of name and value, None where it is unknown: of the ego, of each lane and of each
+    direction of danger in the scene graph. All graphs of one `road` give the same names in the same
+    order, so the values form a feature vector. Units are in the names, such as `ego speed_mps`.
     """
     for name in ("speed_mps", "target_speed_mps", "zone_m"):
         yield f"ego {name}", getattr(graph.ego, name)

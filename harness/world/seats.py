@@ -41,11 +41,11 @@ def refuse_agents(scenario: Scenario, what: str) -> None:
 
 @lru_cache(maxsize=64)
 def seats_of(scenario: Scenario) -> Mapping[PathKey, Seat]:
-    """Return the seat of each agent that is not the ego, by the path on which it starts.
+    """Return how each vehicle but the ego plays a scenario if it decides, by its first path.
 
-    An agent is a vehicle that decides for itself. A seat is the scenario with that agent as its
-    ego; it has the parameters of `scenario`. A path's key is (approach, route). Empty if only the
-    ego has a goal.
+    Such a vehicle is an agent, and how it plays, a seat, is the scenario with that agent as its
+    ego; it has the parameters of `scenario`. The key is that of the path on which the agent starts,
+    (approach, route). Empty if only the ego has a goal.
     """
     seats = scenario.seats() if scenario.seats else {}
     p = scenario.parameters
@@ -114,9 +114,10 @@ def seat_of(scenario: Scenario, vehicle: VehicleState | Spawn) -> Seat:
 
 
 def places_by(scenarios: Iterable[Scenario]) -> dict[Scenario, list[int]]:
-    """Return, for each scenario in `scenarios`, the indices from 0 at which it stands there.
+    """Return where each scenario stands in a sequence: its indices from 0, by scenario.
 
-    The keys are in the order in which they first come.
+    So items that go with it can be handled scenario by scenario. Keys are in the order in which
+    they first come in `scenarios`.
     """
     places: dict[Scenario, list[int]] = {}
     for n, scenario in enumerate(scenarios):

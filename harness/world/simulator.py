@@ -206,10 +206,10 @@ def vehicle_on(
 
 
 def spawn_of(scenario: Scenario, layout: Layout, v: VehicleState) -> Spawn:
-    """Return vehicle `v` as one that starts at its present position and speed.
+    """Return a vehicle as one that starts an episode at its present position and speed.
 
-    `layout` is the start situation of its episode in `scenario`, which says when the vehicle brakes
-    by itself.
+    `v` is the vehicle, and `layout` the start situation of its episode in `scenario`, which says
+    when it brakes by itself.
     """
     arc = scenario.road().paths[v.approach, v.route].project(v.x_m, v.y_m)[0]
     start = next((spawn for spawn in layout.spawns if spawn.id == v.id), None)

@@ -56,11 +56,11 @@ def by_scenario(worlds: Sequence[W]) -> list[list[W]]:
 def on_seat(
     scenario: Scenario, layout: Layout, agent: int, others: Sequence[int] = ()
 ) -> tuple[Scenario, Layout]:
-    """Return the scenario with an agent as its ego, and the layout as that scenario names it.
+    """Return a scenario and a layout with one vehicle as the ego, to play it apart from others.
 
-    An agent is a vehicle that decides; `agent` is its index among the layout's vehicles. The
-    returned layout, a start situation, holds only this agent, first, and `others`, given by their
-    indices.
+    The vehicle is an agent, which decides; `agent` is its index among the layout's vehicles. The
+    returned layout, a start situation as the returned scenario names it, holds only this agent,
+    first, and `others`, given by their indices.
     """
     spawns = [layout.spawns[n] for n in (agent, *others)]
     if not agent:

@@ -41,7 +41,7 @@ class Journey:
     conflicts: Conflicts = field(default_factory=Conflicts)  # how near others came to it in time
 
     def anew(self) -> "Journey":
-        """Return a copy with outcome and counts reset, to count from a decision on."""
+        """Return a copy with outcome and counts reset, to count from the next decision on."""
         return replace(self, outcome=Outcome(), hard_brakings=0, conflicts=self.conflicts.anew())
 
     def passed(self, speeds_mps: Floats, gap_m: float, conflicts: Conflicts, hz: int) -> None:
@@ -87,7 +87,8 @@ class World:
     def begun(cls, scenario: Scenario, seed: int) -> "World":
         """Start the episode of a layout seed in this class of world.
 
-        Call `World.start`, which takes the class that the scenario names.
+        The seed fixes the start situation. Code outside calls `World.start`, which takes the class
+        that the scenario names.
         """
         layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
         road = populated(scenario, layout, agents)
@@ -121,7 +122,7 @@ class World:
 
     @property
     def journey(self) -> Journey:
-        """Return the record of what has happened to the ego."""
+        """Return the record of what has happened to the ego so far in the episode."""
         return self.journeys[0]
 
     @property
@@ -167,7 +168,7 @@ class World:
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":
         """Restore a world of this class from what `state()` and `snapshot()` returned.
 
-        Call `thaw`, which takes the class that the scenario names.
+        Code outside calls `thaw`, which takes the class that the scenario names.
         """
         layout, road = scenario.layout(state.episode_seed, scenario.parameters), new_road(scenario)
         for v, section in zip(state.vehicles, snapshot.sections, strict=True):
@@ -249,9 +250,10 @@ class World:
         return vehicle.spawn.route, int(vehicle.speed_index)
 
     def target_after(self, action: str, agent: int = 0) -> Target:
-        """Return the `target` that an agent would have after an action, without taking it.
+        """Return the route and target speed that a vehicle would have after an action.
 
-        It is the agent's route and the index of its target speed.
+        The action is not taken. The result is the route, such as `straight`, and an index from 0 in
+        the scenario's target speeds, which ascend. `agent` is the vehicle's index.
         """
         vehicle = self.vehicles[agent]
         kept = dict(vars(vehicle))

@@ -35,10 +35,10 @@ class Seat(Struct, frozen=True):
     sin: float  # sine of its heading
 
     def relative(self, x_m: float, y_m: float) -> Point:
-        """Return a position of the road's frame in the viewer's frame, rounded to 0.1 m.
+        """Return a position as the viewer sees it: m forward and to the left of its centre.
 
-        `x_m` and `y_m` are m to the east and south of the road's origin. The viewer's frame has m
-        forward and to the left of its centre.
+        `x_m` and `y_m` are the position, m to the east and south of the road's origin. The result
+        is rounded to 0.1 m.
         """
         dx, dy = x_m - self.x_m, y_m - self.y_m
         return Point(tenths(dx * self.cos + dy * self.sin), tenths(dx * self.sin - dy * self.cos))
@@ -80,37 +80,36 @@ class Encounter(Struct, frozen=True):
     has_lamps: bool  # whether the scenario's vehicles have brake lamps
 
     def arrival(self, arc_m: float, time_s: float | None) -> Arrival:
-        """Return when the other vehicle comes to a conflict point, as a scene graph states it.
+        """Return when the other vehicle comes to the point where it may meet the ego.
 
         `arc_m` is how far it has to go, m, and `time_s` how long at its speed, s, None at a
-        standstill. Its speed and its brake lamps are added.
+        standstill. The record, part of what a viewer knows, has its speed and brake lamps, too.
         """
         braking = self.d.braking if self.has_lamps else UNSET
         return Arrival(tenths(arc_m), time_s, tenths(self.d.speed_mps), braking)
 
     @property
     def key(self) -> PathKey:
-        """Return the key (approach, route) of the path that the other vehicle follows."""
+        """Return which path the other vehicle follows, as its key (approach, route)."""
         assert self.place.key is not None
         return self.place.key
 
     @property
     def ego_key(self) -> PathKey:
-        """Return the key (approach, route) of the ego's path."""
+        """Return which path the ego follows, as its key (approach, route)."""
         return self.ego.approach, self.ego.route
 
 
 def tenths(value: float) -> float:
-    """Round `value` to one decimal, with 0.0 in place of -0.0."""
+    """Round a number to one decimal, as scene graphs have it, with 0.0 in place of -0.0."""
     return round(float(value), 1) + 0.0
 
 
 def places(road: Road, detections: Sequence[Detection]) -> list[Place]:
     """Return where each detected vehicle is on the road, and which path it seems to follow.
 
-    That is, for each of `detections`, the paths near it, with the distance along each, and the
-    nearest path that fits its heading and turn indicator; of equally good ones, the first of the
-    road.
+    For each of `detections` it has the paths near it, with the distance along each, and the nearest
+    path that fits its heading and turn indicator; of equally good ones, the first of the road.
     """
     poses = []
     for d in detections:

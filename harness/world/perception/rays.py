@@ -47,10 +47,11 @@ class Surfaces:
     corners_m: Floats  # the four corners of each surface, (n, 4, 2)
 
     def by_viewer(self, values: Any) -> Any:
-        """Return `values`, one of each surface, (n,), as a table with a row for each viewer.
+        """Return values of all surfaces as a table with a row for each viewer, (v, k).
 
-        It is (v, k), where k is the number of surfaces of the viewer that has the most; cells
-        without a surface are 0 or false.
+        A surface is the outline of a vehicle or building, as one of the v viewers sees it.
+        `values`, (n,), has one for each, and k is the number of surfaces of the viewer that has the
+        most; cells without a surface are 0 or false.
         """
         table = np.zeros((len(self.ids), max(map(len, self.ids), default=0)), dtype=values.dtype)
         table[self.viewer, self.place] = values
@@ -181,10 +182,10 @@ def sweep(state: WorldState, viewer: VehicleState) -> Sweep:
 
 
 def cast(around: Surfaces, of: Bools) -> Rays:
-    """Cast, from all viewers, the rays that may meet some surfaces, and return where they do.
+    """Follow rays from all viewers that may meet certain outlines, and return what they meet.
 
-    `of`, (n,), says which of the n surfaces of `around` count. The rays that may meet one of these
-    are followed to all surfaces.
+    Outlines, surfaces, are of vehicles and buildings; `of`, (n,), says which of the n of `around`
+    count. The rays that may meet one of these are followed to all surfaces.
     """
     begin, count = _towards(around)
     surface = np.repeat(np.arange(len(count)), count)
@@ -242,10 +243,11 @@ def _all_round() -> tuple[Floats, Floats]:
 
 
 def hidden(around: Surfaces, points: Floats, solid: Bools) -> Ints:
-    """Return the number of the surface that hides each point from each viewer, (v, k); -1 if none.
+    """Return which surface hides each of k points from each of v viewers, (v, k); -1 if none.
 
-    `points` are (k, 2) m, the same for all v viewers of `around`. Only surfaces where `solid`,
-    (n,), is true hide.
+    It is the surface's index in `around`, the outlines of vehicles and buildings around the
+    viewers. `points` are (k, 2) m, the same for all viewers. Only surfaces where `solid`, (n,), is
+    true hide.
     """
     surface = np.flatnonzero(solid)
     viewer = around.viewer[surface]

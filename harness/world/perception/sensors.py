@@ -123,9 +123,11 @@ def reports(
 
 
 def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
-    """Return a mask of those of the n surfaces of `around` that are in `pairs`, (n,).
+    """Return a mask of the surfaces that belong to some pairs of a viewer and a vehicle, (n,).
 
-    A pair is the index of a viewer and that of a surface among the viewer's own, from 0.
+    A surface is the outline of a vehicle or building. A pair of `pairs` is the index of a viewer
+    and that of a surface among the viewer's own, from 0; `around` has all n surfaces, viewer by
+    viewer.
     """
     most = max([len(ids) for ids in around.ids], default=0)
     table = np.zeros((len(around.ids), most), dtype=bool)

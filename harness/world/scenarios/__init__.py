@@ -101,10 +101,11 @@ def split(text: str) -> tuple[str, str | None]:
 
 
 def argument(scenario: Scenario) -> str:
-    """Return the text by which `get` finds this scenario again, even if its defaults change later.
+    """Return the text that names a scenario with its settings, such as `blind-merge:ambient=fog`.
 
-    It spells out the settings that differ from the defaults, and those in which suites (sets of
-    datasets, one for each scenario) differ.
+    `get` finds the same scenario by it, even if its defaults change later. It spells out the
+    settings that differ from the defaults, and those in which suites (sets of datasets, one for
+    each scenario) differ.
     """
     return _spelled(scenario, {*_changed(scenario), *_of_suites(scenario)})
 
@@ -207,7 +208,10 @@ def of_manifest(name: str, parameters: Mapping[str, Any]) -> Scenario:
 
 
 def restore(name: str, parameters: Parameters) -> Scenario:
-    """Return the scenario that was pickled as this name and these parameters."""
+    """Return the scenario that was pickled as this name and these parameters.
+
+    Pickle calls it, since a scenario's functions cannot be pickled.
+    """
     return replace(get(name), parameters=parameters)
 
 
