@@ -1,10 +1,11 @@
 """What two runs must have alike for their success to be compared as that of one thing."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from msgspec import structs
 
+from harness.core.errors import UserError, printable
 from harness.runs import formats
 from harness.runs.folder import Run
 from harness.world.scenario import Scenario
@@ -69,3 +70,25 @@ def different(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
         if value != there:
             names.append(name)
     return ", ".join(names)
+
+
+def refuse_two_of_a_name(runs: Iterable[Run]) -> None:
+    """Raise UserError if a model of one name has other weights in one run than in another.
+
+    Work that was stopped may go on with a model that was trained or updated in the meantime.
+    """
+    by_name: dict[str, tuple[Run, Any]] = {}
+    for run in runs:
+        manifest = run.manifest
+        of_ego = formats.identity(manifest.identity)
+        identities = [of_ego, *of_ego.pop("helpers", [])]
+        agents = [manifest.agent(0), *manifest.helpers]
+        for agent, identity in zip(agents, identities, strict=False):
+            name = str(agent["model"]["name"])
+            first, known_identity = by_name.setdefault(name, (run, identity))
+            if identity != known_identity:
+                raise UserError(
+                    f"model {printable(name)} has other weights, or another engine, in "
+                    f"{printable(run.path)} than in {printable(first.path)}; delete both, with "
+                    "what was made of their answers, and type the command again"
+                )

@@ -23,7 +23,7 @@ from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import card_here
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
-from harness.runs import pinned
+from harness.runs import formats, pinned
 from harness.runs.folder import Run
 from harness.runs.headline import PAIRED
 from harness.runs.metrics import METRICS
@@ -236,6 +236,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 def _agent(m: Manifest) -> dict[str, Any]:
     """Return who answered, and how; prompts may differ by family."""
     agent = {**m.agent(0), "temperature": m.settings.temperature}
+    agent["identity"] = formats.identity(m.identity)
     return {key: value for key, value in agent.items() if key != "prompt"}
 
 

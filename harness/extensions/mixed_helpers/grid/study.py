@@ -31,6 +31,7 @@ from harness.evaluate.spec import Spec
 from harness.report.compare.page import beside
 from harness.report.document import Table, linked
 from harness.report.drawing.colours import conditions
+from harness.runs.alike import refuse_two_of_a_name
 from harness.runs.estimates import over_episodes
 from harness.runs.folder import Run
 from harness.runs.headline import SUCCESS, headline_of
@@ -209,7 +210,7 @@ def run_cells(
     """
     opens = cache(open_backend)
     answers: dict[tuple[str, str], dict[str, Answer]] = {}  # by role and agent, then by id
-    cells = []
+    cells, runs = list[Cell](), list[Run]()
     pairs = list(product(enumerate(egos, 1), enumerate(helpers, 1)))
     # All are checked first.
     specs = [replace(spec, ego=ego, helpers=(helper,)) for (_, ego), (_, helper) in pairs]
@@ -220,12 +221,13 @@ def run_cells(
                 stored |= of_role
         folder = folder_in(out, "cells") / f"{i}-{j}"
         run = read_or_evaluate(both, folder, progress, cache_file, opens, stored)
+        refuse_two_of_a_name([*runs, run])
+        runs.append(run)
         for answer in run.answers:
             if answer.role != "merge" and answer.error is None:
                 of_agent = helper.name if is_helper(answer.role) else ego.name
                 answers.setdefault((answer.role, of_agent), {})[answer.id] = answer
         cells.append(Cell(ego, helper, run))
-    runs = [cell.run for cell in cells]
     episodes = runs[0].episodes[: len(runs[0].grid.episodes)]
     return Grid(tuple(cells), len(egos), len(helpers), Success.of(episodes, headline_of(*runs)))
 

@@ -30,6 +30,7 @@ from harness.report.compare.page import beside
 from harness.report.document import Table
 from harness.report.drawing.colours import conditions
 from harness.report.findings import Kind, of_runs
+from harness.runs.alike import refuse_two_of_a_name
 from harness.runs.estimates import in_range
 from harness.runs.folder import Run
 from harness.runs.headline import SUCCESS
@@ -109,6 +110,7 @@ class Repeats:
             raise UserError(
                 f"{printable(self.path)}: its runs are not of the same episodes and conditions"
             )
+        refuse_two_of_a_name(self.runs)
 
     @property
     def k(self) -> int:
