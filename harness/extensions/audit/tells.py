@@ -43,13 +43,10 @@ Hidden = tuple[str, list[tuple[int, dict[str, float | None]]]]
 class Audit:
     """Hold how well what the ego sees predicts the hidden danger of a scenario, and by what.
 
-    The danger is the vehicle that an ego which keeps its speed would meet; a sector is where it can
-    come from. It is of so many `layouts` (start situations), the first with layout seed `seed`, and
-    of the decisions numbered in `steps`, from 0. `auc` has for each question (`danger`: is there
-    one; a sector: does it come from there) the probability from 0 to 1 that a layout where it is
-    true gets a higher score than one where it is not; 0.5 is a guess. `told_by` has the AUC that is
-    lost without each number of the ego's scene graph that gives the danger away; it is empty unless
-    an AUC is too high.
+    The ego is the car that decides, and the danger the vehicle that it would meet if it kept its
+    speed. The danger is out of sight at first, so a scenario is fair only if nothing in sight tells
+    whether it is there. A sector (left, right, oncoming) is where it can come from. A step is a
+    decision of an episode, numbered from 0. An AUC is 0.5 for a guess and 1 for certainty.
     """
 
     scenario: str  # name of the scenario
@@ -62,8 +59,8 @@ class Audit:
     # a layout with it ranks above one without. Intervals are a bootstrap over layouts, for these
     # models
     auc: Mapping[str, Estimate]
-    # names of the scene graph's numbers that gave it away, with the AUC lost without each; empty
-    # unless it `tells`
+    # numbers of the ego's scene graph (what it knows of the scene) that give the danger away, by
+    # name, with the AUC lost without each; empty unless an AUC is above `MOST_AUC`
     told_by: Mapping[str, float]
 
     @property
@@ -79,11 +76,10 @@ class Audit:
 class HiddenPoints:
     """Hold m decision points, some for each layout, at which the danger is out of the ego's sight.
 
-    `layout`, (m,), is the index of each point's layout (drawn start situation), and `step`, (m,),
-    the number of its decision in the episode, from 0. `danger`, (m,), is the sector that its
-    layout's danger comes from, `NONE` without a danger. `numbers`, (m, k), has the k numbers that
-    the ego's scene graph states (what it knows of the scene), NaN where it does not know one, and
-    `names` their names.
+    A decision point is one situation in which the ego must act; a layout is a drawn start
+    situation. The danger is the vehicle that the ego would meet if it kept its speed. Each point
+    has k numbers that the ego's scene graph (what it knows of the scene) states, such as speeds and
+    distances.
     """
 
     layout: Ints  # index of each point's layout (start situation), (m,)
@@ -102,10 +98,10 @@ def audit(
 ) -> Audit:
     """Test, in simulated layouts, whether what the ego sees gives a scenario's hidden danger away.
 
-    There are `layouts` of them, with layout seeds `seed` to `seed + layouts - 1`. `progress` is
-    called with the number of layouts just done; `workers` is the number of processes, or a cluster.
-    Raises UserError without scikit-learn, or if too few layouts have a danger, or too few have
-    none.
+    A layout is a start situation. There are `layouts` of them, with layout seeds `seed` to `seed +
+    layouts - 1`. `progress` is called with the number of layouts just done; `workers` is the number
+    of processes, or a cluster. Raises UserError without scikit-learn, or if too few layouts have a
+    danger, or too few have none.
     """
     extras.need("an audit", "sklearn")
     seeds = range(seed, seed + layouts)
@@ -179,13 +175,23 @@ def _selected(layouts: list[Hidden], scenario: Scenario) -> HiddenPoints:
 def judge(
     points: HiddenPoints, sectors: tuple[str, ...]
 ) -> tuple[dict[str, Estimate], dict[str, float]]:
-    """Return how well numbers predict a danger, the AUC of each question by its name, and by which.
+    """Test whether what the ego sees predicts the danger that it cannot see; say how well.
 
-    A question is whether there is a danger (`danger`), or whether it comes from one of the
-    `sectors` (their names); its AUC is the probability that a layout where that is true scores
-    above one where it is not. Trees learn from the numbers of `points`, and score layouts from
-    which they have not learnt. If the highest AUC is above `MOST_AUC`, the second result has, by
-    name, the numbers without which it falls the most, and how much; else it is empty.
+    The danger is the vehicle that the ego would meet if it kept its speed. A scenario is fair only
+    if nothing in sight tells that it is there, or from which sector (left, right, oncoming) it
+    comes. Classifiers (boosted trees) learn that from numbers of the ego's view in some layouts
+    (start situations), and score the others.
+
+    Args:
+        points: the situations in which the ego must act, with the numbers that it knows there and
+            the true danger.
+        sectors: the names of the sectors that the danger can come from.
+
+    Returns:
+        By question (`danger`, is there one; or a sector, does it come from there) the AUC with its
+        95 % interval: the probability that a layout where it is true scores above one where it is
+        not. And, if one AUC is above `MOST_AUC`, by name the numbers without which it falls most,
+        with by how much; else an empty dict.
     """
     from sklearn.ensemble import HistGradientBoostingClassifier
     from sklearn.model_selection import StratifiedGroupKFold
@@ -253,9 +259,9 @@ def _shuffled(column: Floats, step: Ints, name: str) -> Floats:
 class Ranks:
     """Hold how often layouts with the danger in question score higher than layouts without it.
 
-    Both arrays are (with, without): a row for each layout with the danger and a column for each
-    without. `pairs` counts the pairs of decision points of both that were compared, and `above`
-    those in which the layout with the danger has the higher score; a tie counts half.
+    A layout is a start situation; the danger in question is any, or one from a certain sector
+    (left, right, oncoming), and a score is its predicted probability. Arrays are (with, without): a
+    row for each layout with the danger and a column for each without.
     """
 
     # number of pairs of points in which the layout with it ranks higher, (with, without); a tie
@@ -267,9 +273,10 @@ class Ranks:
     def compare(cls, layout: Ints, alike: Ints, score: Floats, there: Bools) -> "Ranks":
         """Compare scores of m decision points, of layouts with the danger in question and without.
 
-        All arrays are (m,): the number of each point's layout (start situation); `alike`, the
-        number of its group, since only points of one group are compared; the score; and `there`,
-        whether the layout has the danger.
+        All arrays are (m,). `layout` is the number of each point's layout (start situation), and
+        `score` the predicted probability of the danger. `alike` is the number of the point's group:
+        only scores of one group compare, those of one step and one trained model. `there` is
+        whether the layout has the danger. Returns the counts of pairs by layout.
         """
         have, have_not = np.unique(layout[there]), np.unique(layout[~there])
         above, pairs = np.zeros((2, len(have), len(have_not)))
@@ -290,8 +297,8 @@ class Ranks:
     def estimate(self) -> Estimate:
         """Return the AUC: the probability that a layout with the danger scores above one without.
 
-        Its 95 % interval has the percentiles of a bootstrap over the layouts, whose number is its
-        `n`.
+        A layout is a start situation, and the danger a vehicle that the ego would meet. The 95 %
+        interval has the percentiles of a bootstrap over the layouts, whose number is its `n`.
         """
         have, have_not = self.pairs.shape
         draws = noise.generator("audit", "bootstrap")
@@ -307,8 +314,9 @@ class Ranks:
 class OfDatasets:
     """Audit a scenario while `harness dataset build` makes a dataset of it.
 
-    `ready` raises UserError where scikit-learn is missing, and `found` returns the audit's result
-    as a sentence for the dataset's README.
+    An audit tests whether what the ego sees gives the hidden danger away. `ready` raises UserError
+    where scikit-learn is missing. `found` runs the audit on `layouts` start situations with layout
+    seeds from `seed` on, and returns its result as a sentence for the dataset's README.
     """
 
     def ready(self) -> None:
