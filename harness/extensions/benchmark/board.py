@@ -25,13 +25,10 @@ from harness.runs.suite import SuiteRun, plays
 
 @dataclass(frozen=True)
 class Line:
-    """Hold one entry of a board, the ranking of an edition (a release of the benchmark).
+    """Hold one entry of a board, the page that ranks models on a release of the benchmark.
 
-    `entry` is its file of results, computed again here. `rank` is one more than the number of
-    entries that are clearly better, None of an entry that sees what no vehicle can. `success` has,
-    by condition (an operating point of the edition, by name), the share of episodes in which the
-    ego reaches its goal in time, as a mean over scenarios; `gain` is the first of these less that
-    without a radio. None is not known.
+    That release is an edition. A condition is a named set of settings of radio, asking and fusion;
+    success is the share of episodes in which the ego reaches its goal in time. None is not known.
     """
 
     entry: Rescored  # the file of results, computed again
@@ -46,7 +43,7 @@ class Line:
 
     @property
     def name(self) -> str:
-        """Return the entry's name: model, prompt, answer mode and other choices.
+        """Return the entry's name on the board: its model, prompt, answer mode and other choices.
 
         For a rule, which reads no prompt, it is the model alone.
         """
@@ -58,11 +55,12 @@ class Line:
 
 
 def lines(entries: Sequence[Rescored]) -> list[Line]:
-    """Return the board's lines for the entries of one edition, the most successful first.
+    """Return the lines of the page that ranks a benchmark's entries, the best entry first.
 
-    `entries` are files of results whose figures were computed again here. Each gets its rank, its
-    success in each of the edition's conditions, and its gain. Raises UserError if they are of
-    several editions, or if there are none.
+    `entries` are files of results of one edition (a release of the benchmark), whose figures were
+    computed again here. A line has an entry's rank, its success in each of the edition's conditions
+    (settings of radio, asking and fusion), and its gain, the success with a radio less that
+    without. Raises UserError if they are of several editions, or if there are none.
     """
     names = dict.fromkeys(entry.edition.name for entry in entries)
     if len(names) != 1:
@@ -125,20 +123,21 @@ def _gain(suite: SuiteRun, edition: Edition, metric: str) -> Score | None:
 
 
 def write(ordered: Sequence[Line], left_out: Collection[str], out: Path) -> Path:
-    """Write the HTML page that ranks entries to the file `out`, and return its path.
+    """Write the HTML page that ranks a benchmark's entries to the file `out`, and return its path.
 
-    `ordered` are the board's lines in the order of the page, as `lines` returns them. `left_out`
-    has a sentence for each file that is not on the board: which it is, and why.
+    `ordered` has a line for each entry (the results of one model), the best first: its rank, its
+    success under each condition (settings of radio, asking and fusion), and its gain by the radio.
+    `left_out` has a sentence for each file that is not on the board: which it is, and why.
     """
     save([render(ordered, left_out)], out, "--out")
     return out
 
 
 def render(ordered: Sequence[Line], left_out: Collection[str]) -> str:
-    """Return the HTML page that ranks entries, as text; `write` saves it.
+    """Return the HTML page that ranks a benchmark's entries, as text, to be saved or served.
 
-    `ordered` are the board's lines in the order of the page. `left_out` has a sentence for each
-    file of results that is not on the board: which it is, and why.
+    `ordered` has a line for each entry (the results of one model), the best first. `left_out` has a
+    sentence for each file of results that is not on the board: which it is, and why.
     """
     first = ordered[0].entry
     edition, suite = first.edition, first.suite

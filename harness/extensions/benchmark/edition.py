@@ -40,8 +40,8 @@ Digests = Annotated[dict[str, str], Meta(min_length=1, description="a table of d
 class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Describe `editions/NAME.golden.zip`, a file of results that pins how figures are computed.
 
-    An installation must compute the very figures that this file states. `sha256` is the file's hex
-    digest, and `layouts` how many start situations of each dataset it has, counted from the first.
+    An edition is a release of the benchmark; an installation must compute the very figures that
+    this file of it states.
     """
 
     sha256: str  # hex digest of the file
@@ -51,15 +51,8 @@ class Golden(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Describe an edition: a release of the benchmark that never changes.
 
-    It has all that a score depends on, beside the model. `name` is that of its file, `digest` the
-    hex SHA-256 of what the file states, and `description` its purpose. `datasets` and `prompts` are
-    by name with their hex SHA-256; `condition` has the names of the operating points that are
-    scored (settings of the radio, of whom the ego asks and so on), one of them `ranked_by`. `seeds`
-    of the channel's draws, `latency` of an answer and `ties` of actions are as the options of
-    `harness eval` of these names take them. `metrics` are the names of the figures that a file of
-    results states. `gains` is how intervals of gains are made: of all layouts (start situations)
-    together (`paired episodes`), or of those with a danger and without apart. `golden` is None in a
-    project's own edition that pins no figures. `sealed` is read by nothing.
+    It has all that a score depends on, beside the model: datasets, prompts, settings and metrics.
+    Operating points are named settings of radio, asking and fusion.
     """
 
     name: str  # name of its file, without .toml
@@ -71,12 +64,16 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     prompts: Digests
     condition: Names  # the operating points that are scored, such as `6g`
     ranked_by: str  # the one of them by which entries are ranked
-    seeds: str  # channel seeds, as `--seeds` reads them
-    latency: str  # latency of every answer, as `--latency` reads it
-    ties: str  # how equally likely actions are taken, as `--ties` reads it
+    # keys of the channel's random draws, written as for `--seeds`, such as `0:5`
+    seeds: str
+    # how long every answer takes, written as for `--latency`
+    latency: str
+    # which of equally likely actions is taken, written as for `--ties`: drawn, or the first
+    ties: str
     metrics: Names  # the figures that a file of results states
-    # the kind of the intervals of gains: of all layouts taken together, or combined from those of
-    # each half
+    # how the intervals of gains in success are made: of all layouts (start situations) taken
+    # together (`paired episodes`), or combined from those with a danger and those without
+    # (`episodes`)
     gains: Literal["paired episodes", "episodes"] = "episodes"
     golden: Golden | None = None  # None in a project's own edition that pins nothing
     sealed: str | None = None  # what earlier editions of a project may state; nothing reads it
@@ -88,16 +85,17 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def layouts(self, file_sha256: str) -> int | None:
         """Return how many layouts (start situations) of each dataset a file of results is of.
 
-        `file_sha256` is the file's hex digest. None means all: only the edition's golden file has
-        fewer.
+        An edition is a release of the benchmark. `file_sha256` is the file's hex digest. None means
+        all: only the edition's golden file has fewer.
         """
         return self.golden.layouts if self.golden and self.golden.sha256 == file_sha256 else None
 
     def figures(self, run: Run) -> list[Score]:
         """Return the scores of a run that a file of results of this edition states.
 
-        A score is the estimate of one metric in one condition, with its interval. These are the
-        run's scores of the edition's `metrics`, whose gains have the edition's kind of interval.
+        An edition is a release of the benchmark. A score is the estimate of one metric under one
+        condition (settings of radio, asking and fusion), with its interval. These are the run's
+        scores of the edition's `metrics`, whose gains have the edition's kind of interval.
         """
         scores = [score for score in run.scores if score.metric in self.metrics]
         if self.gains == PAIRED:
@@ -107,19 +105,21 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         ]
 
     def difference(self, pairs: Pairs) -> Estimate:
-        """Return the mean difference in success of a less b over families, with an interval.
+        """Return the mean success of model a less that of model b over families, with an interval.
 
-        `pairs` has, for each family (the scenes of one scenario), how success counts there, and the
-        success of a and of b, 1 or 0, both (S, E) by S channel seeds and E episodes. The interval
-        is of the kind that `gains` names.
+        `pairs` has a tuple for each family (the scenes of one scenario): how success counts there,
+        plainly or balanced over episodes with a danger and without; then the success of a and of b,
+        1 or 0, both (S, E) by S channel seeds and E episodes. The interval is of the kind that
+        `gains` names.
         """
         return mean_difference(pairs) if self.gains == PAIRED else pinned.mean_difference(pairs)
 
     def settings(self, dataset: str, **further: Any) -> Settings:
         """Return the settings of an evaluation on one of the edition's datasets, by its name.
 
-        `further` are settings that the edition leaves open, such as `model`, `prompt` and `answer`,
-        by their names in `Settings`.
+        An edition is a release of the benchmark, which fixes all settings but the model's.
+        `further` are those that it leaves open, by their names: `model`, `prompt`, `answer` (`json`
+        and so on) and others of the class `Settings`.
         """
         return Settings(
             world=FrozenSettings(dataset=dataset),
@@ -133,9 +133,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def source(self, dataset: str, limit: int | None = None) -> FrozenSource:
         """Read one of the edition's datasets by its name, as scenes on which a model is evaluated.
 
-        A dataset has layouts, drawn start situations of a scenario, each with every scene that
-        actions can lead to. With `limit`, only that many layouts are taken, from the first. Raises
-        UserError if the dataset here is missing, or has another digest than the edition states.
+        An edition is a release of the benchmark. A dataset has layouts, drawn start situations of a
+        scenario, each with every scene that actions can lead to. With `limit`, only that many
+        layouts are taken, from the first. Raises UserError if the dataset here is missing, or has
+        another digest than the edition states.
         """
         source = FrozenSource(load.load(load.find(dataset), limit), limit)
         if source.dataset.sha256 != self.datasets[dataset]:
@@ -147,10 +148,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def entry(self, runs: Sequence[Run], limit: int | None = None) -> dict[str, Run]:
         """Return the runs of one entry by the name of their dataset, in the edition's order.
 
-        An entry is one model's results on the edition. `limit` is how many layouts (start
-        situations) of each dataset they must be of; None for all. Raises UserError unless each run
-        has this edition's settings, each dataset has one run, and all are of one agent: one model,
-        answer mode and so on.
+        An edition is a release of the benchmark, and an entry one model's results on it. `limit` is
+        how many layouts (start situations) of each dataset they must be of; None for all. Raises
+        UserError unless each run has this edition's settings, each dataset has one run, and all are
+        of one agent: one model with one prompt, answer mode and so on.
         """
         by_dataset: dict[str, Run] = {}
         for run in runs:
@@ -207,11 +208,11 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 yield f"its {what}: {printable(value)}, not {printable(wanted)}"
 
     def spec(self, run: Run, source: FrozenSource) -> Spec:
-        """Return the evaluation that computes a run again, on the scenes of `source`.
+        """Return the evaluation that computes a benchmark run again, on the scenes of `source`.
 
-        A `Spec` is what an evaluation needs: it has the edition's settings here, and the run's
-        agent (its model, prompt and answer mode). Raises UserError if the prompt of that name here
-        has another digest than the edition states.
+        It has the settings of this edition, a release of the benchmark, as they are here, and the
+        run's agent (its model, prompt and answer mode). Raises UserError if the prompt of that name
+        here has another digest than the edition states.
         """
         m = run.manifest
         prompt = versions.load(str(m.prompt["version"]))
@@ -243,7 +244,8 @@ def _agent(m: Manifest) -> dict[str, Any]:
 def named(name: str) -> Edition:
     """Return the edition of a name, such as `v2v-safety-1.1`: one that ships, or the project's own.
 
-    Raises UserError if there is none, or its file is wrong.
+    An edition is a release of the benchmark that never changes. Raises UserError if there is none,
+    or its file is wrong.
     """
     if name not in names(KIND):
         raise unknown("edition", name, names(KIND))

@@ -46,7 +46,7 @@ class Rescored:
 class Here:
     """Represent this installation: it reads each dataset once, and checks how it computes figures.
 
-    One object is shared by all files of results that are computed again.
+    Make one, and share it among all files of results that are computed again in a process.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,8 @@ class Here:
     def source(self, edition: Edition, name: str) -> FrozenSource:
         """Return the scenes of an edition's dataset by its name; each is read once and kept.
 
-        Raises UserError if the dataset here has another digest than the edition states.
+        An edition is a release of the benchmark. Raises UserError if the dataset here has another
+        digest than the edition states.
         """
         key = edition.digest, name
         if key not in self._sources:
@@ -150,10 +151,11 @@ def _about(file: Path, folder: Path) -> Iterator[None]:
 def differing(stated_run: Run, computed_run: Run, edition: Edition) -> Iterator[str]:
     """Yield in words what differs between a run as a file states it and as it is computed here.
 
-    First come the condition and name of each of the edition's figures that differs; then each
-    column of the table of episodes, with the number of episodes that differ. Numbers are compared
-    to the last digit. A column that is empty in the stated run is not compared, since a release
-    that wrote the run may not have had it.
+    First come the condition (settings of radio, asking and fusion) and name of each of the
+    edition's figures that differs; an edition is a release of the benchmark. Then comes each column
+    of the table of episodes, with the number of episodes that differ. Numbers are compared to the
+    last digit. A column that is empty in the stated run is not compared, since a release that wrote
+    the run may not have had it.
     """
     stated_scores = {score.key: score for score in edition.figures(stated_run)}
     computed_scores = {score.key: score for score in edition.figures(computed_run)}

@@ -125,20 +125,22 @@ def _files(
 
 
 def contents_of(file: Path) -> Contents:
-    """Read `results.json` in a file of results, which describes it; nothing else is unpacked.
+    """Read the description of a benchmark's file of results; nothing else is unpacked.
 
-    Raises UserError if the file is not one of results.
+    This is its `results.json`: of which release of the benchmark the results are, who made them,
+    and which runs there are. Raises UserError if the file is not one of results.
     """
     with _archive(file) as archive:
         return msgspec.json.decode(_piece(archive, CONTENTS, CHUNK), type=Contents)
 
 
 def unpack(file: Path, contents: Contents, folder: Path) -> None:
-    """Write the runs in a file of results to `folder`, each in a folder named after its dataset.
+    """Write the runs in a benchmark's file of results to folders below `folder`, one a dataset.
 
-    `contents` is what `contents_of` read in the file. Only the files that it calls for are written,
-    under names made here and no larger than `FILES` allows. Raises UserError if the file is broken;
-    or, before anything is unpacked, if it holds others or larger ones.
+    `contents` is the file's description (its `results.json`), which names the runs. Only the files
+    that it calls for are written, under names made here and no larger than `FILES` allows. Raises
+    UserError if the file is broken; or, before anything is unpacked, if it holds others or larger
+    ones.
     """
     with _archive(file) as archive:
         wanted = {f"{name}/{each}": most for name in contents.runs for each, most in FILES.items()}

@@ -9,12 +9,12 @@ SEALED = 1_000_000_000  # the first of as many layout seeds from which sealed la
 
 
 def sealed(commit: str, scenario: str) -> int:
-    """Return the layout seed of the first of a scenario's sealed layouts, from a commit's id.
+    """Return the first layout seed of a test set that nobody can have seen, from a commit's id.
 
-    Layouts are start situations that are drawn from seeds; the next ones have the next seeds. The
-    seed is 10^9 plus the SHA-256 of "COMMIT SCENARIO", read as a number, modulo 10^9. Nobody knows
-    the id before the commit is made, so nobody can have looked at these layouts before. Raises
-    UserError if `commit` is not a whole hex id.
+    A layout seed draws a start situation of a scenario; the test set has the seeds from this one
+    on. The seed is 10^9 plus the SHA-256 of "COMMIT SCENARIO", read as a number, modulo 10^9.
+    `commit` is the hex id of a Git commit, which nobody knows before it is made, and `scenario` the
+    scenario's name. Raises UserError if `commit` is not a whole hex id.
     """
     if not re.fullmatch("[0-9a-f]{40}|[0-9a-f]{64}", commit):
         raise UserError(
