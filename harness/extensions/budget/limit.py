@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 class Budget:
     """Hold the most money that a command may spend on answers, by the prices in model cards.
 
-    A model card is a file that describes a model. `most` is an amount in `currency`, a currency's
-    name. Every process of the command adds what it spends as a line to `file`. Called with a card
-    and the backend that runs its model, it returns a backend that stops once all is spent.
+    A model card is a file that describes a model. Every process of the command adds what it spends
+    to `file`. Called with a card and the backend (the code that runs its model), it returns a
+    backend that does the same, adds its price to the file, and stops once all is spent.
     """
 
     most: float  # the most, in `currency`
@@ -86,10 +86,11 @@ class Limited:
 def budget(most: float, specs: "Sequence[Spec]", workers: "Workers") -> Iterator[Budget]:
     """Enter a context with the budget that a command's evaluations share, of `most` money.
 
-    `most` is in the currency of the models' prices. `specs` are the evaluations, and `workers` is
-    how many processes play them, or a cluster of them. A line on stderr names the servers' models
-    that have no price and so do not count. Raises UserError if `most` is not above 0, if no model
-    card states a price or several state it in different currencies, or for a cluster.
+    `most` is in the currency of the models' prices, which model cards (files that describe models)
+    state. `specs` are the evaluations, and `workers` is how many processes play them, or a cluster
+    of them. A line on stderr names the servers' models that have no price and so do not count.
+    Raises UserError if `most` is not above 0, if no card states a price or several state it in
+    different currencies, or for a cluster.
     """
     option = f"--max-cost {most:g}"
     if not isinstance(workers, int):

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 class MaxCost(CommandOption):
     """Define the option `--max-cost AMOUNT`: a command asks no model once its answers cost so much.
 
-    `guard` returns the context in which evaluations share that budget; of None, one without a
-    limit.
+    `guard` takes the amount, the evaluations and the number of processes, and returns the context
+    in which these share the budget; if the amount is None, a context without a limit.
     """
 
     kind = float
