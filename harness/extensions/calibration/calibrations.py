@@ -36,12 +36,11 @@ ONLY_TUNE = "calibration is fitted on tune seeds"
 
 @dataclass(frozen=True)
 class Correction:
-    """Hold the correction of one role's answers: a prior to divide out, and a temperature.
+    """Hold a correction that makes one role's stated probabilities fit how often they are right.
 
-    An answer is a probability for each of A actions, and a role is who gives it: the ego, or a
-    helper. `prior` has an action's mean probability each, (A,), and is empty where nothing is
-    divided out. Then probabilities are raised to 1 / `temperature` and scaled to sum to 1; a
-    temperature of 1 changes nothing. `answers` is the number of answers that it was fitted on.
+    An answer is a probability for each of A actions, and a role is who gives it: the ego (the car
+    that decides), or a helper that it asks. First the `prior`, each action's mean probability (A,),
+    is divided out; then probabilities are raised to 1 / `temperature` and scaled to sum to 1.
     """
 
     answers: Count  # number of answers that it was fitted on
@@ -62,19 +61,16 @@ class Correction:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Hold the content of a file of `calibrations/`: corrections of one model's answers.
+    """Hold a file of `calibrations/`: corrections of one model's stated probabilities.
 
-    They hold for one model, prompt and answer mode (`question`, with these settings by name) and
-    one `scenario`, and were fitted on layouts (start situations) with layout seeds from
-    `first_seed` to `last_seed`. `level` says what is corrected: L0 divides a prior out, L1 has a
-    temperature, L0+L1 both. `ego` corrects the ego's answers and `helper` those of helpers, None
-    where none answered. `command` made the file, `fitted_on` describes the run, and `actions` are
-    the names of the actions in the order of an answer's probabilities.
+    They hold for one model, prompt and answer mode (`question`) and one scenario, and were fitted
+    on start situations (layouts) that are drawn by the layout seeds `first_seed` to `last_seed`.
     """
 
     level: Level  # L0 divides a prior out, L1 has a temperature, L0+L1 both
     command: str  # the command that made the file
-    fitted_on: str  # the run, with its layouts
+    # in words: the run whose answers were used, and its layouts (start situations)
+    fitted_on: str
     first_seed: int  # least layout seed that it was fitted on
     last_seed: int  # greatest layout seed
     scenario: str  # name of the scenario
@@ -84,10 +80,10 @@ class Calibration:
     helper: Correction | None = None  # of helpers' answers; None where no helper answered
 
     def obstacle(self, agent: Mapping[str, Any], scenario: Scenario) -> str | None:
-        """Return in words why it must not correct an agent's answers in a scenario; None if it may.
+        """Return in words why this calibration must not correct an agent's answers; None if it may.
 
-        An agent is a model with its prompt and answer mode; `agent` has its settings by name, as
-        `run.json` states them.
+        An agent is a model with its prompt and answer mode, as which the calibration was fitted;
+        `agent` has its settings by name, as `run.json` states them. `scenario` is where it answers.
         """
         of_scenario = {"scenario": scenario.name, "actions": " ".join(scenario.actions)}
         now = {**question_of(agent), **of_scenario}
@@ -102,8 +98,9 @@ class Calibration:
     def of(self, intents: Intents) -> Intents:
         """Return a copy of what vehicles intend, with the ego's and the helpers' answers corrected.
 
-        An intent is the probabilities that a vehicle gives to the ego's actions. Those of helpers
-        stay as they are if `helper` is None.
+        An intent is the probabilities that a vehicle gives to the ego's actions; `intents` has
+        arrays of them for the ego and its helpers. Those of helpers stay as they are if `helper` is
+        None.
         """
         helpers = self.helper.of(intents.helpers) if self.helper else intents.helpers
         return replace(intents, own=self.ego.of(intents.own), helpers=helpers)
@@ -112,8 +109,9 @@ class Calibration:
 def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
     """Return the settings of an agent for which a calibration is valid, as texts by dotted name.
 
-    An agent is a model with its prompt and answer mode. `agent` has its settings as `run.json`
-    states them: tables `model` and `prompt`, and values such as `answer`.
+    An agent is a model with its prompt and answer mode, and a calibration corrects its
+    probabilities. `agent` has its settings as `run.json` states them: tables `model` and `prompt`,
+    and values such as `answer`. A key of the result is, for example, `prompt.sha256`.
     """
     model, prompt = agent["model"], agent["prompt"]
     return {
@@ -124,19 +122,25 @@ def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
 
 
 def names() -> list[str]:
-    """Return the names of all files of `calibrations/`, those that ship and the project's."""
+    """Return the names of all files of `calibrations/`, those that ship and the project's.
+
+    A calibration corrects a model's stated probabilities.
+    """
     return resources.names(FOLDER)
 
 
 def file_of(name: str) -> Any:
-    """Return the path of a calibration's file, by its name. Raises UserError if it is unknown."""
+    """Return the path of a calibration's file, by its name.
+
+    A calibration corrects a model's stated probabilities. Raises UserError if it is unknown.
+    """
     if name not in names():
         raise unknown("calibration", name, names(), "; `harness model calibrate` makes one")
     return resources.find(FOLDER, f"{name}.toml")
 
 
 def calibration(name: str) -> Calibration:
-    """Load the calibration of a name: what corrects one model's answers (`Calibration`).
+    """Load what corrects one model's stated probabilities, by the name of its file.
 
     Raises UserError if it is unknown or its file is wrong.
     """

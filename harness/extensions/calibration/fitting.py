@@ -90,13 +90,20 @@ def nats_of(p: Floats, optimal: Bools) -> float:
 def calibrate(
     folder: Path, level: Level, dataset: Path | None, command: str
 ) -> tuple[Calibration, list[Fitted]]:
-    """Fit a calibration on the answers of a finished run on layouts that are for tuning.
+    """Fit the correction of a model's stated probabilities on the answers of a finished run.
 
-    `folder` is the run's, and `dataset` its dataset's, None for where the run says it is; `level`
-    says what is fitted (`Calibration`), and `command`, as typed, is stated in the result. Also
-    returned is, for each role (ego, helper), the correction and how much it gained. Raises
-    UserError for layouts of another purpose, several models, sampled answers, or if no answer of
-    the ego could be parsed.
+    The run must be on layouts (start situations) that are for tuning. Returns the calibration,
+    which has the corrections, and for each role that answered (`ego`, `helper`) how much its
+    correction gains.
+
+    Args:
+        folder: the run's folder.
+        level: what is fitted: `L0` a prior, `L1` a temperature, `L0+L1` both.
+        dataset: the folder of the run's dataset; None for where the run says it is.
+        command: the command as typed, which the calibration states.
+
+    Raises UserError for layouts of another purpose, several models, sampled answers, or if no
+    answer of the ego could be parsed.
     """
     run, name = read(folder), printable(folder)
     manifest = run.manifest
@@ -151,7 +158,7 @@ def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None
 
 
 def write(calibration: Calibration, out: Path) -> None:
-    """Write a calibration to the TOML file `out`, where `calibrations.calibration` can read it."""
+    """Write a calibration, what corrects a model's stated probabilities, to the TOML file `out`."""
     fields = asdict(calibration)
     tables = {name: fields.pop(name) for name in ("question", "ego", "helper")}
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]

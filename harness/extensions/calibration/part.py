@@ -19,17 +19,17 @@ class Calibrated(Part, frozen=True, kw_only=True):
     """Hold the setting `calibration` of an operating point: what corrects all answers before use.
 
     It is the name of a file of `calibrations/`, fitted for the run's model, prompt and scenario;
-    empty corrects nothing. Methods are the hooks of `Part`, a group of settings of an operating
-    point, which is all that a decision depends on besides scene and model. `behind` is the setting
-    after which it stands in records, `of_ego` says that it matters to an ego that asks nobody, and
-    `named` has what returns the names that there are.
+    empty corrects nothing. An operating point is the settings of radio, asking and fusion. Methods
+    are the hooks of `Part`, a group of such settings. `behind` is the setting after which it stands
+    in records, `of_ego` says that it matters to an ego that asks nobody, and `named` has what
+    returns the names that there are.
     """
 
     behind: ClassVar[str] = "content"
     of_ego: ClassVar[bool] = True
     named: ClassVar = {"calibration": names}
 
-    # A name of `harness.extensions.calibration.calibrations`; empty for nothing.
+    # name of a file of `calibrations/`; empty for nothing
     calibration: Text = ""
 
     def check(self) -> None:
