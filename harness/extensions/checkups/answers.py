@@ -61,12 +61,8 @@ class Looks:
 class Checkup:
     """Hold what asking a language model a few questions showed: its prompt, tokens and answers.
 
-    `prompt` is the first question as the model reads it, `tokens` its token ids, each with its
-    text, and `bos_tokens` how many start tokens it begins with, more than one of which harms most
-    models; both are None for a server's model. `turn_end` is the text of the token that ends an
-    answer; `thinking` what the model's chat template says about thinking first. `answers` has an
-    answer in each answer mode, asked alone after a warm-up; `identity` tells the model apart, such
-    as by its weights' digest; `looks` is None if the model takes no pictures.
+    An answer mode is a way to answer, such as free text (`json`) or one letter (`readout`). A chat
+    template is the model's own rule for writing a chat as one text.
     """
 
     prompt: str  # the first question as the model reads it, or as a server is sent it
@@ -91,9 +87,10 @@ def check(
 ) -> Checkup:
     """Check a language model: ask it some questions, one in each answer mode, and show its prompt.
 
+    An answer mode is a way to answer, such as free text (`json`) or one letter (`readout`).
     `backend` runs the model. For one that takes pictures, `pictured` has in each answer mode the
     same question three times: with a camera picture, with a blank one, and with none. `progress` is
-    called with 1 after each answer.
+    called with 1 after each answer. Returns the prompt as the model reads it, and its answers.
     """
 
     def answer(request: Request, warm: bool = False) -> Completion:

@@ -46,8 +46,8 @@ class Check:
     def completions(self) -> list[Completion]:
         """Return every answer that the model must be able to give.
 
-        That is one in each answer mode to a prompt in words, and to one with a camera picture if it
-        takes pictures; not those to blank pictures.
+        That is one in each answer mode (free text, one letter and so on) to a prompt in words, and
+        to one with a camera picture if it takes pictures; not those to blank pictures.
         """
         return [
             *self.seen.answers.values(),
@@ -56,7 +56,11 @@ class Check:
 
     @property
     def usable(self) -> bool:
-        """Return whether an answer in some mode can be parsed to probabilities of actions."""
+        """Return whether the model can be used: an answer of it says how probable each action is.
+
+        One answer that can be parsed, in any answer mode (free text, one letter and so on), is
+        enough.
+        """
         request = self.spec.ego.blank("ego", self.spec.actions)
         answers = self.seen.answers.items()
         return any(answer_of(request.alike(answer=mode), reply).intent for mode, reply in answers)
@@ -67,8 +71,9 @@ def check(
 ) -> Check:
     """Check a language model in every answer mode, with and without pictures.
 
-    If it answers by letters, fixed questions also show what its read-outs follow (`Findings`),
-    which is then kept in the user's cache.
+    An answer mode is a way to answer, such as free text or one letter for an action. If the model
+    can answer by letters, fixed questions also show whether these answers follow the scene or the
+    letter; that is then kept in the user's cache.
 
     Args:
         card: the file that describes the model, with the engine that runs it.

@@ -22,10 +22,10 @@ CLEAR = 1.2  # times as fast as another, which chance on a shared machine does n
 
 @dataclass(frozen=True)
 class Pace:
-    """Hold the wall times of an engine (code that runs a model) for an answer of two kinds, in s.
+    """Hold how many seconds a model takes on one engine for a short answer and for a longer one.
 
-    Each was asked alone after a warm-up: `readout_s` is for an answer by letters in one order, and
-    `text_s` for the first `TOKENS` tokens of a free answer.
+    An engine is code that runs a model, such as llama.cpp. Each answer was asked alone after a
+    warm-up, on this machine.
     """
 
     engine: str  # its name
@@ -34,11 +34,12 @@ class Pace:
 
 
 def paces(stem: str) -> list[Pace]:
-    """Time the engines (kinds of code that run models) which can run a model here, one entry each.
+    """Return how many seconds a model's answers take on each engine that can run it here.
 
-    `stem` is the name, without that of an engine, of the model's card, a file that describes it and
-    names its engines. The list is empty unless there are several and the weights are small. Raises
-    UserError if weights do not load or the model cannot answer, and Unanswered if an answer fails.
+    An engine is code that runs a model, such as llama.cpp; a model card is a file that describes a
+    model and names its engines. `stem` is the card's name without an engine's, such as `qwen3-4b`.
+    The list is empty unless there are several engines and the weights are small. Raises UserError
+    if weights do not load or the model cannot answer, and Unanswered if an answer fails.
     """
     able = [card for card in each_engine(stem) if missing(card) is None] if stem in names() else []
     if len(able) < 2 or not all(_small(card) for card in able):
@@ -47,10 +48,13 @@ def paces(stem: str) -> list[Pace]:
 
 
 def by_card(stems: Sequence[str], progress: Callable[[int], None]) -> dict[str, list[Pace]]:
-    """Return the times of each model's engines, by the name of its card, a file that describes it.
+    """Return how many seconds the answers of several models take on each engine, by model.
 
-    `stems` are such names, without that of an engine. A model is left out that has fewer than two
-    engines here or large weights, or that cannot be asked. `progress` is called with 1 after each.
+    It serves to advise which engine to use. An engine is code that runs a model, such as llama.cpp;
+    a model card is a file that describes a model. `stems` are names of cards without an engine's
+    name, and the keys of the result; a value has an entry for each engine. A model is left out if
+    there is nothing to choose (fewer than two engines here, or large weights), or if it cannot be
+    asked. `progress` is called with 1 after each model.
     """
     measured = {}
     for stem in stems:

@@ -40,10 +40,9 @@ PASSES = 5
 class Finding:
     """Hold one comparison of what an engine (code that runs a model) makes of n prompts.
 
-    It is compared with another engine, or with itself in batches. `what` says in words what was
-    compared; `measured` is the share of equal outputs or the largest difference, `allowed` its
-    limit, None where there is none, and `holds` whether it is within that. `differences` are the
-    first prompts that differ, in words.
+    Its outputs are compared with another engine's, or with its own when prompts come in batches.
+    `measured` is the share of equal outputs, 0 to 1, or the largest difference of log-probabilities
+    or probabilities, as `what` says in words.
     """
 
     what: str  # what was compared

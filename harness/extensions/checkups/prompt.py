@@ -56,7 +56,7 @@ class Answers(Struct, frozen=True):
     sample: str  # the first text of the commonest kind
 
     def sentences(self) -> Iterator[str]:
-        """Yield sentences on the faults of the answers, the most frequent first.
+        """Yield sentences on the faults of one role's answers to a prompt, the most frequent first.
 
         The last one says which action is the likeliest in how many, or that all texts are the same.
         """
@@ -95,10 +95,11 @@ class Trial(Struct, frozen=True):
 
 
 def card_of(prompt: Prompt, model: str, engine: str | None) -> Card:
-    """Return the card (description) of the model on which a prompt is to be tried.
+    """Return the card (the file that describes a model) on which a prompt is to be tried.
 
-    `model` is its name, and `engine` which of its engines runs it, None for the first. Raises
-    UserError if it is no language model, or the prompt cannot ask the fixed questions.
+    `model` is the model's name, and `engine` the code that is to run it, such as `llama-cpp`; None
+    for the first that its cards name. Raises UserError if it is no language model, or if the prompt
+    cannot ask the fixed questions, twelve scenes that ship with the program.
     """
     card = resolve(model, engine)
     if not capabilities(card.engine).language_model:
@@ -119,10 +120,15 @@ def try_on(
 ) -> tuple[Trial, Findings | str | None]:
     """Try a prompt on a model: ask the fixed questions for answers in words, and by read-outs.
 
-    `card` describes the model, `device` is where it is loaded (None: the engine chooses), and
-    `dtype` the number format (None: the card's). `progress` is told how many questions there are,
-    and called with 1 after each. The second value returned is None if the engine has no read-outs
-    (probabilities of one letter an action), and an error's text if a read-out got no answer.
+    The fixed questions are scenes that ship with the program; a read-out takes the probabilities of
+    one letter an action. `card` describes the model, `device` is where it is loaded (None: the
+    engine chooses), and `dtype` the number format (None: the card's). `progress` is told how many
+    questions there are, and called with 1 after each.
+
+    Returns:
+        Counts of qualities and faults of the answers in words; and what read-outs follow, the scene
+        or the letter. The second is None if the engine has no read-outs, and an error's text if one
+        got no answer.
     """
     agent = Agent(card, prompt)
     reads_out = "readout" in agent.can.answer_modes and not agent.thinking
@@ -167,10 +173,11 @@ def try_out(
 def described(
     prompt: Prompt, role: Role, actions: Sequence[str], answers: Sequence[Answer]
 ) -> Answers:
-    """Return a summary of one role's answers: how many have which quality or fault.
+    """Return how many of one role's answers have which quality or fault.
 
-    `actions` are the names of the actions, in the order of an answer's probabilities. `prompt` is
-    what was asked with: answers that copy one of its examples are counted.
+    `answers` are the model's, with their parsed probabilities, and `role` is who was asked, `ego`
+    or `helper`. `actions` are the names of the actions, in the order of an answer's probabilities.
+    `prompt` is what was asked with: answers that copy one of its examples are counted.
     """
     examples = []
     if prompt.examples:

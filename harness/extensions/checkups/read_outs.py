@@ -33,15 +33,16 @@ COUNT = 12 + 2 * 16  # requests that an examination asks, but for those of scene
 class Moved(Struct, frozen=True):
     """Hold how answers to pairs of questions followed the one fact in which both differ.
 
-    `fact` is its kind, such as `conflict` (`questions.Pair`). In `moved` of `n` pairs the expected
-    action became clearly likelier with the fact; `mean` is the mean change of its probability, from
-    -1 to 1.
+    It tests whether a model reads what it is asked. The fact is of a kind such as `conflict` (a
+    conflict of paths in the scene) or `number` (which of two is greater); each pair has it in one
+    question and not in the other, and it should make one action likelier.
     """
 
     fact: str  # the kind of fact
     n: int  # number of pairs with two answers that can be parsed
     moved: int  # in how many the expected action became clearly likelier with the fact
-    mean: float  # mean change of the expected action's probability
+    # mean change of the expected action's probability, -1 to 1
+    mean: float
 
     @property
     def change(self) -> str:
@@ -223,9 +224,11 @@ def _likelihood(pair: Pair, half: Request, completion: Completion) -> float | No
 
 
 def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
-    """Store findings in the user's cache, by the model's identity, prompt and answer mode.
+    """Store what fixed questions showed of a model's answers, in the user's cache folder.
 
-    `identity` has values that tell the model apart, by name, as its backend states them.
+    They are stored by the model's identity, the prompt and the answer mode (such as `readout`, one
+    letter for an action), and `recall_findings` returns them. `identity` has values that tell the
+    model apart, by name, as its backend states them, such as the digest of its weights.
     """
     name = _name(identity, findings.prompt_sha256, findings.answer)
     kept.keep(name, msgspec.json.encode(findings))
@@ -234,10 +237,11 @@ def keep_findings(identity: Mapping[str, Any], findings: Findings) -> None:
 def recall_findings(
     identity: Mapping[str, Any], prompt_sha256: str, answer: str
 ) -> Findings | None:
-    """Return the findings on a model that this machine has stored; None if there are none.
+    """Return what fixed questions showed of a model's answers, as this machine has stored it.
 
-    `identity` has values that tell the model apart, by name, as its backend states them;
-    `prompt_sha256` is the hex digest of the prompt's files, and `answer` the answer mode.
+    Returns None if nothing is stored. `identity` has values that tell the model apart, by name, as
+    its backend states them; `prompt_sha256` is the hex digest of the prompt's files, and `answer`
+    the answer mode, such as `readout`.
     """
     data = kept.recall(_name(identity, prompt_sha256, answer))
     try:
@@ -254,10 +258,11 @@ def _name(identity: Mapping[str, Any], prompt_sha256: str, answer: str) -> str:
 
 
 def caveats(manifest: Manifest) -> Iterator[str]:
-    """Yield what stored findings say against a run's models, in sentences for its page.
+    """Yield warnings about a run's models, in sentences for the run's page.
 
-    Findings count for a model, the ego's or a helper's, if it was asked with the same prompt and
-    answer mode. `manifest` is what the run's `run.json` has.
+    They say where stored answers to fixed questions showed that a model ignores the scene or
+    follows the letter of an option. They count for a model, the ego's or a helper's, if it was
+    asked with the same prompt and answer mode. `manifest` is what the run's `run.json` has.
     """
     helpers = manifest.identity.get("helpers")
     identities = [manifest.identity, *(helpers if isinstance(helpers, list | tuple) else ())]
