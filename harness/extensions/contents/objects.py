@@ -64,10 +64,10 @@ class ShowsTruth(Call):
 class OfLists(Content):
     """Describe a message that lists the objects which a helper's sensors see.
 
-    The helper's model is not asked, so the message leaves at once. The ego's model is asked again
-    (`call`) with a scene graph (what the ego knows) that has these objects as well, and the ego
-    acts on that answer. `kind` is the kind of what the message holds, of
-    `coordination.contents.KINDS`.
+    A helper is a vehicle that the ego (the car that decides) asks. Its model is not asked, so the
+    message leaves at once. The ego's model is asked again (`call`) with a scene graph (what the ego
+    knows) that has these objects as well, and the ego acts on that answer. `kind` says which of the
+    kinds of `coordination.contents.KINDS` the message holds.
     """
 
     needs = (kinds.OBJECTS,)

@@ -109,8 +109,9 @@ def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
 def headline(result: Result) -> list[str]:
     """Return sentences on what messages gain, by what they hold: intents, words, objects or both.
 
-    They state success over that with intents, the bits that messages take, and the time until the
-    ego acts.
+    An intent is a vehicle's probabilities of the ego's actions. `result` has one model's outcomes.
+    The sentences state the success with each content over that with intents, the bits that messages
+    take, and the time until the ego acts.
     """
     base, name, intent = result.base, result.model.name, result.at(result.base, INTENT)
     gains, costs = list[str](), list[str]()
@@ -401,11 +402,11 @@ def _marks(curves: "Sequence[pd.DataFrame]") -> "pd.DataFrame":
 def points_table(results: Sequence[Result]) -> "pd.DataFrame":
     """Return the outcomes as a table: a row for each model, grid point, content and family.
 
-    A content is what messages hold, and a family the scenes of one scenario, or `mean` of several.
-    A grid point is a `condition` (operating point) with one setting (`variable`) at a `value`.
-    Columns of figures, such as `success` (a share) and `bits_per_episode`, have the ends of their
-    95 % interval beside them, in `_low` and `_high`; `over_intent` is success less that with
-    intents.
+    A content is what messages hold, such as `intent` (a vehicle's probabilities of actions), and a
+    family the scenes of one scenario, or `mean` of several. A grid point is a `condition` (settings
+    of radio, asking and fusion) with one setting (`variable`) at a `value`. Columns of figures,
+    such as `success` (a share) and `bits_per_episode`, have the ends of their 95 % interval beside
+    them, in `_low` and `_high`; `over_intent` is success less that with intents.
     """
     import pandas as pd
 
@@ -446,8 +447,9 @@ def _points_row(
 def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
     """Return success by who sees the danger: a row for each model, group of episodes and content.
 
-    A group has the episodes in which so many helpers see the danger (`study.groups`), a content is
-    what messages hold, and the condition is the first one as it is. `success` is a share, and
+    The danger is the vehicle that the ego would meet if it drove on. A group has the episodes in
+    which so many helpers see it, and a content is what messages hold. All are under the first
+    condition (settings of radio, asking and fusion) as it is. `success` is a share, and
     `over_intent` that less the share with intents, with 95 % intervals in `_low` and `_high`; `n`
     counts episodes.
     """

@@ -60,10 +60,11 @@ Place = tuple[OperatingPoint, int]  # of an outcome: the operating point, and th
 
 
 class Panel(NamedTuple):
-    """Describe what a study varies in one condition (operating point): one setting, its axis.
+    """Describe what a study varies in one condition: one setting, its axis, with its values.
 
-    `name` is for people, and `axis` the setting's name, such as `loss`; without one, the condition
-    is played as it is. `settings` are the grid points to play, one for each value of the axis.
+    A condition is a named set of settings of radio, asking and fusion. A grid point is the
+    condition with one value of the axis, and a number of vehicles; without an axis, the condition
+    is played as it is.
     """
 
     name: str  # such as `6g:encoding=etsi over loss`
@@ -75,8 +76,8 @@ class Panel(NamedTuple):
 class Model:
     """Hold the runs of one model, by family (the scenario's name), that a study plays again.
 
-    `name` says which model, prompts and answer mode. `left_out` has the contents of messages
-    (`intent`, `objects`, `both` and so on) that it cannot play, each with the reason in words.
+    The study varies what messages between vehicles hold: `intent` (probabilities of actions),
+    `objects`, `both` and so on. It uses the runs' stored answers; only what they lack is asked.
     """
 
     name: str  # model, prompts and answer mode
@@ -85,20 +86,20 @@ class Model:
 
     @property
     def contents(self) -> list[str]:
-        """Return what messages may hold in this model's runs, such as `intent` or `objects`.
+        """Return what messages may hold in this model's runs, such as `objects`.
 
-        `nothing` stands for an ego that asks nobody, and `oracle` for the whole truth.
+        `intent` is a vehicle's probabilities of actions; `nothing` stands for an ego that asks
+        nobody, and `oracle` for the whole truth.
         """
         return [content for content in PLAYED if content not in self.left_out]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Hold what a model's runs come to with one content of messages at one grid point.
+    """Hold how well the ego does with one content of messages under one set of settings.
 
-    A grid point is an operating point with one value changed. `families` has by family (scenario)
-    and metric, such as `success_rate`, the values by S channel seeds and E episodes, (S, E).
-    `success_rules` says by family how success counts, plain or balanced.
+    The content is what messages hold, such as `objects`; the settings are those of radio, asking
+    and fusion, with one value changed. A family is the scenes of one scenario.
     """
 
     # values by family and metric, such as `success_rate`, (S, E) each
@@ -109,22 +110,25 @@ class Outcome:
     def headline_metric(self) -> str:
         """Return the name of the metric of success that is shown first, plain or balanced.
 
-        Balanced success is the mean of success with a danger and without.
+        Balanced success is the mean over episodes with a danger (a vehicle that the ego would meet)
+        and without.
         """
         return next(iter(self.success_rules.values())).metric
 
     @property
     def success(self) -> Estimate:
-        """Return the metric of success that is shown first, a share, as a mean over families.
+        """Return the share of successful episodes, plain or balanced, as a mean over scenarios.
 
-        A family is the scenes of one scenario.
+        Balanced is the mean over episodes with a danger (a vehicle that the ego would meet) and
+        without.
         """
         return self.estimate(self.headline_metric)
 
     def estimate(self, metric: str, family: str = MEAN) -> Estimate:
-        """Return the mean of a metric over the episodes of a family, with an interval.
+        """Return the mean of a metric over the episodes of a scenario, with an interval.
 
-        `metric` is its name, and `family` the scenario's; by default the mean over families.
+        `metric` is its name, such as `success_rate`, and `family` the scenario's name; by default
+        it is the mean over all scenarios.
         """
         estimates = []
         for name in self._of(family):
@@ -140,9 +144,9 @@ class Outcome:
     ) -> Estimate:
         """Return this outcome's success less another's, paired by episode, from -1 to 1.
 
-        `family` is a scenario's name, or that of the mean over families; `level` is the confidence
-        of the interval. `metric` is empty for the metric that is shown first, or names plain
-        success.
+        `family` is a scenario's name, or that of the mean over families (scenarios); `level` is the
+        confidence of the interval. `metric` names plain or balanced success; empty takes the one
+        that is shown first.
         """
         return mean_difference([*self._pairs(other, family, metric)], level)
 
@@ -164,10 +168,10 @@ class Outcome:
             yield rule, self.families[name][SUCCESS], other.families[name][SUCCESS]
 
     def pooled(self, groups: Mapping[str, Bools]) -> Floats:
-        """Return success, 1 or 0, of the n episodes in a group, all families together, (S, n).
+        """Return success, 1 or 0, of the n episodes in a group, of all scenarios together, (S, n).
 
-        `groups` has, by family, a mask (E,): which of its E episodes are in the group. S is the
-        number of channel seeds.
+        `groups` has, by scenario's name, a mask (E,): which of its E episodes are in the group,
+        such as those in which one helper sees the danger. S is the number of channel seeds.
         """
         parts = []
         for family, values in self.families.items():
@@ -193,26 +197,28 @@ class Result:
     outcomes: Mapping[Place, Outcome]
 
     def at(self, setting: Setting, content: str) -> Outcome:
-        """Return the outcome with a content of messages, such as `objects`, at a grid point.
+        """Return how well the ego does with a content of messages, such as `objects`.
 
-        `setting` is the grid point: an operating point, and a number of vehicles.
+        `setting` is the grid point: an operating point (settings of radio, asking and fusion), and
+        a number of vehicles.
         """
         return self.outcomes[place(setting, content)]
 
     @property
     def base(self) -> Setting:
-        """Return the grid point at which the first condition is as it is, with no value changed.
+        """Return the grid point in which nothing is changed: the study's first condition as it is.
 
-        A grid point is an operating point to play and a number of vehicles; a condition is the
-        operating point that it changes.
+        A condition is a named set of settings of radio, asking and fusion, and a grid point such
+        settings with one value changed, and a number of vehicles.
         """
         return self.panels[0].settings[0]
 
     @property
     def points(self) -> list[Setting]:
-        """Return every grid point once, in order, though panels may share it.
+        """Return every grid point of the study once, in order, though panels may share it.
 
-        A grid point is an operating point to play and a number of vehicles.
+        A grid point is settings of radio, asking and fusion, with one value changed, and a number
+        of vehicles. A panel has those in which the same setting is varied.
         """
         return distinct(self.panels)
 
@@ -220,15 +226,17 @@ class Result:
     def others(self) -> list[str]:
         """Return the contents that are compared with `intent`: all others that were played.
 
-        A content is what messages hold, such as `objects`; `nothing` is an ego that asks nobody.
+        A content is what messages hold: `intent` is a vehicle's probabilities of actions, `objects`
+        a list of what it sees; `nothing` is an ego that asks nobody.
         """
         return [content for content in self.model.contents if content != INTENT]
 
     @property
     def sent(self) -> list[str]:
-        """Return the contents beside intents that messages can hold, such as `text` or `objects`.
+        """Return what messages can hold beside intents in this study, such as `text` or `objects`.
 
-        So `nothing`, an ego that asks nobody, and `oracle`, the whole truth, are left out.
+        An intent is probabilities of actions. `nothing`, an ego that asks nobody, and `oracle`, the
+        whole truth, are left out, as no message holds them.
         """
         return [
             content
@@ -250,10 +258,10 @@ class Result:
         """Return the p-value of no change in success by another content of messages than intents.
 
         It compares success when messages hold `content`, such as `objects`, with that when they
-        hold intents (a vehicle's probabilities of actions), over the same episodes, at the grid
-        point `setting`: an operating point with a number of vehicles. The p-value is corrected by
-        Holm's method over all contents and grid points of the model; it is None for intents
-        themselves, and where no interval is known.
+        hold intents (a vehicle's probabilities of actions), over the same episodes. `setting` is
+        the grid point: settings of radio, asking and fusion, and a number of vehicles. The p-value
+        is corrected by Holm's method over all contents and grid points of the model; it is None for
+        intents themselves, and where no interval is known.
         """
         return self._p.get(place(setting, content))
 
@@ -261,20 +269,22 @@ class Result:
     def headline_metric(self) -> str:
         """Return the name of the metric of success that is shown first, plain or balanced.
 
-        Balanced success is the mean of success with a danger and without.
+        Balanced success is the mean over episodes with a danger (a vehicle that the ego would meet)
+        and without.
         """
         return self.at(self.base, INTENT).headline_metric
 
     @property
     def words(self) -> str:
-        """Return the name of the metric that is shown first, such as `balanced success`."""
+        """Return the first metric's name for people, such as `balanced success`."""
         return IN_WORDS[self.headline_metric]
 
     @property
     def successes(self) -> tuple[str, ...]:
-        """Return the name of the metric that is shown first, and those of its halves if it has any.
+        """Return the names of the metrics of success to show: the first, then its halves if any.
 
-        Balanced success is the mean of success with a danger and without.
+        Balanced success is the mean of two halves: over episodes with a danger (a vehicle that the
+        ego would meet) and without.
         """
         return self.headline_metric, *entry(self.headline_metric).halves
 
@@ -297,10 +307,10 @@ def holding(point: OperatingPoint, content: str) -> OperatingPoint:
 
 
 def place(setting: Setting, content: str) -> Place:
-    """Return the key of an outcome in `Result.outcomes`, at a grid point with a content.
+    """Return the key in `Result.outcomes` of the outcome with a content of messages.
 
-    It is the operating point in which messages hold that content, such as `objects`, and the number
-    of vehicles.
+    It is the operating point (settings of radio, asking and fusion) in which messages hold that
+    content, such as `objects`, and the number of vehicles. `setting` is the grid point.
     """
     return holding(setting.point, content), setting.vehicles
 
@@ -308,7 +318,8 @@ def place(setting: Setting, content: str) -> Place:
 def distinct(panels: Sequence[Panel]) -> list[Setting]:
     """Return the grid points of all panels in order, each once, though panels may share it.
 
-    A grid point is an operating point to play and a number of vehicles.
+    A grid point is settings of radio, asking and fusion, with one value changed, and a number of
+    vehicles. A panel has those in which the same setting is varied.
     """
     every = [setting for panel in panels for setting in panel.settings]
     last_first = {place(setting, INTENT): setting for setting in reversed(every)}
@@ -392,13 +403,14 @@ def panels_of(
     over: Sequence[str],
     grids: Sequence[str],
 ) -> list[Panel]:
-    """Return what to vary: a panel for each condition as it is, and for each axis in each of them.
+    """Return what a study varies: a panel for each condition as it is, and for each of its axes.
 
-    `conditions` are texts such as `6g:encoding=etsi`. `over` names the axes, settings such as
-    `loss`, and `grids` has the text of each one's values, such as `0,0.1,0.2`, in the same order;
-    without conditions and axes, the usual ones (`USUAL`) are taken. Raises UserError for a
-    condition, axis or value that does not exist or that the runs cannot play, or if there are more
-    grids than axes.
+    A condition is a text that names settings of radio, asking and fusion, such as
+    `6g:encoding=etsi`. An axis is one setting that is varied, such as `loss`, and a panel has all
+    its values in one condition. `over` names the axes, and `grids` has the text of each one's
+    values, such as `0,0.1,0.2`, in the same order; without conditions and axes, the usual ones
+    (`USUAL`) are taken. Raises UserError for a condition, axis or value that does not exist or that
+    the runs cannot play, or if there are more grids than axes.
     """
     if len(grids) > len(over):
         raise UserError(
@@ -421,10 +433,21 @@ def panels_of(
 
 
 def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, int]]:
-    """Return how many answers each run may lack at most, by family (scenario) and role.
+    """Return how many questions a study will have to ask a model, at most, by run and role.
 
-    The roles are `ego`, `helper`, and `fusion` for an ego that is asked again with messages. The
-    questions are about the decision points that the run or a reference driver, a rule, visits.
+    Use it to tell the cost before the study is played. The study plays finished runs again with
+    other settings and other contents of messages; what was not answered before must be asked.
+
+    Args:
+        model: the model's runs, with their stored answers.
+        panels: the settings of radio, asking and fusion that the study will play, grouped by the
+            setting that is varied.
+
+    Returns:
+        By family (the scenario's name of each run) the number of questions by role: `ego`,
+        `helper`, and `fusion` for an ego that is asked again with messages. They count the
+        situations that the run or a rule driver came to; an ego that decides otherwise may come to
+        others.
     """
     points = set[OperatingPoint]()
     for setting in distinct(panels):
@@ -440,10 +463,10 @@ def asked_at_most(model: Model, panels: Sequence[Panel]) -> dict[str, dict[str, 
 def manifest_of(
     swarms: Sequence[Model], panels: Sequence[Panel], seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Return what identifies a study, as plain values by name, for its `contents.json`.
+    """Return what tells one study from another, as plain values by name, for its `contents.json`.
 
     They are the models' runs (`sources`), the contents of messages, the channel's `seeds`, and the
-    operating points of each panel.
+    operating points (settings of radio, asking and fusion) that are played.
     """
     return {
         "sources": [run.manifest() for model in swarms for run in model.runs.values()],
@@ -462,6 +485,9 @@ def run_contents(
 ) -> list[Result]:
     """Play every content of messages at every grid point with every model's runs.
 
+    A content is what messages hold, such as `objects`; a grid point is an operating point (settings
+    of radio, asking and fusion) with one value changed.
+
     Args:
         swarms: the models with their runs.
         panels: the conditions, and the settings varied in them.
@@ -469,7 +495,7 @@ def run_contents(
         out: the folder of the study, which may hold the same one only.
         progress: told how many points there are to play, and called with 1 after each.
 
-    Returns one result a model, in their order.
+    Returns one result a model, in their order, with the success and cost of each content.
 
     Raises:
         UserError: the folder `out` holds another study.
