@@ -49,12 +49,12 @@ def _others(holds: frozenset[str]) -> list[str]:
 class Controlled(Part, frozen=True, kw_only=True):
     """Hold the setting `messages` of an operating point: whose messages the ego hears.
 
-    An operating point is the settings of radio, asking and fusion. `own` takes those of its
-    helpers. `shuffled`, messages of helpers in another start situation, and `blind`, those of
-    helpers that are shown nothing, are controls: a gain that remains under them does not come from
-    what helpers see. Methods are the hooks of `Part`, a group of such settings. `behind` is the
-    setting after which it stands in records, `questions` has what helpers may be asked by it, and
-    `controls` says by the value what the ego hears.
+    An operating point is the settings of radio, asking and fusion. `own` takes messages of the
+    ego's own helpers. Two values are controls: `shuffled` takes messages of helpers in another
+    start situation, and `blind` those of helpers that are shown nothing. A gain in success that
+    remains under them does not come from what helpers see. Methods are the hooks of `Part`, a group
+    of such settings. `behind` is the setting after which it stands in records, `questions` has what
+    helpers may be asked by it, and `controls` says by the value what the ego hears.
     """
 
     behind: ClassVar[str] = "on_demand"
@@ -111,9 +111,10 @@ class Controlled(Part, frozen=True, kw_only=True):
 
 
 def setting_of(control: str) -> str:
-    """Return the setting of an operating point that is a control, by the control's name.
+    """Return the setting of radio, asking and fusion that is a control, by the control's name.
 
-    `shuffled-messages` is `messages=shuffled`, for example. Raises UserError if there is no such
+    A control replaces what helpers say, to show whether a gain comes from what they see. For
+    example, `shuffled-messages` is `messages=shuffled`. Raises UserError if there is no such
     control.
     """
     settings = {**NO_MESSAGES, **control_settings()}
