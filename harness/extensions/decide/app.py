@@ -66,6 +66,7 @@ class Service:
     """Answer HTTP requests for decisions of one model; `app` returns its web application.
 
     A decision is a question with listed options, of which the model gives each a probability.
+    Requests that come together are answered together.
     """
 
     def __init__(

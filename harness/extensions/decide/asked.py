@@ -16,9 +16,10 @@ MOST_DEPTH = 32
 
 
 class Refusal(Exception):
-    """Signal that a request gets no answer: `words`, one line for the client, and what HTTP needs.
+    """Signal that a client's request gets no answer, and why.
 
-    That is `status`, the HTTP status, and `code`, a short name of the reason for programs.
+    `words` is one line for the client, `status` the HTTP status, such as 429, and `code` a short
+    name of the reason for programs, such as `busy`.
     """
 
     def __init__(self, words: str, status: int = 400, code: str = "invalid_request") -> None:
@@ -45,7 +46,10 @@ class Asked:
 
     @property
     def length(self) -> int:
-        """Return the number of characters of its state, instructions, options and meanings."""
+        """Return how many characters the question takes: state, instructions, options and meanings.
+
+        Questions that are too long are refused by it.
+        """
         meanings = self.question.meanings
         texts = (self.question.state, self.question.instructions, *meanings, *meanings.values())
         return sum(len(text or "") for text in texts)
@@ -60,6 +64,7 @@ class Enquiry:
     """
 
     model: str | None  # name of the model that it asks for; None takes the served one
+    # the questions with their options, each asked by itself
     questions: tuple[Asked, ...]
     images: tuple[str, ...] = ()  # URLs of the pictures before the state
 
@@ -72,6 +77,7 @@ class Answered:
     if it refused. `tokens` is the number of prompt tokens, None if nobody counts them.
     """
 
+    # the question, with its options
     asked: Asked
     # probability of each option, as the model states it; None where the model refused
     shares: tuple[float, ...] | None

@@ -26,10 +26,7 @@ class Text(Struct, tag_field="type", tag="input_text"):
 
 
 class Json(Struct, tag_field="type", tag="input_json"):
-    """Hold a part of a message or of instructions that is JSON data, of type `input_json`.
-
-    `data` is what the JSON states; the model reads it written out as JSON.
-    """
+    """Hold a part of a message or of instructions that is JSON data, of type `input_json`."""
 
     data: dict[str, Any] | list[Any]  # what JSON states; the model reads it as JSON
 

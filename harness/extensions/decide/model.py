@@ -44,7 +44,8 @@ def served(card: Card, letters: Any = None) -> Agent:
 class ServedModel:
     """Hold a model that is served, and turn clients' questions into requests to it.
 
-    `name` is the model's, `backend` runs it, and `sees` says whether it takes pictures.
+    A question has listed options, of which the model gives each a probability. `name` is the
+    model's, `backend` is the code that runs it, and `sees` says whether it takes pictures.
     """
 
     def __init__(self, agent: Agent, backend: Backend) -> None:
@@ -69,9 +70,10 @@ class ServedModel:
         }
 
     def requests(self, enquiry: Enquiry) -> list[Request]:
-        """Return a request to the model for each question of a client.
+        """Return a request to the model for each question of a client, in their order.
 
-        Raises Refusal if it asks for another model, or for what this one cannot take.
+        `enquiry` has the questions, about one state. Raises Refusal if it asks for another model,
+        or for what this one cannot take, such as pictures.
         """
         if enquiry.model not in (None, ANY, self.name):
             raise Refusal(
