@@ -45,9 +45,9 @@ def fits(
 ) -> list[Fit]:
     """Return the time and energy of answers on a device, for each row and each kind of answer.
 
-    A row of a device profile has a computer's speed with one model. `answers` has the token counts,
-    by kind of answer. `window_s` is the longest time, s, from seeing to the answer that counts as
-    in time.
+    A device is an on-board computer, and a row of its profile has its speed with one model.
+    `answers` has the token counts, by kind of answer: one letter, or in writing. `window_s` is the
+    longest time, s, from seeing to the answer that counts as in time.
     """
     results = []
     for row in rows:
@@ -73,9 +73,10 @@ class Answers:
 
 
 def declared(prompt_tokens: int, answer_tokens: int) -> Answers:
-    """Return the token counts of one assumed answer: as a read-out of one token, and in writing.
+    """Return the token counts of one answer that is assumed: as a read-out, and in writing.
 
-    `prompt_tokens` are read, and `answer_tokens` written where it writes.
+    They are used where no run is at hand. `prompt_tokens` are read; a read-out (one letter) writes
+    one token, and an answer in writing `answer_tokens`.
     """
     output = {READOUT: np.array([1.0]), WRITTEN: np.array([float(answer_tokens)])}
     return Answers(np.array([float(prompt_tokens)]), output)
@@ -125,10 +126,8 @@ def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: 
 class Comparison:
     """Hold a time or token rate that a run measured beside what a device profile states for it.
 
-    `what` is `seconds` of an answer, or the name of a rate in tokens a second, and `role` whose
-    answers they are, `ego` or `helper`. `measured` is a median of `n` answers with its 95 %
-    interval over episodes; `stated` is the profile's figure, of seconds its median over the same
-    answers, NaN if it has none.
+    A device profile is a file with an on-board computer's speed and power. `stated` is NaN if it
+    has none.
     """
 
     # `seconds` of an answer, or a rate in tokens a second, by its name in a profile
@@ -141,9 +140,10 @@ class Comparison:
 def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
     """Return what a run measured beside what a device profile states, for each role and figure.
 
-    `row` is the profile's speed with one model. The figures are seconds of an answer, and tokens a
-    second read and written. Only answers that were asked one at a time count. Raises UserError if
-    there are none.
+    A device profile has an on-board computer's speed and power with some models; `row` is that with
+    one model. The role is whose answers they are, `ego` or `helper`. The figures are seconds of an
+    answer, and tokens a second read and written. Only answers that were asked one at a time count.
+    Raises UserError if there are none.
     """
     alone: dict[str, list[Answer]] = {}  # by role
     for answer in run.answers:

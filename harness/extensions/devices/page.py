@@ -24,7 +24,8 @@ PARTS = {
 def caveats(manifest: Manifest) -> Iterator[str]:
     """Yield a sentence for each of a run's models whose times and joules are another model's.
 
-    There is none for a run without a device profile. `manifest` is what the run's `run.json` has.
+    A run may time answers by a device profile, a file with a computer's speed and power for some
+    models; there is none for a run without. `manifest` is what the run's `run.json` has.
     """
     if (device := manifest.beside.get(PROFILE)) is None:
         return
@@ -42,7 +43,9 @@ def caveats(manifest: Manifest) -> Iterator[str]:
 def notes(run: Shown) -> Iterator[str]:
     """Yield a sentence for each condition on the joules of a decision, and on who takes them.
 
-    Yields nothing for a run whose energy is not known, as without a device profile.
+    A condition is a named set of settings of radio, asking and fusion. Yields nothing for a run
+    whose energy is not known, as without a device profile (a file with a computer's speed and
+    power).
     """
     for name in run.conditions:
         total, helpers = run.score(name, "energy_j"), run.score(name, "helpers_j")
@@ -58,10 +61,11 @@ def notes(run: Shown) -> Iterator[str]:
 def energies(run: Run) -> Table:
     """Return the mean joules of a decision as rows, one for each condition and who takes them.
 
-    A row has the name of the `condition` (operating point); who takes them as `part`, the ego's
-    inference, the helpers' or the radios; its `joules`; and of the whole decision `total_j` with
-    `low` and `high`, the ends of the 95 % interval, `n` and `interval`, what the units of n are. A
-    condition without energy is left out.
+    A condition is an operating point: settings of radio, asking and fusion. Who takes the joules
+    (`part`) is the ego's inference, the helpers' inference or the radios. A row has the
+    `condition`, the `part`, its `joules`, and of the whole decision `total_j` with `low` and
+    `high`, the ends of the 95 % interval, `n` and `interval`, which says what n counts. A condition
+    whose energy is not known is left out.
     """
     rows = []
     for condition in run.conditions:
@@ -85,9 +89,10 @@ def energies(run: Run) -> Table:
 
 
 def chart(rows: Table) -> dict[str, Any]:
-    """Return the Vega-Lite specification of a chart of the joules of a decision, stacked by part.
+    """Return the Vega-Lite specification of a chart of the joules of a decision, stacked.
 
-    `rows` are those that `energies` returns, of one or several runs.
+    The parts are the ego's inference, the helpers' and the radios. `rows` are those that `energies`
+    returns, one for each condition and part, of one or several runs.
     """
     return charts.stacked(rows, "condition", "part", PARTS, "J per decision", amount="joules")
 

@@ -103,8 +103,8 @@ def measure_agent(
     Scenes are asked one at a time, in `WINDOWS` windows of `window_s` seconds at least. `agent` is
     the model with a prompt and an answer mode, and `device` where it is loaded, such as `cuda`;
     None lets the engine choose. `meters` are one or more energy or power meters of this machine,
-    and `progress` is called with 1 after each window. Returns what each meter counted, and the
-    number of answers. Raises Unanswered if a question got no answer.
+    and `progress` is called with 1 after each window. Returns what each meter counted (watts, and
+    joules of an answer), and the number of answers. Raises Unanswered if a question got no answer.
     """
     data = load.load(load.find(DATASET), 10)
     spec = Spec(agent, FrozenSource(data), (), (0,), settings=Settings(batch_size=1, device=device))

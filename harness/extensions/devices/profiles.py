@@ -140,7 +140,8 @@ class Device(Struct, frozen=True, kw_only=True):
 def names() -> list[str]:
     """Return the sorted names of all device profiles, those that ship and the project's.
 
-    Each is the name of a file of `devices/`, such as `agx-orin`.
+    A device profile is a file of `devices/`, such as `agx-orin`: an on-board computer's speed and
+    power with some models.
     """
     return resources.names("devices")
 
@@ -172,11 +173,11 @@ def _with_sources(value: Any, sources: dict[str, str]) -> Any:
 
 
 def find_row(device: Device, model: str) -> DeviceRow:
-    """Return a device profile's row for a model: its speed, energy and memory there.
+    """Return a device profile's row for a model: the computer's speed, energy and memory with it.
 
-    `model` is the name of a row, or a size such as `3b`, in billions of weights; if the profile
-    allows scaling, the nearest row is then scaled by the number of weights. Raises UserError if the
-    profile has no row for it.
+    `device` is the profile, of an on-board computer. `model` is the name of a row, or a size such
+    as `3b`, in billions of weights; if the profile allows scaling, the nearest row is then scaled
+    by the number of weights. Raises UserError if the profile has no row for it.
     """
     by_name = {row.model: row for row in device.rows}
     if model in by_name:
@@ -212,8 +213,9 @@ def _scaled(device: Device, billions: float) -> DeviceRow:
 def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | None]]:
     """Yield the names and values of a row's tokens a second and joules a token; None if unknown.
 
-    They are for tokens read and written. Joules that the row lacks are the power that the device
-    draws while it infers (`load_watts`), divided by the rate.
+    A row is a device's speed and energy with one model. The figures are for tokens read and for
+    tokens written. Joules that the row lacks are the power that the device draws while it infers
+    (`load_watts`), divided by the rate.
     """
     for name in RATES:
         yield name, getattr(row, name)
@@ -229,7 +231,8 @@ def constants(device: Device, row: DeviceRow) -> Iterator[tuple[str, Constant | 
 def speed(device: Device, row: DeviceRow) -> Speed:
     """Return a row's tokens a second and joules a token as plain numbers, without their sources.
 
-    Joules that the row lacks follow from the device's power (`constants`).
+    A row is a device's speed and energy with one model. Joules that it lacks are the power that the
+    device draws while it infers, divided by the rate. None is unknown.
     """
     answer_s = row.answer_ms.value / 1000 if row.answer_ms else None
     rates = {name: c.value if c else None for name, c in constants(device, row)}

@@ -188,12 +188,14 @@ class Computer(Timer):
         `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call (a
         second question to the ego's model), and `helpers_j` the helpers' alone; `radio_mj`
         millijoules to send the request and the replies; `waiting_j` joules of the ego's computer
-        while it waits for messages and does not infer. NaN where a part is unknown.
+        while it waits for messages and does not infer. NaN where one of these is unknown.
 
         Args:
-            latency: how long answers take, with each agent's speed on the device.
-            decided: the decisions of each step and condition.
-            answers: the answers by request id.
+            latency: how long answers take, with each agent's speed on the device. An agent is a
+                model with its prompt.
+            decided: the decisions of each step and condition (settings of radio, asking and
+                fusion).
+            answers: the models' answers by request id.
         """
         parts = [self._columns_of(latency, part, answers) for part in decided]
         columns = {}
@@ -232,9 +234,9 @@ class Computer(Timer):
     ) -> Floats:
         """Return the joules of each vehicle's answer in n scenes, (n, 1+H), the ego first.
 
-        The H helpers follow. `latency` has each agent's speed on the device, `point` is the
-        condition, and `answers` are by request id. NaN for an answer that is missing, has no known
-        tokens, or came from a cloud; 0 where there is no vehicle.
+        The H helpers follow. `latency` has the device's speed with each agent's model, `point` is
+        the settings of radio, asking and fusion, and `answers` are by request id. NaN for an answer
+        that is missing, has no known tokens, or came from a cloud; 0 where there is no vehicle.
         """
         joules = np.zeros((len(scenes), max(len(scene.viewers) for scene in scenes)))
         for n, scene in enumerate(scenes):
@@ -266,11 +268,12 @@ TIMER = Computer()
 
 
 def answer_s(speed: Speed, answer: Answer) -> float:
-    """Return the seconds that an answer takes at a speed; NaN if it failed.
+    """Return the seconds that an answer takes on a computer; NaN if it failed.
 
-    They go by its tokens, or are the same for all answers if `speed` says so. A repair turn, a
-    second question after an answer that cannot be parsed, is included. Raises UserError if the
-    answer has no token counts and `speed` needs them.
+    `speed` has the computer's rates with the model, tokens a second. Seconds go by the answer's
+    tokens, or are the same for all answers if `speed` says so. A repair turn, a second question
+    after an answer that cannot be parsed, is included. Raises UserError if the answer has no token
+    counts and `speed` needs them.
     """
     if speed.answer_s is not None:
         if answer.error is not None:
@@ -280,10 +283,11 @@ def answer_s(speed: Speed, answer: Answer) -> float:
 
 
 def answer_j(speed: Speed, answer: Answer) -> float:
-    """Return the joules that an answer takes, by its tokens.
+    """Return the joules that an answer takes on a computer, by its tokens.
 
-    NaN if it failed, or if `speed` has seconds for an answer of any length and no energy a token.
-    Raises UserError if the answer has no token counts and `speed` needs them.
+    `speed` is the computer's with the model, and has the joules of a token. NaN if the answer
+    failed, or if `speed` has seconds for an answer of any length and no energy a token. Raises
+    UserError if the answer has no token counts and `speed` needs them.
     """
     return math.nan if speed.answer_s is not None else profiles.joules(speed, *tokens(answer))
 
@@ -301,10 +305,11 @@ def helpers_j(infers: Bools, vehicles: Floats) -> Floats:
 
 
 def tokens(answer: Answer) -> tuple[float, float]:
-    """Return how many tokens an answer reads and writes, of both turns if it was asked again.
+    """Return how many tokens an answer reads and how many it writes.
 
-    It is asked again, once, if it cannot be parsed and the run has repair turns. NaN if the engine
-    failed. Raises UserError if the answer has no token counts otherwise.
+    A model is asked again, once, if its answer cannot be parsed and the run has repair turns; then
+    both turns are counted. Both are NaN if the engine failed. Raises UserError if the answer has no
+    token counts otherwise.
     """
     if answer.prompt_tokens is not None and answer.completion_tokens is not None:
         return answer.prompt_tokens, answer.completion_tokens
@@ -319,8 +324,8 @@ def tokens(answer: Answer) -> tuple[float, float]:
 def transmit_watts(device: Device, point: "OperatingPoint") -> float:
     """Return the electric power of a radio while it sends, in W; NaN if the profile does not say.
 
-    It is the transmit power of the channel of `point`, the condition, if it has one, else the
-    device profile's, over the amplifier's efficiency.
+    It is the transmit power over the amplifier's efficiency. `point` is the settings of radio,
+    asking and fusion; the power is that of its channel, if it has one, else the device profile's.
     """
     if device.transmit_dbm is None or device.amplifier_efficiency is None:
         return math.nan
