@@ -37,14 +37,14 @@ class LooksRecord(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Hold the rule of a run that may stop early and its interim looks, as `run.json` has them.
 
     A layout is a start situation with one episode, and an interim look a test, after the first so
-    many of `layouts`, whether these are enough. They are if the interval of success is as narrow as
-    `width` (a share), or success differs from that of another run (`against`, its name, and
-    `against_sha256`, the hex digest of its episodes.csv), in every condition. `at` has the numbers
-    of layouts at which it looked; `enough` is the result of the last look.
+    many layouts, whether these are enough. They are if in every condition (settings of radio,
+    asking and fusion) the interval of success is as narrow as `width`, or success differs from that
+    of another run.
     """
 
     layouts: int  # how many layouts there were in all
-    width: float | None = None  # of each condition's interval of success, as a share
+    # how wide each condition's interval of success may be, as a share; None to compare with a run
+    width: float | None = None
     against: str | None = None  # the name of the run from which every condition is to differ
     against_sha256: str | None = None  # hex SHA-256 of that run's episodes.csv
     at: tuple[int, ...] = ()  # numbers of layouts after which it looked; empty while it runs
@@ -213,17 +213,18 @@ RULE = Until()
 def any_time_mean(success: Success, values: Floats) -> Estimate:
     """Return mean success with an interval that stays valid though one looks after every episode.
 
-    `values`, (S, E), are 1 or 0 by S channel seeds and E episodes, and `success` says how they are
-    averaged: plainly, or balanced over episodes with a danger and without.
+    A run may so be stopped as soon as the interval is narrow enough. `values`, (S, E), are 1 or 0
+    by S channel seeds and E episodes, and `success` says how they are averaged: plainly, or
+    balanced over episodes with a danger and without.
     """
     means = known_mean(values, 0)
     return any_time([means[part] for part in success.parts])
 
 
 def interim_looks(layouts: int) -> list[int]:
-    """Return after how many layouts a run looks whether it may stop, ascending up to `layouts`.
+    """Return after how many layouts a run tests whether it may stop, ascending up to `layouts`.
 
-    A layout is a start situation with one episode.
+    A layout is a start situation with one episode, and `layouts` how many the run has in all.
     """
     at = [min(FIRST, layouts)]
     while at[-1] < layouts:
