@@ -50,7 +50,10 @@ def split(text: str) -> tuple[str, str | None]:
 
 
 def joined(name: str, settings: Sequence[str]) -> str:
-    """Return a scenario's name with settings such as `decisions=5` added: `split` undone."""
+    """Return a scenario's name with settings added, such as `env:merge-v0:decisions=5,helpers=2`.
+
+    `name` is that without settings, and each of `settings` one such as `decisions=5`.
+    """
     head, config, changes = name.partition(CHANGES)
     return ":".join([head, *([",".join(settings)] if settings else [])]) + config + changes
 
@@ -122,8 +125,9 @@ def _texts(value: Any) -> Iterator[str]:
 def reset(name: str, seed: int) -> Any:
     """Return a new environment of highway-env (an `AbstractEnv`), reset to a seed.
 
-    `name` is its scenario name, as `named` makes it. Raises UserError if there is none, it fails,
-    or its ego cannot be driven by meta-actions (SLOWER, IDLE, FASTER and changes of lane).
+    `name` is its scenario name, such as `env:merge-v0`. Raises UserError if there is none, it
+    fails, or its ego (the car that decides) cannot be driven by meta-actions: SLOWER, IDLE, FASTER
+    and changes of lane.
     """
     env = _create(name)
     _constants().restore()
@@ -164,7 +168,7 @@ def _only_drivable(name: str, env: Any) -> None:
 
 
 def hittable(thing: Any) -> bool:
-    """Return whether a highway-env `Vehicle` or `RoadObject` can collide with others."""
+    """Return whether a `Vehicle` or `RoadObject` of highway-env can collide with others."""
     return bool(thing.collidable and thing.solid)
 
 
@@ -238,10 +242,10 @@ def _merged(default: Any, value: Any) -> Any:
 
 
 def config(name: str) -> dict[str, Any]:
-    """Return the whole configuration of an environment, with the changes that its name states.
+    """Return the whole configuration of a highway-env environment, with the changes in its name.
 
-    `name` is its scenario name, such as `env:merge-v0`. Keys are highway-env's, and values are
-    plain values of JSON.
+    `name` is its scenario name, such as `env:merge-v0` or `env:merge-v0:config={...}`. Keys are
+    highway-env's, and values are plain values of JSON.
     """
     text = json.dumps(_create(name).config, default=str)
     whole: dict[str, Any] = json.loads(text, parse_constant=str)
@@ -277,8 +281,8 @@ def numbered(env: Any, kind: Any, action: str) -> Any:
     """Return what `env.step` must be given so that the ego takes an action and others stay idle.
 
     That is the action's number, or a tuple of one for each agent that the environment controls.
-    `env` is highway-env's environment, `kind` the ego's action type, as `meta_actions` returns it,
-    and `action` a name such as `FASTER`.
+    `env` is highway-env's environment, `kind` its ego's action type (a `DiscreteMetaAction`), and
+    `action` a name such as `FASTER`.
     """
     if kind is env.action_type:
         return kind.actions_indexes[action]
@@ -316,7 +320,10 @@ class Constants:
 
     @classmethod
     def now(cls) -> "Constants":
-        """Return the constants of highway-env's vehicles as they are now in this process."""
+        """Return the class constants of highway-env's vehicles as they are now in this process.
+
+        Restore them later, before the environment that they belong to goes on.
+        """
         from highway_env.vehicle import behavior, controller, kinematics
 
         values: dict[tuple[type, str], Any] = {}
@@ -329,7 +336,11 @@ class Constants:
         return cls(values)
 
     def restore(self) -> None:
-        """Set the class constants of highway-env's vehicles back to the values that are held."""
+        """Set the class constants of highway-env's vehicles back to the values that are held here.
+
+        Do so before an environment goes on, since another in this process may have overwritten
+        them.
+        """
         for (kind, key), value in self.values.items():
             if vars(kind)[key] is not value:
                 setattr(kind, key, value)

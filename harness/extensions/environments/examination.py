@@ -14,7 +14,7 @@ Places = list[tuple[float, ...]]  # x, y, heading and speed of each vehicle
 
 
 def examine(scenario: Scenario, seed: int) -> None:
-    """Raise UserError unless an environment of highway-env simulates an episode reproducibly.
+    """Raise UserError unless an environment of highway-env simulates reproducibly.
 
     `scenario` is one that is made of such an environment, and `seed` that of the start situation.
     The environment's own `step` takes IDLE, FASTER and SLOWER twice, and deep copies take them

@@ -42,9 +42,9 @@ class Routes:
     def ahead(self, lane: Lane, plan: Sequence[Lane] | None) -> Route:
         """Return the roads that a vehicle will take, from its present one on, as two nodes each.
 
-        `lane` is where it is: two nodes and a number from the left. At each node it follows
-        highway-env's rule for the next lane; `plan` has the lanes that highway-env planned for the
-        vehicle, or is None.
+        `lane` is where it is: the two nodes of its road, and a number from the left, from 0. At
+        each node it follows highway-env's rule for the next lane. `plan` has the lanes that
+        highway-env planned for the vehicle, as such triples, or is None.
         """
         streets, plan = [lane[:2]], list(plan or ())
         while lane[1] in self.network.graph:
@@ -59,8 +59,10 @@ class Routes:
     def keys(self, lane: Lane, plan: Sequence[Lane] | None) -> list[PathKey]:
         """Return the keys of the paths that contain a vehicle's `lane`, the best match first.
 
-        The best match shares most roads with those that the vehicle will take. `plan` has the lanes
-        that highway-env planned for it, or is None.
+        A path is a line through the road network; its key is the node where it begins, and a name.
+        `lane` is the two nodes of a road and a number from the left, from 0. The best match shares
+        most roads with those that the vehicle will take. `plan` has the lanes that highway-env
+        planned for it, or is None.
         """
         ahead = self.ahead(lane, plan)
         on_lane = [key for key, path in self.paths.items() if lane in path.lanes]

@@ -105,9 +105,10 @@ class EnvironmentWorld(OwnWorld):
 
     @classmethod
     def configuration(cls, scenario: Scenario) -> dict[str, Any]:
-        """Return the environment's whole configuration, by key, to be kept in a dataset's manifest.
+        """Return the environment's whole configuration, by key, for a dataset's manifest.
 
-        The scenario's name and the version of the environment's package decide what that is.
+        Keys are highway-env's. The scenario's name and the version of the environment's package
+        decide what the values are.
         """
         return config(scenario.name)
 
@@ -117,7 +118,7 @@ class EnvironmentWorld(OwnWorld):
 
     @property
     def period(self) -> int:
-        """Return the number of frames between two decisions of the environment."""
+        """Return the number of simulated frames between two decisions of the environment."""
         p = self.scenario.parameters
         return round(p.decision_period_s * p.simulation_hz)
 
@@ -149,7 +150,7 @@ class EnvironmentWorld(OwnWorld):
         return copy.deepcopy(self, {id(thing): thing for thing in shared})
 
     def snapshot(self) -> ActionsTaken:
-        """Return the actions so far, with their frames; replayed, they lead to the same world."""
+        """Return the actions so far, with their frames; replayed, they give the same world."""
         return ActionsTaken(self.frame, tuple(self.taken))
 
     def take(self, action: str, agent: int = 0) -> None:
@@ -162,7 +163,8 @@ class EnvironmentWorld(OwnWorld):
         """Return what the ego aims for: its lane and speed as one text, and that speed's index.
 
         The text has the lane's two nodes, its number from the left and the target speed in m/s; the
-        index is that of the speed among those that the ego can choose. `agent` is 0, the ego.
+        index is that of the speed among those that the ego can choose. `agent` is the number of the
+        vehicle that decides: 0, the ego.
         """
         ego = self.everybody[0]
         aim = *lane_of(ego), round(float(ego.target_speed), DECIMALS)
