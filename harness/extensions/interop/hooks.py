@@ -157,7 +157,8 @@ class Followers:
     def counting(self, progress: Callable[[int], None]) -> Callable[[int], None]:
         """Return a function to call with the number of answers that are new.
 
-        It calls `progress` with that number, and the hooks with the total so far.
+        It calls `progress` with that number, and the hooks (plug-ins that follow the run) with the
+        total so far.
         """
 
         def count(new: int) -> None:
@@ -195,10 +196,11 @@ class Followers:
 def following(
     hooks: Mapping[str, Hook], folder: Path, settings: Mapping[str, Any]
 ) -> Iterator[Followers]:
-    """Enter a context in which hooks, by name, follow a run; if it raises, they are told so.
+    """Enter a context in which hooks, plug-ins such as trackers, follow a run.
 
-    `folder` is the run's, and `settings` are its settings by name, as in its `run.json`. Call `end`
-    of the object that is entered with the finished run.
+    They are told if it raises. `hooks` are by name, `folder` is the run's, and `settings` are its
+    settings by name, as in its `run.json`. Call `end` of the object that is entered with the
+    finished run.
     """
     followers = Followers(hooks, folder, settings)
     try:

@@ -9,9 +9,12 @@ from harness.extensions.interop import hooks
 
 
 class Tracker(CommandOption):
-    """Define the option `--tracker NAME`, repeatable: hooks, by name, that follow a command's runs.
+    """Define the option `--tracker NAME`, repeatable: trackers that follow a command's runs.
 
-    `follow` returns what makes the hooks follow a run; None where none are chosen.
+    A tracker is a program that records experiments. `follow` takes the typed names, and a text that
+    names what the command does in place of one run, if it does. It returns a function that makes
+    the trackers follow a run; None if none are chosen. Raises UserError if trackers cannot follow
+    the command.
     """
 
     kind = list[str]

@@ -14,10 +14,11 @@ _TABLES = ("channels", "networks", "schedules", "kept")  # of which a condition 
 
 
 def params(settings: Mapping[str, Any]) -> dict[str, str | int | float | bool]:
-    """Return a run's settings as flat values by dotted name, such as `world.limit`, for a tracker.
+    """Return a run's settings as flat values by dotted name, for a tracker of experiments.
 
-    `settings` are nested, as in `run.json`. Those without a value are left out, lists become JSON
-    texts, and of conditions only the names are kept.
+    `settings` are nested dicts of plain values, as `run.json` has them; a name in the result is,
+    for example, `world.limit`. Settings without a value are left out, lists become JSON texts, and
+    of conditions (settings of radio, asking and fusion) only the names are kept.
     """
     conditions = [point["name"] for point in settings["conditions"]]
     some = {name: value for name, value in settings.items() if name not in _TABLES}
@@ -35,10 +36,11 @@ def _leaves(table: Mapping[str, Any], above: str) -> Iterator[tuple[str, str | i
 
 
 def figures(done: "Evaluated") -> dict[str, float]:
-    """Return a finished run's figures by name, for a tracker, as far as they are known.
+    """Return a finished run's figures by name, for a tracker of experiments, as far as known.
 
-    `CONDITION/METRIC` is a score, with the ends of its 95 % interval in `.low` and `.high` and the
-    number of its units in `.n`; `cost/MODEL/CURRENCY` is what a model's answers cost.
+    `CONDITION/METRIC` is a score under a named set of settings of radio, asking and fusion, with
+    the ends of its 95 % interval in `.low` and `.high` and the number of its units in `.n`;
+    `cost/MODEL/CURRENCY` is what a model's answers cost.
     """
     named: dict[str, float | None] = {}
     for score in (score for score in done.scores if score.interval != "seed means"):

@@ -16,9 +16,10 @@ AT_ONCE = 100  # parameters, by MLflow's limit
 
 
 class Mlflow:
-    """Record runs in MLflow while they go: a hook, chosen by `--tracker mlflow`.
+    """Record runs in the tracker MLflow while they go, for `--tracker mlflow`.
 
-    It logs settings as parameters, the number of answers, and at the end figures and files.
+    It is a hook, a plug-in that follows runs. It logs settings as parameters, the number of
+    answers, and at the end figures and files.
     """
 
     needs = ("mlflow",)  # without which it cannot begin

@@ -12,9 +12,10 @@ if TYPE_CHECKING:
 
 
 class Trackio:
-    """Record runs in Trackio while they go: a hook, chosen by `--tracker trackio`.
+    """Record runs in the tracker Trackio while they go, for `--tracker trackio`.
 
-    It logs settings, the number of answers, and at the end figures.
+    It is a hook, a plug-in that follows runs. It logs settings, the number of answers, and at the
+    end figures.
     """
 
     needs = ("trackio",)  # without which it cannot begin

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
 
 
 class Wandb:
-    """Record runs in Weights & Biases while they go: a hook, chosen by `--tracker wandb`.
+    """Record runs in the tracker Weights & Biases while they go, for `--tracker wandb`.
 
-    It logs settings, the number of answers, and at the end figures and files.
+    It is a hook, a plug-in that follows runs. It logs settings, the number of answers, and at the
+    end figures and files.
     """
 
     needs = ("wandb",)  # without which it cannot begin
