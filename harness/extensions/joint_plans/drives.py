@@ -15,8 +15,10 @@ Row = Sequence[str]  # of a table
 def show(episodes: int, seed: int, outcomes: dict[str, Any]) -> None:
     """Print tables of how agents fare under each policy, and what it costs against a plan for all.
 
-    Agents are vehicles that decide for themselves. `outcomes` is what `policies.check` returns for
-    `episodes` layouts, start situations, with layout seeds from `seed` on.
+    Agents are vehicles that decide for themselves; a policy is a rule driver, or the plan that a
+    search found for all of them together. `outcomes` is what `policies.check` returns (estimates by
+    policy, and the seeds without a plan) for `episodes` start situations with layout seeds from
+    `seed` on.
     """
     seconds, ratio, driver = Unit("s", 2), Unit(decimals=3), "driver of all agents"
     outcome_rows, time_rows, decision_rows = list[Row](), list[Row](), list[Row]()

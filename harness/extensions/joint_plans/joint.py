@@ -64,9 +64,9 @@ class Rehearsal(World):
     def parts(self, step: int) -> list["Rehearsal"]:
         """Return copies of this world, each with one of the actions that the agent can take now.
 
-        `step` is the number of its decision, from 0; after `HORIZON` of them it takes FASTER. Of
-        actions that set the same target speed and route only one is tried. This world is the first
-        of the copies.
+        An agent is a vehicle that decides for itself. `step` is the number of its decision, from 0;
+        after `HORIZON` of them it takes FASTER. Of actions that set the same target speed and route
+        only one is tried. This world is the first of the copies.
         """
         calm_last = sorted(self.actions, key=lambda action: action == "IDLE")
         action_to = {self.target_after(action): action for action in calm_last}
@@ -89,10 +89,10 @@ class Rehearsal(World):
 class Options:
     """Hold n sequences of actions by which an agent touches no other traffic, the soonest first.
 
-    `arrives_s`, (n,), is when the agent reaches its goal by each, inf for never. Each was simulated
-    for F frames, `hz` a second, with V vehicles, the agent and then the other traffic: `poses`, (n,
-    F, V, 3), has their x (m), y (m) and heading (rad), and `sizes_m`, (V, 2), their lengths and
-    widths.
+    An agent is a vehicle that decides for itself. `arrives_s`, (n,), is when the agent reaches its
+    goal by each, inf for never. Each was simulated for F frames, `hz` a second, with V vehicles,
+    the agent and then the other traffic: `poses`, (n, F, V, 3), has their x (m), y (m) and heading
+    (rad), and `sizes_m`, (V, 2), their lengths and widths.
     """
 
     actions: Sequence[tuple[str, ...]]  # the meta-actions of each of the n sequences
@@ -111,10 +111,8 @@ class Options:
 class Plan:
     """Hold a sequence of actions for every agent of a layout, a drawn start situation.
 
-    An agent is known by its index among the layout's vehicles, 0 the ego. `actions` and
-    `arrives_s`, when it reaches its goal (inf for never), are by that. No plan has a smaller sum of
-    these times than `bound_s`, with `NEVER_S` for never; `nodes` is how many partial choices the
-    search tried.
+    An agent is a vehicle that decides for itself, known by its index among the layout's vehicles, 0
+    the ego. The plan is meant to have the least sum of arrival times.
     """
 
     actions: Mapping[int, tuple[str, ...]]  # each agent's meta-actions, by its index
@@ -129,7 +127,7 @@ class Plan:
     def turn(self, step: int) -> dict[int, str]:
         """Return each agent's action at a step, the number of a decision from 0, by agent index.
 
-        Agents that decide no more are left out.
+        An agent is a vehicle that decides for itself; those that decide no more are left out.
         """
         return {agent: taken[step] for agent, taken in self.actions.items() if step < len(taken)}
 
@@ -137,7 +135,7 @@ class Plan:
     def exact(self) -> bool:
         """Return whether it is proven that no plan has a smaller sum of arrival times.
 
-        An agent that never arrives counts as `NEVER_S`.
+        An agent, a vehicle that decides for itself, that never arrives counts as `NEVER_S`.
         """
         return self.bound_s >= self.sum_s - 1e-9
 
@@ -178,10 +176,11 @@ def courses(
 ) -> list[dict[int, Options]]:
     """Return where agents were under given actions, one dict per item of `taken`, by agent index.
 
-    An item of `taken` is a layout seed and the actions of each agent, by its index among the
-    layout's vehicles. A result is an `Options` that holds this one sequence, simulated with the
-    traffic, without other agents, even if it touches traffic. `able` has what `options` returned
-    for these seeds; frames are as many as there.
+    An agent is a vehicle that decides for itself, and its index that among a layout's vehicles, 0
+    the ego. An item of `taken` is a layout seed, which draws a start situation, and the actions of
+    each agent by its index. A value is an `Options` that holds this one sequence of actions,
+    simulated with the traffic, without other agents, even if it touches traffic. `able` has all
+    sequences that agents can take, by seed and agent index; frames are as many as there.
     """
     layouts: list[list[Rehearsal]] = []
     for seed, scripts in taken:
@@ -209,7 +208,8 @@ def courses(
 def rehearsals(scenario: Scenario, seed: int) -> list[Rehearsal]:
     """Return a world at its start for each agent of a layout, with only that agent and the traffic.
 
-    `seed` draws the layout, a start situation of `scenario`.
+    An agent is a vehicle that decides for itself. `seed` draws the layout, a start situation of
+    `scenario`.
     """
     layout, agents = agents_of(scenario, scenario.layout(seed, scenario.parameters), seed)
     traffic = [n for n, spawn in enumerate(layout.spawns) if spawn.part == "other"]
@@ -269,11 +269,12 @@ def _never(xy_m: Floats, approaches: object, parameters: object) -> Bools:
 class Search:
     """Search, by branch and bound, for compatible options of all agents with the least total cost.
 
-    An option is a sequence of actions, and its cost, s, when the agent arrives by it. Two are
-    compatible if the agents and the traffic do not touch (`together`). `able` has each agent's
-    options, and `unfit` choices (an option's index for each agent) that are left out. `run` finds
-    `best`, the best choice, of cost `cost_s` (inf for none), after `nodes` partial choices; what it
-    did not search may cost `open_s` at least. `rows` keeps which options are compatible.
+    An agent is a vehicle that decides for itself. An option is a sequence of actions, and its cost,
+    s, when the agent arrives by it. Two are compatible if the agents and the traffic do not touch
+    (`together`). `able` has each agent's options, and `unfit` choices (an option's index for each
+    agent) that are left out. `run` finds `best`, the best choice, of cost `cost_s` (inf for none),
+    after `nodes` partial choices; what it did not search may cost `open_s` at least. `rows` keeps
+    which options are compatible.
     """
 
     able: Sequence[Options]  # of each agent: the sequences of actions that it can take
@@ -287,9 +288,11 @@ class Search:
     open_s: float = np.inf  # the least cost that a part which was not searched may have
 
     def run(self) -> None:
-        """Find the best choice of an option for each agent, outside `unfit`, into `best`.
+        """Find the best choice of a sequence of actions for each agent, into `best`.
 
-        Afterwards `bound_s` is a lower bound, s, of the cost of any choice.
+        An agent is a vehicle that decides for itself, and the best choice has the least sum of
+        arrival times; those in `unfit` are left out. Afterwards `bound_s` is a lower bound, s, of
+        the cost of any choice.
         """
         self.nodes, self.best, self.cost_s, self.open_s = 0, None, np.inf, np.inf
         if all(len(each.actions) for each in self.able):
@@ -301,7 +304,11 @@ class Search:
 
     @property
     def ended(self) -> bool:
-        """Return whether all that could be better was searched, so that `best` is optimal."""
+        """Return whether the search was complete, so that `best` is the choice of least cost.
+
+        It is false if the search was cut off while something that it did not look at could cost
+        less.
+        """
         return self.open_s >= self.cost_s
 
     def _choose(self, chosen: tuple[int, ...], cost_s: float, left: Sequence[Bools]) -> None:
@@ -341,9 +348,9 @@ class Search:
 def together(options: Options, n: int, other: Options) -> Bools:
     """Return which of another agent's n options are compatible with one of an agent's, (n,).
 
-    `options` has the agent's sequences of actions, of which `n` is the index of one, and `other`
-    the other agent's. They are compatible if neither agent touches the other or traffic, in the
-    frames before both have arrived.
+    An agent is a vehicle that decides for itself. `options` has the agent's sequences of actions,
+    of which `n` is the index of one, and `other` the other agent's. They are compatible if neither
+    agent touches the other or traffic, in the frames before both have arrived.
     """
     poses, other_poses, frames = options.poses[n : n + 1], other.poses, options.poses.shape[1]
     ends = np.minimum(np.maximum(options.arrives_s[n], other.arrives_s) * options.hz, frames)
@@ -385,10 +392,11 @@ def plans(
 ) -> tuple[dict[int, tuple[Plan, World]], set[int]]:
     """Return, by layout seed, the best plan that works in the simulator, and the world it ended in.
 
-    `able` is what `options` returned: each agent's possible sequences of actions, by layout seed
-    and agent index. A plan, one sequence for each agent, works if, with all together, each arrives
-    when its option says. Seeds without such a plan are left out. Returned second are the seeds
-    whose search was cut off, so that a plan may exist.
+    A layout seed draws a start situation, and an agent is a vehicle that decides for itself. `able`
+    has each agent's possible sequences of actions, by layout seed and agent index. A plan, one
+    sequence for each agent, works if, with all together, each arrives when it would alone with the
+    traffic. Seeds without such a plan are left out. Returned second are the seeds whose search was
+    cut off, so that a plan may exist.
     """
     solved, unended = dict[int, tuple[Plan, World]](), set[int]()
     searches = {seed: Search(list(by_agent.values())) for seed, by_agent in able.items()}
@@ -422,7 +430,11 @@ def _best(search: Search, able: Mapping[int, Options]) -> Plan | None:
 
 
 def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, World]:
-    """Return each layout's finished world, by seed, after all agents took their planned actions."""
+    """Return each layout's finished world, by seed, after all agents took their planned actions.
+
+    A layout is a start situation of `scenario`, and agents are vehicles that decide for themselves.
+    `plans_by_seed` has the plan of each layout: a sequence of actions for every agent.
+    """
     worlds = {seed: World.start(scenario, seed) for seed in plans_by_seed}
     while live_worlds := [world for world in worlds.values() if not world.ended]:
         turns = [plans_by_seed[world.seed].turn(world.step) for world in live_worlds]
@@ -433,7 +445,9 @@ def played(scenario: Scenario, plans_by_seed: Mapping[int, Plan]) -> dict[int, W
 def kept(plan: Plan, world: World) -> bool:
     """Return whether all agents of a finished world arrived exactly when the plan says.
 
-    One that never arrives by the plan must have run out of time, unharmed.
+    `plan` has a sequence of actions for every agent (a vehicle that decides for itself), and
+    `world` is the simulation in which they took them. One that never arrives by the plan must have
+    run out of time, unharmed.
     """
     for agent, journey in world.journeys.items():
         outcome, arrives_s = journey.outcome, plan.arrives_s[agent]

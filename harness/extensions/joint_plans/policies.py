@@ -67,9 +67,9 @@ class Fate:
 
     @property
     def trips_s(self) -> float:
-        """Return the sum of the times, s, at which agents reached their goals.
+        """Return the sum of the times, s, at which agents reached their goals; NaN unless all did.
 
-        It is NaN unless all of them did.
+        An agent is a vehicle that decides for itself.
         """
         return self.sum_s if self.success else np.nan
 
@@ -80,9 +80,9 @@ UNSOLVED = Fate(0.0, False, False, np.inf, np.nan, np.nan)
 def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> Fate:
     """Return how the agents of a finished world fared.
 
-    `alone_s` has the time (s) at which each would arrive on an empty road, by its index among the
-    world's vehicles. `exact` (whether no better plan exists) and `cost`, that of the agents'
-    decisions, are stored as they are.
+    An agent is a vehicle that decides for itself. `alone_s` has the time (s) at which each would
+    arrive on an empty road, by its index among the world's vehicles. `exact` (whether no better
+    plan exists) and `cost`, that of the agents' decisions, are stored as they are.
     """
     agent_ends, worst = ends(world, alone_s), gravest(world.journeys)
     lost_s = np.array([np.nan if end.lost_s is None else end.lost_s for end in agent_ends])
@@ -103,8 +103,9 @@ def fate(world: World, alone_s: dict[int, float], exact: bool, cost: Regret) -> 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]:
     """Drive each layout (start situation, drawn by a seed) under every policy of `POLICIES`.
 
-    A policy is a rule driver that every agent follows, or a plan for all of them. Returns how the
-    agents fared, one dict a seed, in their order, by policy.
+    An agent is a vehicle that decides for itself. A policy is a rule driver that every agent
+    follows, or a plan for all of them. Returns how the agents fared, one dict a seed, in their
+    order, by policy.
     """
     drivers = POLICIES[:-1]
     policies = [(seed, driver) for seed in seeds for driver in drivers]
@@ -133,9 +134,11 @@ def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Fate]]
 def best_of(fates: Mapping[str, Fate]) -> Fate:
     """Return how agents fared under the plan for all of them, or under a driver that was faster.
 
-    `fates` is by policy (rule drivers, and the joint plan), of one layout. A driver's summed
-    arrival time can be smaller because the search for plans leaves out sequences of actions that
-    differ after `joint.HORIZON` decisions, and gaps below `joint.MARGIN_M`; then `exact` is False.
+    An agent is a vehicle that decides for itself, and a layout a start situation. `fates` says by
+    policy (rule drivers, and the joint plan) how the agents of one layout fared. A driver's summed
+    arrival time can be smaller than the plan's, because the search for plans leaves out sequences
+    of actions that differ after `joint.HORIZON` decisions, and gaps below `joint.MARGIN_M`; then
+    `exact` is False.
     """
     plan = fates[JOINT]
     best = min(fates.values(), key=lambda fate: fate.sum_s)
@@ -147,11 +150,13 @@ def check(
 ) -> dict[str, Any]:
     """Drive every policy of all agents through the same layouts, and compare how agents fare.
 
-    The layouts, start situations, have the seeds from `seed` on. In the dict that is returned,
-    `policies` has the estimates of `summary` by policy; `unsolved` lists the seeds without a plan
-    for all agents by which all arrive, and `inexact` those whose plan may not be optimal, since its
-    search was cut off or a driver did better. `progress` is called with the number of layouts just
-    done. Raises UserError if agents do not decide at the same times.
+    Agents are vehicles that decide for themselves; a policy is a rule driver that all follow, or
+    the best plan for all together. The layouts, start situations, have the seeds from `seed` on. In
+    the dict that is returned, `policies` has by policy its figures by name, such as `success` and
+    `lost_s` (seconds lost), as estimates over layouts; `unsolved` lists the seeds without a plan by
+    which all arrive, and `inexact` those whose plan may not be optimal, since its search was cut
+    off or a driver did better. `progress` is called with the number of layouts just done. Raises
+    UserError if agents do not decide at the same times.
     """
     if len(offsets(scenario)) > 1:
         raise UserError(
@@ -176,11 +181,13 @@ def check(
 def summary(fates: Sequence[Fate], best: Sequence[Fate], policy: str) -> dict[str, Estimate]:
     """Return estimates of a policy's figures over layouts, by name, with 95 % intervals.
 
-    `fates` says how agents fared under the policy in each layout, and `best` under the joint plan
-    on the same ones. Figures are `success` (share of layouts where all arrive) and the fields of
-    `Fate` and `Regret` of their names. `less_than_joint` is success less the plan's. `anarchy` is
-    the price of anarchy (Koutsoupias and Papadimitriou 1999): the summed arrival times over those
-    of the plan, where all arrive under both, with a bootstrap over layouts.
+    Agents are vehicles that decide for themselves, and a layout is a start situation. `fates` says
+    how agents fared under the policy in each layout, and `best` under the joint plan on the same
+    ones. `success` is the share of layouts where all arrive; `arrived`, `met`, `stuck`, `lost_s`,
+    `most_lost_s` and, of decisions, `best_decisions`, `gave_away` and `regret_s` are means of the
+    fields of these names. `less_than_joint` is success less the plan's. `anarchy` is the price of
+    anarchy (Koutsoupias and Papadimitriou 1999): the summed arrival times over those of the plan,
+    where all arrive under both, with a bootstrap over layouts.
     """
 
     def column(rows: Sequence[object], name: str) -> Any:

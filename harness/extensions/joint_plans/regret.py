@@ -36,9 +36,10 @@ class Regret:
 def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regret:
     """Return what agents' decisions in a layout cost, against each one's best response to others.
 
-    Both arguments are by the agent's index among the layout's vehicles: `able` has all sequences of
-    actions that it could have taken, `courses` the single one that it took. The others are held to
-    what they did. A decision counts only while its agent can still reach its goal.
+    An agent is a vehicle that decides for itself, and a layout a start situation. Both arguments
+    are by the agent's index among the layout's vehicles: `able` has all sequences of actions that
+    it could have taken, `courses` the single one that it took. The others are held to what they
+    did. A decision counts only while its agent can still reach its goal.
     """
     delays, spent_s = list[Floats](), list[float]()
     for agent, options in able.items():
@@ -59,9 +60,10 @@ def regret(able: Mapping[int, Options], courses: Mapping[int, Options]) -> Regre
 def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floats:
     """Return when an agent can arrive at the soonest, s, before and after each of k decisions.
 
-    The result has shape (k + 1,). Entry i assumes the agent's first i actual decisions; inf means
-    never. `able` has its possible sequences of actions, `course` the one that it took, and `others`
-    those that the other agents took, which are held fixed. k is at most `HORIZON`.
+    An agent is a vehicle that decides for itself. The result has shape (k + 1,). Entry i assumes
+    the agent's first i actual decisions; inf means never. `able` has its possible sequences of
+    actions, `course` the one that it took, and `others` those that the other agents took, which are
+    held fixed. k is at most `HORIZON`.
     """
     arrives_s = np.where(passes(able, others), able.arrives_s, np.inf)
     course_s = np.where(passes(course, others), course.arrives_s, np.inf)
@@ -77,8 +79,8 @@ def soonest_s(able: Options, course: Options, others: Sequence[Options]) -> Floa
 def passes(able: Options, others: Sequence[Options]) -> Bools:
     """Return which of an agent's n options touch no other agent before it reaches its goal, (n,).
 
-    An option is a sequence of actions. Each of `others` holds one: that which this other agent
-    took.
+    An agent is a vehicle that decides for itself. An option is a sequence of actions. Each of
+    `others` holds one: that which this other agent took.
     """
     frame = np.arange(1, able.poses.shape[1] + 1)
     under_way = frame <= np.minimum(able.arrives_s * able.hz, len(frame))[:, None] + 0.5
