@@ -39,15 +39,15 @@ class Candidate:
 
     @property
     def key(self) -> str:
-        """Return the hex SHA-256 of the prompt's files, by which candidates are told apart."""
+        """Return the hex SHA-256 of the prompt's files, by which wordings are told apart."""
         return self.prompt.sha256
 
 
 def space(prompt: Prompt) -> dict[str, int]:
     """Return how many alternative wordings a prompt has at each choice, by the choice's name.
 
-    A choice is a place in the prompt's files at which the author marked several wordings, or the
-    sets of examples if there are several. Raises UserError if a mark is malformed.
+    A choice is a place in the prompt's files at which the author marked several wordings to try, or
+    the sets of examples if there are several. Raises UserError if a mark is malformed.
     """
     try:
         marks = counts(prompt.texts.values())
@@ -57,10 +57,11 @@ def space(prompt: Prompt) -> dict[str, int]:
 
 
 def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
-    """Return a prompt with one alternative wording of each choice (see `space`), as a candidate.
+    """Return a prompt with one alternative wording at each marked place, as a candidate.
 
-    `choice` has the number of the alternative, from 0, by the choice's name; others take the first.
-    Raises UserError if the prompt's files are wrong.
+    The author of `base` marked places, the choices, each with several wordings and a name. `choice`
+    has the number of the wording, from 0, by the choice's name; others take the first. Raises
+    UserError if the prompt's files are wrong.
     """
     sizes = space(base)
     changes = ", ".join(f"{name} {n + 1} of {sizes[name]}" for name, n in choice.items() if n)
@@ -76,9 +77,10 @@ def chosen(base: Prompt, choice: Mapping[str, int] = FIRST) -> Candidate:
 
 
 def systems(base: Prompt) -> dict[str, str]:
-    """Return the system message of each role's template (its Jinja block `system`), by role.
+    """Return the system message of each role's prompt template (its Jinja block `system`), by role.
 
-    Where the author marked several wordings, it has the first.
+    A role is who is asked, such as `ego` or `helper`. Where the author marked several wordings, it
+    has the first.
     """
     texts = {}
     for role in ROLES:
@@ -129,7 +131,7 @@ def _toml(value: Any) -> str:
 
 
 def write(candidate: Candidate, folder: Path, more: Mapping[str, str]) -> None:
-    """Write a candidate's prompt files to a folder, and more files beside them.
+    """Write the prompt files of a candidate, one wording of a prompt, to a folder, with more files.
 
     `more` has the text of each further file by its name; these are not part of the prompt's digest.
     """

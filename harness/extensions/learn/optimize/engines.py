@@ -41,12 +41,12 @@ form of the answer alone, which is asked for elsewhere. Write only the template,
 
 
 def alternatives(tuning: Tuning) -> None:
-    """Search the alternatives that a prompt's author marked, by coordinate descent.
+    """Search the best wording of a prompt, place by place, among those that its author marked.
 
-    Each alternative wording of each choice (a marked place) is played with the best of the other
-    choices, first on half of the layouts (start situations), and on the rest if it is not worse
-    there. The search ends when a round over all choices changes nothing, or raises Spent when the
-    budget of questions is spent. `tuning` plays, and keeps all results.
+    Each alternative wording of each marked place is played with the best of the other places, first
+    on half of the layouts (start situations), and on the rest if it is not worse there. The search
+    ends when a round over all places changes nothing, or raises Spent when the budget of questions
+    is spent. `tuning` plays the wordings, scores them, and keeps all results.
     """
     base = tuning.base
     sizes = space(base)
@@ -68,12 +68,13 @@ def _better(tuning: Tuning, new: Candidate, old: Candidate) -> bool:
 
 
 class Reflecting:
-    """Search with GEPA: a model reads what went wrong, and rewrites the system messages.
+    """Search a better prompt with GEPA: a model reads what went wrong, and rewrites the texts.
 
-    Call it with a `Tuning`, which plays each new wording, keeps all results, and ends the search
-    when the budget of questions is spent; `replies` counts the rewriting model's. Source: Agrawal
-    and others 2025, arXiv:2507.19457, whose package runs the loop. All that it draws is seeded, and
-    what the model wrote is kept, so that a stopped search resumes by repeating.
+    These are the system messages. Call it with a `Tuning`, which plays each new wording, keeps all
+    results, and ends the search when the budget of questions is spent; `replies` is how often the
+    rewriting model answered. Source: Agrawal and others 2025, arXiv:2507.19457, whose package runs
+    the loop. All that it draws is seeded, and what the model wrote is kept, so that a stopped
+    search resumes by repeating.
     """
 
     def __init__(

@@ -14,11 +14,12 @@ from harness.world.scene_graph import Conflict
 def of_course(played: Played) -> tuple[Decision, str]:
     """Return the decision of an episode whose policy lost most, and feedback in words on it.
 
-    `played` is a wording's result on one layout (start situation), with the episode's decisions. A
-    policy is the ego's probabilities of actions. It loses the best action's worth less its own mean
-    worth. The worth of an action is the probability that the episode succeeds after it if all later
-    actions are drawn evenly. The feedback is that of `of_decision`, and whether the episode
-    succeeded.
+    The feedback is for a model that rewrites the prompt: what was stated and done, what each action
+    was worth, what the ego could not see, and whether the episode succeeded. `played` is a
+    wording's result on one layout (start situation), with the episode's decisions. A policy is the
+    ego's probabilities of actions. It loses the best action's worth less its own mean worth. The
+    worth of an action is the probability that the episode succeeds after it if all later actions
+    are drawn evenly.
     """
     lost = [_lost(decision) for decision in played.course]
     worst = played.course[int(np.argmax(lost))]
@@ -33,8 +34,8 @@ def of_decision(decision: Decision) -> str:
 
     It says what was stated and done, what each action was worth, and which vehicles in the ego's
     way were out of its sight and in no message. The worth is the probability that the episode
-    succeeds after the action if all later actions are drawn evenly (`Forest.worth`); what an action
-    lost is the best action's worth less its own.
+    succeeds after the action if all later actions are drawn evenly; what an action lost is the best
+    action's worth less its own.
     """
     actions = decision.dataset.actions
     policy = ", ".join(

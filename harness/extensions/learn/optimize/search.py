@@ -45,11 +45,8 @@ class Search:
     """Describe a search for a better wording of a prompt.
 
     Wordings are compared by evaluations on tune layouts, start situations for choosing, within a
-    budget of questions to the model; the winner is measured once on report layouts, the test set,
-    and written as a new version. `base` is the version to begin with; `tune` has its evaluations on
-    tune layouts, one for each scenario, and `report` returns those on report layouts. `version`
-    names the new version, a folder in `prompts`. `engine` names what proposes wordings, and
-    `command` is the command line, both for the study's page.
+    budget of questions to the model. The winner is measured once on report layouts, the test set,
+    and written as a new prompt version: a folder of prompt templates.
     """
 
     base: Prompt  # the prompt version whose wording is searched
@@ -65,8 +62,8 @@ class Search:
 
 
 def choices(prompt: Prompt) -> dict[str, int]:
-    """Return how many alternatives each marked choice of a prompt has, by the choice's name.
-    Raises UserError if there are none.
+    """Return how many wordings each marked place of a prompt has to try, by the place's name.
+    Raises UserError if no place is marked.
     """
     sizes = space(prompt)
     if not sizes:
@@ -107,18 +104,21 @@ def search(
     progress: Progress,
     cache_file: Path | None,
 ) -> Study:
-    """Search a better wording, measure the winner on report layouts, and write it as a version.
+    """Search a better wording of a prompt, measure it on a test set, and write it as a new version.
 
-    Layouts are start situations; report layouts are those on which results are measured. Returns a
-    study of what was tried and gained. If no candidate beats the base on tune layouts, no report
-    layout is read and no version written.
+    A prompt version is a folder of templates, and a wording is its texts; the search begins with
+    that of the version `plan.base`. Wordings compete on tune layouts, start situations for
+    choosing; the winner is measured once on report layouts, the test set. If none beats the base on
+    tune layouts, no report layout is read and no version written. Returns a study, the tables and
+    sentences of a page: which wordings were tried, and what the winner gained over the base.
 
     Args:
-        plan: what is searched, on which layouts, and with which budget.
-        engine: is called once with the `Tuning`, and plays candidates on it until it has tried all.
+        plan: the base, the layouts, and the budget of questions.
+        engine: proposes wordings. It is called once with a `Tuning`, which plays a wording on tune
+            layouts and returns its score, and it returns when it has tried all.
         out: the folder in which the runs on report layouts stay, of base and winner.
         place: the folder of the answers so far, from which a stopped search resumes.
-        opens: opens a model's backend.
+        opens: opens a model's backend, the code that runs it.
         progress: is called with the number of questions just asked.
         cache_file: file of stored completions; None for no cache.
 
@@ -165,10 +165,11 @@ def search(
 
 
 def looks(base: Prompt, where: Path) -> int:
-    """Return how often report layouts were read to make a prompt version.
+    """Return how often the test set was used to make a prompt version.
 
-    These are start situations on which results are measured. It counts the searches from which
-    `base` came, by the history file in its folder under `where`; 0 without one.
+    A search measures its winner on report layouts (start situations); the more often, the less an
+    unseen result it is. It counts the searches from which `base` came, by the history file in its
+    folder under `where`; 0 without one.
     """
     with suppress(*BROKEN):
         return max(0, int(json.loads(text_of(where / base.version / HISTORY))["looks"]))

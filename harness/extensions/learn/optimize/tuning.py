@@ -81,9 +81,8 @@ class Played(NamedTuple):
 class Record:
     """Hold all results of one candidate wording so far, and the questions that it asked.
 
-    `length` is characters of its prompts to the ego, one of each scenario, in sum. `played` has the
-    results by the index of the layout (start situation) in `Tuning.layouts`, and `asked` the keys
-    of its questions so far.
+    A wording is played on layouts, start situations of scenarios; each question to the model counts
+    once in the budget.
     """
 
     candidate: Candidate  # the wording
@@ -129,9 +128,10 @@ class Tuning:
 
     @cached_property
     def layouts(self) -> list[tuple[int, int]]:
-        """Return all tune layouts as pairs: the index in `specs` and the episode's number.
+        """Return all start situations (tune layouts) on which wordings are compared, as pairs.
 
-        A layout is a start situation. Other methods number layouts by their index in this list.
+        A pair is the index of the scenario's evaluation in `specs`, and the number of the episode
+        there. Other methods number layouts by their index in this list.
         """
         return [(n, e) for n, spec in enumerate(self.specs) for e in _dataset(spec).episodes]
 
@@ -141,10 +141,11 @@ class Tuning:
 
     @cached_property
     def first_half(self) -> Ints:
-        """Return indices (n,) of half of the layouts, on which a worse candidate is given up.
+        """Return the indices (n,) of half of the layouts, on which a worse candidate is given up.
 
-        They index `layouts`, a list of start situations. It is every second one of each scenario,
-        of those with a danger (a vehicle that the ego would meet) and of those without.
+        So less of the budget is spent on it. A layout is a start situation, by its index in the
+        list `layouts`. The half is every second one of each scenario, of those with a danger (a
+        vehicle that the ego would meet) and of those without.
         """
         kinds: dict[tuple[int, bool], list[int]] = {}
         for n, (family, _) in enumerate(self.layouts):
@@ -208,13 +209,14 @@ class Tuning:
 
     @property
     def tokens(self) -> int:
-        """Return the prompt and completion tokens of all answers so far."""
+        """Return how many tokens all answers of the search took so far, prompts included."""
         return sum(tokens(read_kept(file).values()) for file in self._place.glob("answers-*.jsonl"))
 
     def best(self) -> Candidate:
-        """Return the best candidate wording, by `rank`, of those played on all layouts.
+        """Return the best wording of those played on all layouts, start situations for choosing.
 
-        Layouts are start situations. Of equal ones it is the first that was played.
+        The best has the greatest score (success), of equal ones the shortest prompts, then the
+        first that was played.
         """
         whole = [r.candidate for r in self.records.values() if len(r.played) == len(self.layouts)]
         return max(whole, key=self.rank)
@@ -268,8 +270,8 @@ class Tuning:
     def take(self, record: Record, questions: Iterable[Hashable]) -> None:
         """Charge those of these questions that the candidate has not asked before to the budget.
 
-        `record` has the candidate's questions so far. A question is any hashable key; equal keys
-        are the same question. Raises Spent, and charges none, if the budget has too few left.
+        `record` has the candidate wording's questions so far. A question is any hashable key; equal
+        keys are the same question. Raises Spent, and charges none, if the budget has too few left.
         """
         new = set(questions) - record.asked
         if self.spent + len(new) > self.budget:
@@ -317,9 +319,10 @@ def tokens(answers: Iterable[Answer]) -> int:
 
 
 def changed(spec: Spec, prompt: Prompt) -> Spec:
-    """Return an evaluation with another prompt for the ego, and for helpers that have the ego's.
+    """Return an evaluation with another prompt for the ego, and for helpers that share the ego's.
 
-    Helpers with a prompt version of their own keep it.
+    `spec` is the evaluation. Helpers (the vehicles that the ego asks) with a prompt version of
+    their own keep it.
     """
     version = spec.ego.prompt.version
     helpers = [

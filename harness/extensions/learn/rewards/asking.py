@@ -18,10 +18,11 @@ ANY = "any"  # the viewer is drawn among all
 
 
 def read_by(asking: Asking, role: str) -> dict[str, Any]:
-    """Return how answers of a role (`ego`, `helper`) are parsed: keyword arguments of `intent`.
+    """Return how answers of a role (`ego`, `helper`) are parsed, as keyword arguments of `intent`.
 
-    `asking` has the prompt and the answer mode. The keys are `answer`, `role`, `actions`, `form`,
-    `extension` and `reasons_first`.
+    `asking` has the prompt and the answer mode. The keys are `answer` (the answer mode), `role`,
+    `actions` (their names), `form` (the form of answer that the prompt asks for), `extension` (JSON
+    text of the schemas of further members) and `reasons_first` (whether reasons may stand before).
     """
     shape = asking.prompt.shape(role, asking.scenario.actions)
     return {
@@ -37,7 +38,8 @@ def read_by(asking: Asking, role: str) -> dict[str, Any]:
 def viewer_of(scene: Scene, viewer: str | None, draw: float) -> str:
     """Return the id of the vehicle that is asked in a scene.
 
-    `viewer` is an id, None for the ego, or `any`: then a uniform `draw` in [0, 1) chooses.
+    `viewer` is a vehicle's id, None for the ego, or `any` for a random one: then a uniform `draw`
+    in [0, 1) chooses.
     """
     return scene.viewers[int(draw * len(scene.viewers))] if viewer == ANY else scene.viewer(viewer)
 
@@ -47,16 +49,17 @@ def rows(
 ) -> Iterator[dict[str, Any]]:
     """Yield a training row, for a trainer of text models, for each decision point in `at`, (n,).
 
-    A row has `prompt` (chat messages), and the columns that `advantage` needs: `values`, the
+    A decision point is a situation in which a vehicle must decide. A row is a dict: `prompt` has
+    the chat messages that ask; the other columns are what a reward function needs: `values`, the
     probability of success after each of A actions, (A,), `constant`, and how the answer is parsed.
 
     Args:
         data: the dataset with the decision points' scenes.
         values: what each action is worth at each decision point.
         constant: index of the action that is always taken, beside which answers are judged.
-        asking: the prompt and the answer mode.
-        viewer: who is asked, as `viewer_of` takes it.
-        at: indices of decision points in the dataset's decision trees, repeats allowed, (n,).
+        asking: the prompt, and how to answer (free text or one letter).
+        viewer: who is asked: a vehicle's id, None for the ego, or `any` for a random one.
+        at: indices of decision points among all of the dataset, repeats allowed, (n,).
     """
     forest = data.forest
     names = list(dict.fromkeys(forest.ids[n] for n in at.tolist()))
@@ -124,9 +127,11 @@ Worth = Callable[[Sequence[float], Sequence[float]], float]
 
 
 def driven(p: Sequence[float], values: Sequence[float]) -> float:
-    """Return the worth of a distribution's likeliest action; of equally likely ones, their mean.
+    """Return the worth of an answer as it is driven: that of its likeliest action.
 
-    `p` (A,) is the distribution over A actions, `values` (A,) each one's probability of success.
+    The worth of an action is the probability of success after it. `p` (A,) is the answer's
+    distribution over A actions, `values` (A,) each one's worth. Of equally likely actions it is
+    their mean.
     """
     likeliest = np.array(p) == max(p)
     return float(np.mean(np.array(values)[likeliest]))
@@ -168,16 +173,17 @@ def advantage(
 ) -> list[float]:
     """Return the advantage of each completion: a reward function for TRL's trainers.
 
-    The advantage is the worth of the action that the answer makes likeliest, less that of one
-    action that is always taken.
+    The advantage is the probability of success after the action that the answer makes likeliest,
+    less that after one action that is always taken. The arguments but the first two are columns of
+    the training rows, with a value for each completion.
 
     Args:
         prompts: as the trainer has them; not read.
-        completions: texts, or chats whose last message is the answer;
-            one without a text cannot be parsed, and its worth is 0.
-        values: of each row, the worth of every action, (A,): a column of `rows`.
-        constant: of each row, the index of the action that is always taken: a column of `rows`.
-        columns: the further columns of `rows`; columns of other names are ignored.
+        completions: texts, or chats whose last message is the answer; one without a text cannot be
+            parsed, and its worth is 0.
+        values: the probability of success after every action, (A,).
+        constant: the index of the action that is always taken.
+        columns: how answers are parsed; columns of other names are ignored.
     """
     return _rewards(driven, completions, values, constant, columns)
 
@@ -194,12 +200,15 @@ def expected_advantage(
 
     The advantage is the mean probability of success under the distribution, less that of one action
     that is always taken. It differs between answers with the same likeliest action, so that few
-    samples teach more; but an answer that is unsure and right earns less than one that is sure.
+    samples teach more; but an answer that is unsure and right earns less than one that is sure. The
+    arguments but the first two are columns of the training rows, with a value for each completion.
 
-    `completions` are the model's answers, as texts or chats; one that cannot be parsed states
-    success 0. Of each row, `values` has the probability of success after every action, (A,), and
-    `constant` the index of the action that is always taken; these and `columns` are columns of
-    `rows`. `prompts` are not read.
+    Args:
+        prompts: as the trainer has them; not read.
+        completions: texts or chats; one that cannot be parsed states success 0.
+        values: the probability of success after every action, (A,).
+        constant: the index of the action that is always taken.
+        columns: how answers are parsed; columns of other names are ignored.
     """
     return _rewards(expected_success, completions, values, constant, columns)
 

@@ -32,17 +32,18 @@ CHARACTERS = frozenset(["\n", "\t"] + [chr(code) for code in range(0x20, 0x3000)
 
 
 class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untyped
-    """Let an agent decide for the ego, a decision a step, as a Gymnasium environment.
+    """Let a learning program decide for the ego, one decision a step, as a Gymnasium environment.
 
     Users get one from `harness.environment`. An observation is a chat that asks the viewer, the
-    vehicle whose sight it shows (`text`), or the numbers of its scene graph (`arrays`): `numbers`,
-    named by `self.numbers`, which are 0 where `known` is 0. The last observation of an episode
-    repeats the one before.
+    vehicle whose sight it shows (`text`), or the numbers of its scene graph, what it knows of the
+    scene (`arrays`): `numbers`, named by `self.numbers`, which are 0 where `known` is 0. The last
+    observation of an episode repeats the one before.
 
     `info` has what no driver knows: `values`, the probability of success after each of A actions,
     (A,), `optimal`, a mask (A,) of the best ones, `lost` if success is out of reach, `scene` (its
-    id), `layout_seed`, `danger` (the sector it comes from, "" without one) and `viewer`; after a
-    step the index `taken`, and at the end `success`.
+    id), `layout_seed` (which draws the start situation), `danger` (the side that a hidden vehicle
+    comes from, such as `left`, "" without one) and `viewer`; after a step the index `taken`, and at
+    the end `success`.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 # as gymnasium declares it
@@ -88,16 +89,20 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
     @property
     def values(self) -> Values:
         """Return the probability of success after every action, at every decision point, as arrays.
-        Raises UserError if the episodes are driven and so have no trees.
+
+        Raises UserError if episodes are driven in the simulator and so have no decision trees, from
+        which it is computed.
         """
         return self._trees("values").values
 
     def rows(self, per_level: int = 6) -> list[dict[str, Any]]:
         """Return questions of all layouts (start situations) for trainers of text models, as dicts.
 
-        The dicts are those of `asking.rows`: the chat, what each action is worth, and how the
-        answer is parsed. They are of decision points at which the action matters, `per_level` for
-        each step of each layout. Raises UserError if the episodes are driven and so have no trees.
+        A dict has `prompt`, the chat messages that ask, and the columns that the reward functions
+        read: `values`, the probability of success after each action, (A,), `constant`, the index of
+        the action that is always taken, and how the answer is parsed. They are of decision points
+        at which the action matters, `per_level` for each step of each layout. Raises UserError if
+        the episodes are driven in the simulator and so have no trees.
         """
         trees = self._trees("rows()")
         at = trees.drawn(per_level)
@@ -110,9 +115,9 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
 
         The keys are drivers, such as `constant`, `uniform` and `full-view`, which sees everything.
         Each has `advantage`, the mean reward over `rows(per_level)` (0 for `constant`), and
-        `success`, the share of successful episodes on their layouts, balanced over those with and
-        without a danger, a vehicle that a cruising ego would meet. Raises UserError if the episodes
-        are driven, or if no decision of the layouts matters.
+        `success`, the share of successful episodes on their layouts (start situations), balanced
+        over those with and without a danger, a vehicle that a cruising ego would meet. Raises
+        UserError if the episodes are driven, or if no decision of the layouts matters.
         """
         trees = self._trees("references()")
         return trees.references(trees.drawn(per_level))

@@ -26,7 +26,9 @@ def environment(
     workers: int = 1,
     quiet: bool = False,
 ) -> "Driving":
-    """Make a Gymnasium environment, whose rewards are exact: docs/learning-environment.md.
+    """Make a Gymnasium environment to learn to drive in: docs/learning-environment.md.
+
+    Rewards are exact, since it is known how every course of an episode ends.
 
     Args:
         scenario: name of the scenario, such as `occluded-intersection`. Default: the usual one.
@@ -36,8 +38,9 @@ def environment(
             once, in seconds each, and kept in the cache folder.
         dataset: folder of a dataset of train or tune seeds, whose trees are taken instead.
         driven: whether episodes are driven in the simulator; then no tree is built.
-        then: who decides after an action that is judged: a reference driver, and on trees also
-            `best` (the default there) or `uniform`. Without one, driven episodes have no values.
+        then: who decides after an action that is judged: a reference driver (a rule), and on trees
+            also `best` (the default there) or `uniform`. Without one, driven episodes have no
+            values.
         observation: `text`, a chat as a prompt version writes it, or `arrays`.
         prompt: prompt version. Default: the scenario's.
         answer: what the chat asks for: `json`, or a letter, `readout`.

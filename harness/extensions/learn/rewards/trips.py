@@ -31,14 +31,17 @@ from harness.world.world import World
 
 
 class Trip(Protocol):
-    """Describe one episode in progress, as the environment needs it: where it is, and how to go on.
+    """Describe one episode in progress for a learning program: where it is, how to go on.
 
     It stands at a decision point, a situation in which the ego must act, or is over.
     """
 
     @property
     def scene(self) -> Scene:
-        """Return the present decision point, with what each vehicle sees; at the end the last."""
+        """Return the present situation in which the ego must act, with what each vehicle sees.
+
+        At the end of the episode it is the last one.
+        """
         ...
 
     @property
@@ -52,12 +55,15 @@ class Trip(Protocol):
         ...
 
     def take(self, action: int) -> None:
-        """Take an action by its index, and go on to the next decision point or to the end."""
+        """Take an action by its index, and go on to the next decision point or to the end.
+
+        A decision point is a situation in which the ego must act.
+        """
         ...
 
 
 class Source(Protocol):
-    """Describe where the environment's episodes come from: decision trees or the simulator.
+    """Describe where a learning environment's episodes come from: trees or the simulator.
 
     A decision tree has every course that actions can lead to, and how each ends.
     """
@@ -82,8 +88,9 @@ class Source(Protocol):
 class Trees:
     """Take the environment's episodes from the decision trees of a dataset, without a simulator.
 
-    A tree has every decision point of a layout that actions can lead to, and how each episode ends.
-    What an action is worth depends on who decides after it, `then`: `best`, `uniform` or a driver.
+    A decision tree has every course that actions can lead to from a layout (start situation), and
+    how each episode ends. What an action is worth depends on who decides after it, `then`: `best`,
+    `uniform` or a reference driver, a rule.
     """
 
     dataset: Dataset  # the trees, and the scenes of their decision points
@@ -114,10 +121,12 @@ class Trees:
         return self.scenario.actions.index(action)
 
     def drawn(self, per_level: int) -> Ints:
-        """Return indices, (n,), of decision points at which the action matters.
+        """Return the indices, (n,), of random decision points at which the action matters.
 
-        They index the dataset's decision trees. There are about `per_level` for each step of each
-        tree, drawn at random by `values.drawn`.
+        A decision point is a situation in which the ego must act; a decision tree has all that
+        actions can lead to from a start situation, and indices are those in all trees. There are
+        about `per_level` for each step (number of the decision) of each tree; the draw is the same
+        every time.
         """
         data = self.dataset
         return drawn(

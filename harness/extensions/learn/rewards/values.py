@@ -36,9 +36,8 @@ BEST = "best"
 class Values:
     """Hold the worth of A actions at N decision points: the probability of success after each.
 
-    `table` (N, A) has it, for the points of `ids` and the names in `actions`, in their order. It is
-    for an episode in which `then` decides after the action: `best`, `uniform` or a reference
-    driver.
+    A decision point is a situation in which the ego must act. Worth depends on who decides in the
+    rest of the episode, `then`.
     """
 
     ids: tuple[str, ...]  # ids of the decision points
@@ -48,11 +47,11 @@ class Values:
 
     @classmethod
     def of(cls, forest: Forest, then: str = BEST) -> "Values":
-        """Compute the worth of every action at every decision point of a forest.
+        """Compute the probability of success after every action at every decision point.
 
-        A forest has a dataset's decision trees: every course that actions can lead to. `then`
-        decides after the action: `best`, `uniform` or a reference driver. Raises UserError if it is
-        none of these.
+        `forest` has the dataset's decision trees: every course that actions can lead to, from each
+        start situation. `then` decides after the action: `best`, `uniform` or a reference driver, a
+        rule. Raises UserError if it is none of these.
         """
         if then == BEST:
             table = forest.safe.astype(float)
@@ -77,7 +76,8 @@ class Values:
     def at(self, ids: Sequence[str]) -> Ints:
         """Return the indices in `self.ids` of the n decision points with these ids, (n,).
 
-        Raises KeyError for an unknown id.
+        A decision point is a situation in which the ego must act. Raises KeyError for an unknown
+        id.
         """
         return np.fromiter(map(self.place.__getitem__, ids), np.intp, len(ids))
 
@@ -87,12 +87,19 @@ class Values:
 
     @cached_property
     def lost(self) -> Bools:
-        """Return at which of the N decision points no action can lead to success, (N,)."""
+        """Return at which of the N decision points no action can lead to success, (N,).
+
+        A decision point is a situation in which the ego must act.
+        """
         return np.asarray(~self.table.any(axis=-1))
 
     @cached_property
     def decides(self) -> Bools:
-        """Return at which of the N decision points the actions differ in worth, (N,)."""
+        """Return at which of the N decision points it matters what is done, (N,).
+
+        A decision point is a situation in which the ego must act; there the probability of success
+        differs between actions.
+        """
         return np.asarray(self.table.max(axis=-1) > self.table.min(axis=-1))
 
 
@@ -112,7 +119,8 @@ def best_constant(forest: Forest, dangerous: Bools) -> int:
 
     Balanced success is the mean of that in layouts with a danger, a vehicle that the ego would
     meet, and without; `dangerous` (E,) says which of E layouts (start situations) have one.
-    `forest` has their decision trees. Of equal actions it is the first.
+    `forest` has their decision trees, every course that actions can lead to. Of equal actions it is
+    the first.
     """
     success = [balanced(forest.constant_success(action), dangerous) for action in forest.actions]
     return int(np.argmax(success))
@@ -150,7 +158,8 @@ def drawn(forest: Forest, dangerous: Bools, of: Bools, per_level: int, scenario:
 def optimal(values: Floats) -> Bools:
     """Return which of A actions have the greatest worth, a mask (..., A), for `values` (..., A).
 
-    It is false for all where every action is worth 0 or NaN (unknown).
+    The worth of an action is the probability of success after it. The mask is false for all where
+    every action is worth 0 or NaN (unknown).
     """
     most = values.max(axis=-1, keepdims=True)
     return np.asarray((values == most) & (most > 0))

@@ -33,9 +33,8 @@ FACTS = "training.json"  # written last
 class Curriculum:
     """Describe what a model is trained from: scenarios, prompts, layouts, and initial weights.
 
-    A layout is a start situation of a scenario, drawn from a seed: there are `layouts` of each
-    scenario, with seeds from `seed` on. `prompts` has the versions that are learnt in each, and
-    `base` the model that it begins as; None begins with random weights.
+    A layout is a start situation of a scenario, drawn from a seed. The decisions in it, with what
+    should be answered, are what the model learns.
     """
 
     prompts: Mapping[Scenario, tuple[Prompt, ...]]  # of each scenario, the versions that are learnt
@@ -61,8 +60,8 @@ class Curriculum:
     def settings(self) -> dict[str, Any]:
         """Return as plain values the settings that a resumed training must not change.
 
-        They are digests of scenarios, prompts and the base's weights, and the number and the first
-        seed of layouts (start situations).
+        They are digests of scenarios, prompts and the weights of the model that it begins as, and
+        the number and the first seed of layouts (start situations).
         """
         scenarios = {}
         for scenario in self.prompts:
@@ -91,10 +90,12 @@ def distill(
     threads: int | None = None,
     workers: Workers = 1,
 ) -> dict[str, Any]:
-    """Train a model in some scenarios; write checkpoint, tokenizer, GGUF file and card to `out`.
+    """Train a small language model to drive, by decisions whose best answer is known.
 
-    Returns what the card, the file that describes the model, states: data, plan, loss curves, and
-    how its letters for actions fit on held-out layouts (start situations). A killed call resumes.
+    It writes checkpoint, tokenizer, GGUF file and card (the file that describes the model) to
+    `out`. Returns what the card states, as plain values by name: data, plan, loss curves, and how
+    the model's probabilities fit the right ones on held-out layouts (start situations). A killed
+    call resumes.
 
     Args:
         curriculum: the scenarios, prompts and layouts, and the initial weights.
@@ -182,7 +183,8 @@ def _described(
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
     """Return the README.md of a model trained from random weights: data, losses and limits.
 
-    `name` is the model's, and `facts` is what `distill` returns.
+    `name` is the model's, and `facts` has what was learnt and measured, the dict that `distill`
+    returns.
     """
     plan, base = facts["plan"], facts["base_sha256"]
     begins = f"from the weights with sha256 `{base}`" if base else "from random weights"

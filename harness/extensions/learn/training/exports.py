@@ -35,9 +35,9 @@ class Lessons:
     """Export chats to fine-tune a language model on, made of a run: the format `--sft`.
 
     Each question that the run asked becomes one line of JSON: the chat messages, and the answer
-    that the model should have given. It follows from the scene's decision tree, which has every
-    course that actions can lead to from there, and how each ends. It is an `Export` of
-    `harness run export`.
+    that the model should have given. It is known from the scene's decision tree, which has every
+    course that actions can lead to from there, and how each ends. Methods are those of an export
+    format of `harness run export`.
     """
 
     help = (
@@ -59,10 +59,11 @@ class Lessons:
 class Preferences:
     """Export pairs of answers, a better and a worse one, to a run's chats: the format `--dpo`.
 
-    Each line of JSON is a question whose answer by the model was worse than the one that follows
-    from the scene's decision tree (see `Lessons`): the chat messages, the tree's answer as the
-    chosen one, and the model's as the rejected one. `--margin` says by how much it must be worse:
-    an answer is worth the probability that it gives to actions after which success is possible.
+    Each line of JSON is a question that the model answered worse than it could: the chat messages,
+    the right answer as the chosen one, and the model's as the rejected one. The right answer is
+    known from the scene's decision tree, every course that actions can lead to. An answer is worth
+    the probability that it gives to actions after which success is possible; `--margin` says by how
+    much the model's must be worth less.
     """
 
     help = (

@@ -79,7 +79,7 @@ class Lessons:
 
     @property
     def episodes(self) -> tuple[int, ...]:
-        """Return the numbers of the layouts (start situations) of these scenes, each once."""
+        """Return the numbers of the layouts (start situations) of the scenes, each once."""
         return tuple(dict.fromkeys(scene.record.episode for scene in self.scenes))
 
     @cached_property
@@ -101,10 +101,10 @@ class Lessons:
         return dict(zip((scene.id for scene in self.scenes), weights.tolist(), strict=True))
 
     def split(self, held_out: float) -> "tuple[Lessons, Lessons]":
-        """Return these lessons without the last layouts, and those of the last layouts.
+        """Return these lessons in two: the first layouts, to learn, and the last, to test.
 
         A layout is a start situation. `held_out` is the share of layouts that the second part gets,
-        at least one layout.
+        0 to 1, at least one layout.
         """
         last = self.episodes[-max(1, round(len(self.episodes) * held_out)) :]
         kept = tuple(scene for scene in self.scenes if scene.record.episode not in last)
@@ -121,11 +121,11 @@ def draw(
     workers: Workers,
     progress: Callable[[int], None],
 ) -> Lessons:
-    """Draw decision points of `layouts` layouts (start situations), and return them as lessons.
+    """Draw the situations in which a model learns to decide, with the right answers, as lessons.
 
-    Each layout is a file in the folder `place`, and only missing ones are drawn, so that a killed
-    call resumes. Layout number n has layout seed `seed + n`; `progress` is called with the number
-    of layouts just done.
+    They are of `layouts` start situations (layouts) of the scenario. Each layout is a file in the
+    folder `place`, and only missing ones are drawn, so that a killed call resumes. Layout number n
+    has layout seed `seed + n`; `progress` is called with the number of layouts just done.
     """
     place.mkdir(parents=True, exist_ok=True)
     files = [place / f"{n:05d}.json" for n in range(layouts)]
@@ -190,9 +190,9 @@ def decision_points(scenario: Scenario, seed: int, number: int) -> list[Point]:
 def label(ends_s: Mapping[str, float]) -> Floats:
     """Return the soft label (A,) of a decision point: probabilities of its A actions.
 
-    `ends_s` has, by action, the time in seconds at which the episode succeeds after it, inf for
-    never; at least one has to be finite. A probability falls with the delay by exp(-delay / 0.25
-    s).
+    A decision point is a situation in which the ego must act. `ends_s` has, by action, the time in
+    seconds at which the episode succeeds after it, inf for never; at least one has to be finite. A
+    probability falls with the delay by exp(-delay / 0.25 s).
     """
     time_s = np.array(list(ends_s.values()))
     weight = np.array([PRIOR.get(a, 1.0) for a in ends_s]) * np.exp(

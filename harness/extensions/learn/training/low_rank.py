@@ -22,7 +22,8 @@ SCALE = 2.0  # alpha / r
 class LowRank(torch.nn.Module):  # type: ignore[misc]
     """Add a trainable low-rank update to a linear layer with weights (out, in), which are kept.
 
-    The update is the product of matrices (out, rank) and (rank, in), scaled by alpha / r = 2.
+    This is LoRA: the update is the product of matrices (out, rank) and (rank, in), scaled by alpha
+    / r = 2.
     """
 
     def __init__(self, kept: Any, rank: int, generator: Any) -> None:

@@ -122,10 +122,11 @@ def new_model(tokenizer: Any, seed: int, sees: bool = False) -> Any:
 
 
 def take_over(model: Any, base: Path) -> None:
-    """Copy the weights of a text model into `model`, a larger one from `new_model`.
+    """Copy the weights of a trained text model into `model`, which may have more tokens.
 
-    `base` is the folder of a text model that `harness model distill` made; its vocabulary is the
-    beginning of the model's. Raises UserError if the folder has no such weights, or those of
+    `model` is made by `new_model`, and changed in place; it may also take pictures, which adds
+    tokens. `base` is the folder of a text model that `harness model distill` made; its vocabulary
+    is the beginning of the model's. Raises UserError if the folder has no such weights, or those of
     another size.
     """
     from safetensors import SafetensorError
@@ -201,7 +202,8 @@ def _special(texts: Sequence[str]) -> list[Any]:
 def chat(messages: Sequence[Mapping[str, str]]) -> tuple[str, str]:
     """Return a chat in ChatML as two texts: the system message, and the rest up to the answer.
 
-    A message with the key `image` begins with its picture: one mark for each token of the picture.
+    ChatML is the format in which the model reads chats. `messages` have `role` and `content`; one
+    with the key `image` begins with its picture: one mark for each token of the picture.
     """
     picture = f"{BEGINS}{PICTURE * VISION.tokens}{ENDS}"
     parts = [

@@ -17,9 +17,9 @@ STEPS = 5
 
 
 class Muon(torch.optim.Optimizer):  # type: ignore[misc]
-    """Optimise matrices with Muon: Nesterov momentum of 0.95, orthogonalised.
+    """Optimise weight matrices with Muon: steps of Nesterov momentum 0.95, orthogonalised.
 
-    Matrices of one shape are orthogonalised as one batch.
+    It is a PyTorch optimiser. Matrices of one shape are orthogonalised as one batch.
     """
 
     def __init__(self, matrices: Iterable[Any], lr: float, weight_decay: float) -> None:
@@ -48,7 +48,8 @@ def _shape(p: Any) -> tuple[int, int]:
 def orthogonal(m: Any) -> Any:
     """Return matrices (n, rows, columns) with their singular values moved near 1.
 
-    This is Newton and Schulz's iteration, five steps of a quintic polynomial.
+    The optimiser Muon does so with its steps. This is Newton and Schulz's iteration, five steps of
+    a quintic polynomial.
     """
     if m.shape[1] > m.shape[2]:
         return orthogonal(m.mT).mT

@@ -43,11 +43,13 @@ def write(
 ) -> Path:
     """Write a run's chats for fine-tuning to a file as JSON Lines, and return its path.
 
-    Without `margin` they are those of `pairs`, with it those of `preferences`, whose answers are
-    worth less than the best by that or more. `dataset` is the folder of the run's dataset; None
-    finds it. Raises UserError if the run was driven, its dataset or prompt is not here as it was,
-    or an answer does not match its text; and, unless `report_seeds_too`, if it has report seeds, or
-    layouts (start situations) that their seeds do not give.
+    Without `margin` each line has the right answer, known from the scene's decision tree (every
+    course that actions can lead to). With it, a line also has the model's own, and only answers
+    that are worth less than the right one by `margin` or more, 0 to 1, are written. `dataset` is
+    the folder of the run's dataset; None finds it. Raises UserError if the run was driven, its
+    dataset or prompt is not here as it was, or an answer does not match its text; and, unless
+    `report_seeds_too`, if it has report seeds (start situations for results), or layouts that their
+    seeds do not give.
     """
     option = "--sft" if margin is None else "--dpo"
     if not isinstance(run.manifest.world, FrozenScenes):
@@ -80,26 +82,29 @@ def _check_seeds(what: str, seeds: Collection[int]) -> None:
 
 
 def pairs(run: Run, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """Yield each question of a run as a chat, with the answer that the decision tree asks for.
+    """Yield each question of a run as a chat, with the right answer, to fine-tune a model on.
 
-    A dict has `prompt` and `completion` (chat messages), and the scene, viewer (the vehicle asked),
-    seed, actions, their label (`probabilities`) and `values`. Fusion calls are included; a decision
-    point at which no action succeeds is left out. `folder` has the dataset; None finds the one that
-    the run states. Raises UserError if the dataset or the prompt is not here as it was.
+    The right answer is known from the decision tree, every course that actions can lead to. A dict
+    has `prompt` and `completion` (chat messages), and the scene, viewer (the vehicle asked), seed
+    and actions, with the right `probabilities` of actions and the `values` of these. Fusion calls
+    (the ego is asked again with messages) are included; a decision point at which no action
+    succeeds is left out. `folder` has the dataset; None finds the one that the run states. Raises
+    UserError if the dataset or the prompt is not here as it was.
     """
     for row, completion, _ in _answered(run, folder):
         yield {"prompt": row.pop("prompt"), "completion": _reply(completion), **row}
 
 
 def preferences(run: Run, margin: float, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """Yield each question of a run whose answer is worth less than the tree's by `margin` or more.
+    """Yield each question of a run whose answer was worth less than the right one by `margin`.
 
-    The tree is the scene's decision tree, which says after which actions success is possible. A
-    dict has what those of `pairs` have, with `chosen` (the tree's answer), `rejected` (the model's)
-    and `value_rejected`. An answer is worth the probability that it gives to actions after which
-    success is possible; one that cannot be parsed is worth 0, and of a read-out the likeliest
-    letter counts. A question without an answer is left out. `folder` is that of the dataset; None
-    finds it.
+    The right answer is known from the scene's decision tree, which says after which actions success
+    is possible. A dict has `prompt` (chat messages), `chosen` (the right answer), `rejected` (the
+    model's) and `value_rejected` (its worth), with the scene, viewer (the vehicle asked), seed,
+    actions, and the right `probabilities` and the `values` of these. An answer is worth the
+    probability that it gives to actions after which success is possible; one that cannot be parsed
+    is worth 0, and of a read-out (one letter an action) the likeliest letter counts. A question
+    without an answer is left out. `folder` is that of the dataset; None finds it.
     """
     for row, completion, stored in _answered(run, folder):
         values, p, raw = row["values"], stored.intent, stored.raw

@@ -25,13 +25,13 @@ Candidate = tuple[SceneGraph, Floats, int]
 def examples(
     prompt: Prompt, scenario: Scenario, count: int, first_seed: int, progress: Callable[[int], None]
 ) -> Examples:
-    """Draw `count` examples for a prompt, 1 or more for each role, each from a layout of its own.
+    """Draw `count` worked examples for a prompt to show, 1 or more for each role (ego, helper).
 
-    Layouts are start situations, and have the seeds from `first_seed` on. An example is a decision
-    point of its layout whose best action the role's examples show least so far, and whose viewer
-    (the vehicle asked) sees a conflict where one does. A layout with no safe action is passed over,
-    and so are a few that repeat frequent actions. `progress` is called with 1 for each layout used.
-    Raises UserError if the train seeds end too early.
+    Each is from a layout (start situation) of its own; layouts have the seeds from `first_seed` on.
+    An example is a decision whose best action the role's examples show least so far, and in which
+    the vehicle that is asked sees a conflict of paths, where one does. A layout with no safe action
+    is passed over, and so are a few that repeat frequent actions. `progress` is called with 1 for
+    each layout used. Raises UserError if the train seeds end too early.
     """
     chosen: dict[str, list[Example]] = {role: [] for role in ROLES}
     times = {role: [0] * len(scenario.actions) for role in ROLES}

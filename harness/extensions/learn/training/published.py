@@ -34,14 +34,12 @@ _TELLING = 1e-3  # largest difference of logits that is rounding
 class Adapt:
     """Describe how a published model is fine-tuned: which weights, how fast, and for what.
 
-    The model learns to answer with a letter for an action, followed by a report in words. `rank` is
-    that of the LoRA adapter, None to train all weights; `rate` is the learning rate, `dtype` what
-    layers compute in, and `report` the weight of the report's loss beside the letter's.
+    The model learns to answer with a letter for an action, followed by a report in words.
     """
 
     rank: int | None  # of the LoRA adapter that is trained; None trains all weights
     rate: float  # learning rate of AdamW
-    # in which its layers compute; weights are float32
+    # number format in which its layers compute; weights are float32
     dtype: Literal["float32", "bfloat16"] = "float32"
     # weight of the loss of the words that follow an answer's letter, beside the letter's loss, the
     # KL divergence of its probabilities from the ones to be learnt
@@ -98,7 +96,7 @@ class Published:
         return np.array(ids, dtype=np.int32), shared, f"{shared} {kind}"
 
     def letters(self, texts: str) -> list[int]:
-        """Return the token id of each letter of `texts`.
+        """Return the token id of each letter of `texts`, by which the model answers with an action.
         Raises UserError if a letter is not one token.
         """
         tokens = [self.encode(text) for text in texts]
@@ -109,9 +107,10 @@ class Published:
         return [token for (token,) in tokens]
 
     def write(self, out: Path, weights: Mapping[str, Any]) -> None:
-        """Write the LoRA adapter, or the whole checkpoint with these weights, to the folder `out`.
+        """Write the fine-tuned model to the folder `out`.
 
-        `weights` has the model's weights by name.
+        That is the LoRA adapter, or if all weights were trained the whole checkpoint with these
+        `weights`, by name.
         """
         if any(isinstance(module, low_rank.LowRank) for module in self.model.modules()):
             low_rank.write(self.model, out, base_name(self.card))
@@ -136,9 +135,9 @@ class Published:
 
 
 def base_name(card: Card) -> str:
-    """Return how `--model` names the model that a card, a file of its facts, describes.
+    """Return the name by which `--model` finds a model: its card's path, or its id on the hub.
 
-    That is the card's file, a path, or the model's id on the hub.
+    A card is a file that describes a model.
     """
     named = argument(card)
     return named.partition(":")[0] if named == card.name else named
@@ -155,7 +154,8 @@ def _digest(card: Card, where: Path) -> str:
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
     """Return the README.md of a fine-tuned published model as Markdown: base, data and losses.
 
-    `name` is the new model's, and `facts` is what `distill` returns.
+    `name` is the new model's, and `facts` has what was learnt and measured, the dict that `distill`
+    returns.
     """
     plan, adapt = facts["plan"], facts["plan"]["adapt"]
     loss_rows = []
@@ -224,8 +224,8 @@ out. The losses are of different sums and compare within a stage only; curves ar
 def references_table(facts: Mapping[str, Any]) -> str:
     """Return a Markdown table of values by scenario: the model's, and those of rule drivers.
 
-    A value is a mean probability of success, and a rule driver one without a model. `facts` is what
-    `distill` returns.
+    A value is a mean probability of success, and a rule driver one without a model. `facts` has
+    what was learnt and measured, the dict that `distill` returns.
     """
     names = dict.fromkeys(name for row in facts["held_out"] for name in row["references"])
     lines = [f"| scenario | the model | {' | '.join(f'`{name}`' for name in names)} |"]

@@ -51,7 +51,7 @@ class Question:
     def named(self) -> bool:
         """Return whether the prompt names a vehicle whose path conflicts with the ego's.
 
-        It is false for a picture, which shows no names.
+        Then the answer's words may name it, too. It is false for a picture, which shows no names.
         """
         return any(f"{c.vehicle} " in self.messages[-1]["content"] for c in self.graph.conflicts)
 
@@ -61,7 +61,7 @@ class Question:
 
     @property
     def read_out(self) -> tuple[Mapping[str, str], ...]:
-        """Return the prompt's chat messages, asking for one letter (read-out)."""
+        """Return the prompt's chat messages, which ask to answer with one letter for an action."""
         graph, words = self.excerpt or self.graph, self.scenario.prompt_words
         messages = self.prompt.render(graph, self.actions, self.heard, words, letter=True)
         return in_mode("readout", self.prompt, messages, self.graph, self.actions, words)
@@ -81,9 +81,9 @@ def alone(lessons: Lessons) -> Iterator[Question]:
 def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
     """Yield shorter copies of questions, in whose scene graph only the conflicts are left.
 
-    A scene graph is what the asked vehicle knows of the scene. A conflict is a vehicle whose path
-    meets the ego's, with both arrival times. Questions with neither conflicts nor a picture are
-    left out.
+    They are learnt first, since they are easier. A scene graph is what the asked vehicle knows of
+    the scene. A conflict is a vehicle whose path meets the ego's, with both arrival times.
+    Questions with neither conflicts nor a picture are left out.
     """
     for q in questions:
         if q.graph.conflicts or q.image:
@@ -95,11 +95,12 @@ def excerpts(questions: Sequence[Question]) -> Iterator[Question]:
 def with_messages(
     lessons: Lessons, scenes: Sequence[Scene], intents: Mapping[str, Floats]
 ) -> Iterator[Question]:
-    """Yield questions to the ego that show helpers' messages, by scene and prompt version.
+    """Yield training questions to the ego that show helpers' messages, by scene and prompt version.
 
-    `intents` has each helper's intent over A actions, (A,), by the `key` of its question. Each
-    message arrives with probability 0.85, by draws keyed by layout (start situation) and scene; a
-    scene in which none arrives is left out.
+    `lessons` has the scenario and the right answers, and `scenes` are those to ask about. `intents`
+    has each helper's probabilities of A actions, (A,), by the key of the question that it answered,
+    `scenario/scene/viewer/prompt version`. Each message arrives with probability 0.85, by draws
+    keyed by layout (start situation) and scene; a scene in which none arrives is left out.
     """
     for scene in scenes:
         ego, *helpers = scene.viewers
@@ -136,18 +137,20 @@ def question(
 
 
 def key(lessons: Lessons, scene: Scene, viewer: str, prompt: Prompt) -> str:
-    """Return the key that tells a question apart: `scenario/scene/viewer/prompt version`.
+    """Return the key that tells a training question apart: `scenario/scene/viewer/prompt version`.
 
-    The scenario is that of `lessons`, the scene is given by its id, and `viewer` is a vehicle's id.
+    The scenario is that of `lessons`, the scene is given by its id, and `viewer` is the id of the
+    vehicle that is asked.
     """
     return f"{lessons.scenario.name}/{scene.id}/{viewer}/{prompt.version}"
 
 
 def value(labels: Floats, p: Floats, weights: Sequence[float]) -> float:
-    """Return the weighted mean probability of success of answers to n questions.
+    """Return the weighted mean probability of success of a model's answers to n questions.
 
-    `p` (n, A) has the stated distributions over A actions, and `labels` (n, A) the soft labels,
-    which are above 0 for the actions after which the episode succeeds; `weights` has n.
+    `p` (n, A) has the distributions over A actions that the answers state, and `labels` (n, A) the
+    right ones, which are above 0 for the actions after which the episode succeeds; `weights` has
+    how much each of the n counts.
     """
     return float(np.average((p * (labels > 0)).sum(axis=1), weights=weights))
 
@@ -157,8 +160,10 @@ def references(
 ) -> dict[str, float]:
     """Return the value of drivers that need no model at n questions, by the driver's name.
 
-    They are `uniform`, `local-view` and, where the scenario has one, `constant`. `labels` (n, A)
-    are soft labels over A actions; a value is the weighted mean probability of success (`value`).
+    They are `uniform` (all actions alike), `local-view` (a rule that goes by what it sees) and,
+    where the scenario has one, `constant` (one action always). `labels` (n, A) are the right
+    probabilities of A actions, and `weights` has how much each question counts. A value is the
+    weighted mean probability of success.
     """
     scenario = questions[0].scenario
     each = np.eye(len(scenario.actions))

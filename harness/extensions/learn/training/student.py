@@ -123,7 +123,8 @@ class Student:
     def writing(self, questions: Sequence[Question], intents: Sequence[Floats]) -> list[Sample]:
         """Return training samples of questions, answered by JSON that states these intents.
 
-        There is one intent for each question: a distribution over A actions, (A,).
+        There is one intent for each question: a distribution over A actions, (A,), which the
+        answer's text then has.
         """
         bare = np.random.default_rng(self.plan.seed).random(len(questions)) < BARE
         samples = []
@@ -134,7 +135,10 @@ class Student:
 
     @cached_property
     def one_letter_samples(self) -> list[Sample]:
-        """Return a sample with a one-letter answer for each question without helpers' messages."""
+        """Return training samples with a one-letter answer, one for each question without messages.
+
+        Such questions do not show what helpers said; the letter stands for an action.
+        """
         return self.reading(self.questions)
 
     @cached_property
@@ -176,7 +180,7 @@ class Student:
         return heard
 
     def samples(self, stage: str) -> list[Sample]:
-        """Return the training samples of a stage, by the stage's name.
+        """Return the training samples of a stage, a part of the training, by the stage's name.
 
         `excerpts` have scene graphs (what a vehicle knows) with conflicts alone, `alone` whole ones
         without helpers' messages, and `messages` those to an ego that heard some, all answered by a
@@ -206,16 +210,17 @@ class Student:
         return texts + self.some(self.one_letter_samples + with_heard, int(REHEARSED * len(texts)))
 
     def some(self, items: Sequence[T], most: int) -> list[T]:
-        """Return at most `most` random items, in their order; the plan's seed draws them."""
+        """Return at most `most` of the items, drawn by the plan's seed, in their order."""
         places = np.random.default_rng(self.plan.seed).permutation(len(items))[:most]
         return [items[i] for i in sorted(places)]
 
     def stage(self, name: str, progress: Progress) -> Curve:
-        """Train a stage, or load its weights if it is done, and return its loss curve.
+        """Train one stage, or load its weights if it is done, and return its loss curve.
 
-        `name` is the stage's, as in `samples`. A point of the curve is the sequences seen, the mean
-        loss, and what is watched; the curve is empty for a stage of no sequences. `progress` is
-        called with the name and each point.
+        `name` is the stage's: `excerpts`, `alone`, `messages` or `answers`, which differ in what is
+        asked. A point of the curve is the sequences seen, the mean loss, and what is watched; the
+        curve is empty for a stage of no sequences. `progress` is called with the name and each
+        point.
         """
         done = self.work / f"{name}.pt"
         if done.is_file():
@@ -269,13 +274,16 @@ class Student:
         return {name: halves.get(p.data_ptr(), p) for name, p in self.model.state_dict().items()}
 
     def held_out_facts(self) -> list[dict[str, Any]]:
-        """Return for each scenario, as a dict, how the read-out fits labels of held-out layouts.
+        """Return how well the model's probabilities fit the right ones, a dict a scenario.
 
-        Held-out layouts are start situations that are not learnt. A read-out is the probabilities
-        of the letters of actions. It has the KL in nats and the `value`, the mean probability of
-        success (`questions.value`), balanced over layouts with and without a danger (a vehicle that
-        the ego would meet); the same of always answering the mean label; and the values of drivers
-        that need no model.
+        The questions are of held-out layouts, start situations that are not learnt. The model
+        answers by read-outs, the probabilities of the letters of actions. `scenario` is the name,
+        and `layouts` and `questions` are counts. `kl_nats` is the KL divergence from the right
+        probabilities, and `value` the mean probability of success, balanced over layouts with and
+        without a danger (a vehicle that the ego would meet); names with `of_the_mean` and
+        `of_the_likeliest` are the same of always giving the mean answer, and of the likeliest
+        action alone. `references` has the values of drivers that need no model, and `likeliest` how
+        often each action is the likeliest.
         """
         facts = []
         for each in self.held_out:

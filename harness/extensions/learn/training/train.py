@@ -75,10 +75,7 @@ class Sample:
 class Plan:
     """Describe a training: its length, batch size, learning rates, seed and objective.
 
-    `samples` is the number of sequences of each stage, by its name, and `batch` those of a step.
-    `muon_lr` is the learning rate of matrices, `adam_lr` that of embeddings and norms; `adapt`, for
-    a published model, replaces both. `objective` is what a letter's probability is fitted to:
-    `imitation` of soft labels, or the `values` of actions.
+    A stage is a part of the training with questions of its own, such as those without messages.
     """
 
     samples: dict[str, int]  # sequences per stage, by name
@@ -90,7 +87,10 @@ class Plan:
     objective: Objective = "imitation"  # what a letter's probability is fitted to
 
     def settings(self) -> dict[str, Any]:
-        """Return as plain values, by name, settings that a resumed training must not change."""
+        """Return as plain values, by name, the settings that a resumed training must not change.
+
+        They are the fields of this plan, without the objective if it is the default.
+        """
         settings = asdict(self)
         # trainings that were begun before there was another say nothing
         if self.objective == "imitation":
@@ -200,7 +200,7 @@ def _optimizers(model: Any, plan: Plan) -> tuple[list[Any], list[float]]:
 
 
 def learnt(model: Any) -> dict[str, Any]:
-    """Return the trainable part of a PyTorch model's state: its tensors by name."""
+    """Return the trainable part of a PyTorch model's state for a checkpoint: tensors by name."""
     # an output embedding may be the input's as well
     every = model.named_parameters(remove_duplicate=False)
     frozen = {name for name, p in every if not p.requires_grad}
@@ -208,7 +208,7 @@ def learnt(model: Any) -> dict[str, Any]:
 
 
 def restore(model: Any, state: Mapping[str, Any]) -> None:
-    """Load a trainable state, as `learnt` returns it, into a PyTorch model."""
+    """Load the trainable tensors of a checkpoint, by name in `state`, into a PyTorch model."""
     model.load_state_dict({**model.state_dict(), **state})
 
 
