@@ -8,7 +8,10 @@ from harness.core.files import folder_in
 
 
 class Failures:
-    """Draw the failed episodes of a run as videos: what `harness drive --save-video` calls."""
+    """Draw the failed episodes of a closed-loop run as videos, for `harness drive --save-video`.
+
+    `write` does it, once the run is finished.
+    """
 
     def ready(self) -> None:
         extras.need("--save-video", "matplotlib")
@@ -17,9 +20,9 @@ class Failures:
         """Draw at most `most` failed episodes of a run as videos; return the files.
 
         `run` is the folder of a closed-loop run. Episodes are those that failed under its last
-        condition (operating point), each with the first channel seed with which it did. Files are
-        written to the run's folder `videos`, as .mp4 if that can be written here, else as .gif. If
-        `quiet`, no progress is shown.
+        condition (settings of radio, asking and fusion), each with the first channel seed with
+        which it did. Files are written to the run's folder `videos`, as .mp4 if that can be written
+        here, else as .gif. If `quiet`, no progress is shown.
         """
         from harness.evaluate.replay import played
         from harness.extensions.media.video import formats, write_video

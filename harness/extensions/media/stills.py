@@ -28,9 +28,8 @@ STILLS_HZ = 10  # while no decision is open
 class Turn:
     """Hold the latest decision of one agent, at the time of a still (a picture of a video).
 
-    An agent is a vehicle that decides for itself, such as the ego. The decision began `since_s`
-    seconds before, and is `open` until the agent acts on it; `outcome` is how the agent's journey
-    ended.
+    An agent is a vehicle that decides for itself, such as the ego. A decision takes time: the agent
+    acts on it only when the answers are there.
     """
 
     decision: Decision  # the decision, open or taken
@@ -43,9 +42,8 @@ class Turn:
 class Still:
     """Hold the state of an episode at the time of one picture of its video.
 
-    `state` is the world now, `seen` as it was when the last decision began. `turns` has the latest
-    decision of each agent (vehicle that decides for itself), by its id. `outcome` is how the
-    episode ended, empty before, and `danger` the id of the vehicle that a cruising ego would meet.
+    An agent is a vehicle that decides for itself; the ego is one. What an agent decides, it decides
+    on what it saw when the decision began.
     """
 
     state: WorldState  # the state of the world
@@ -57,16 +55,17 @@ class Still:
 
     @property
     def since_s(self) -> float:
-        """Return the seconds since the last decision began."""
+        """Return the seconds since the last decision of an agent (a vehicle that decides) began."""
         return min(turn.since_s for turn in self.turns.values())
 
 
 def find(path: Path, episode: int, condition: str | None, seed: int | None) -> ReplayedEpisode:
     """Return one episode of a closed-loop run, with all that replaying it needs.
 
-    `path` is the run's folder and `episode` the episode's number. `condition` names the operating
-    point under which it was driven, None for the run's last; `seed` is that of the channel, None
-    for the first. Raises UserError if the folder holds no closed-loop run, or lacks one of these.
+    A closed-loop run is one that was driven in the simulator. `path` is the run's folder and
+    `episode` the episode's number. `condition` names the settings of radio, asking and fusion under
+    which it was driven, None for the run's last; `seed` is that of the channel, None for the first.
+    Raises UserError if the folder holds no closed-loop run, or lacks one of these.
     """
     run = read(path)
     if not isinstance(run.manifest.world, ClosedLoop):

@@ -31,7 +31,7 @@ COLOURS = 64  # of a GIF
 
 
 def formats() -> list[str]:
-    """Return the file name endings of videos that can be written here, the best last."""
+    """Return the endings of video files that can be written here, such as `.gif`, the best last."""
     return [".gif", ".mp4"] if find_spec("imageio_ffmpeg") else [".gif"]
 
 
@@ -39,7 +39,8 @@ def formats() -> list[str]:
 def write_video(played: ReplayedEpisode, out: Path, progress: Callable[[int], None]) -> None:
     """Draw an episode as a video to a `.gif` or `.mp4` file; `progress` is called with 1 a still.
 
-    `played` is the episode with its decisions, as `stills.find` returns it.
+    `played` is an episode of a closed-loop run, with its decisions; a still is one picture of the
+    video.
 
     Raises:
         UserError: the file's name ends otherwise, or an .mp4 cannot be written here.
