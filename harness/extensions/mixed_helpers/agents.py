@@ -17,9 +17,11 @@ from harness.runs.settings import Settings
 class Helpers(RoleAgents):
     """Choose who answers for helpers, where that is another agent than the ego's.
 
-    An agent is a model with a prompt version and an answer mode. The settings in `chosen_by` name
-    it (`helper_model`, a list by commas, and so on); without any of them, the ego's agent answers
-    for all.
+    An agent is a model with a prompt version and an answer mode; helpers are the vehicles that the
+    ego asks. The settings in `chosen_by` name it: `helper_model` (one or more, by commas),
+    `helper_prompt`, `helper_answer` and `helper_thinking`. Without any of them, the ego's agent
+    answers for all. Methods are those of `RoleAgents`: they open the agents by these settings, and
+    state them in a run's records.
     """
 
     chosen_by = ("helper_model", "helper_prompt", "helper_answer", "helper_thinking")

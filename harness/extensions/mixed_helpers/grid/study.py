@@ -54,10 +54,10 @@ HALVES = ("ego", "helper")
 
 @dataclass(frozen=True)
 class Factor:
-    """Describe one thing that the grid varies, such as the helpers' prompt version.
+    """Describe one thing that the grid of runs varies, such as the helpers' prompt version.
 
-    `half` says whose it is, `ego` or `helper`, and `field` what: `model`, `prompt` or `answer` (the
-    answer mode). `levels` are its values in the grid; effects are measured from the first.
+    The grid has a run of each choice for the ego with each choice for its helpers. An answer mode
+    is a way to answer, such as free text or one letter.
     """
 
     half: str  # whose it is: `ego` or `helper`
@@ -66,15 +66,20 @@ class Factor:
 
     @property
     def name(self) -> str:
-        """Return the name for tables, such as `helper prompt`."""
+        """Return the factor's name for tables, such as `helper prompt`.
+
+        A factor is what the grid of runs varies, such as the helpers' model, and a level one of its
+        values.
+        """
         return f"{self.half} {self.field}"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Hold one cell of the grid: an ego agent, a helper agent, and their run.
+    """Hold one cell of a grid of runs: an ego agent, a helper agent, and their run.
 
-    An agent is a model with a prompt version and an answer mode.
+    An agent is a model with a prompt version and an answer mode. The grid has a run of every ego
+    agent with every helper agent.
     """
 
     ego: Agent  # who answers for the ego
@@ -82,10 +87,10 @@ class Cell:
     run: Run  # their finished run
 
     def level(self, half: str, field: str) -> str:
-        """Return the cell's level of a factor, such as the model's name.
+        """Return what a cell has of something that the grid varies, such as the model's name.
 
-        A cell is one ego agent with one helper agent. A factor is what the grid varies, and a level
-        one of its values. `half` is `ego` or `helper`, and `field` is `model`, `prompt` or
+        A cell is a run of one ego agent with one helper agent, each a model with a prompt version
+        and an answer mode. `half` is `ego` or `helper`, and `field` is `model`, `prompt` or
         `answer`.
         """
         return level(self.ego if half == "ego" else self.helper, field)
@@ -94,8 +99,8 @@ class Cell:
     def values(self) -> Mapping[str, Floats]:
         """Return success (0 to 1), latency (ms) and tokens, by metric, each an array (C, S, E).
 
-        The axes are C conditions (operating points), S channel seeds and E episodes. Latency and
-        tokens are means over an episode's decisions; unknown values are NaN.
+        The axes are C conditions (settings of radio, asking and fusion), S channel seeds and E
+        episodes. Latency and tokens are means over an episode's decisions; unknown values are NaN.
         """
         run = self.run
         metrics = [METRICS[SUCCESS], METRICS[LATENCY]]
@@ -107,8 +112,8 @@ class Cell:
     def estimate(self, metric: str, condition: str) -> Estimate:
         """Return a metric's mean under a condition, with its 95 % interval over episodes.
 
-        `metric` names success, latency (ms) or tokens, a key of `values`, and `condition` is the
-        name of an operating point of the run.
+        `metric` names success, latency (ms) or tokens, a key of `values`. `condition` is the name
+        of a set of settings of radio, asking and fusion in the run.
         """
         return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
 
@@ -117,13 +122,12 @@ class Cell:
 class Effect:
     """Describe how success, the headline metric, changes with a factor, averaged over all others.
 
-    A factor is what the grid varies, such as the ego's prompt; `what` names it and its two levels.
-    `estimate` is success of the second level less the first, with its interval; for an interaction
-    of two factors half the difference of two such differences. `p` is the corrected p-value of no
-    effect, None without an interval, and `condition` the operating point.
+    A factor is what the grid of runs varies, such as the ego's prompt version or the helpers'
+    model, and a level one of its values.
     """
 
-    condition: str  # the operating point
+    # name of the settings of radio, asking and fusion
+    condition: str
     what: str  # the factor and its two levels, in words; for an interaction, two factors
     # second level minus first; for an interaction, half the difference of two such differences
     estimate: Estimate
@@ -133,22 +137,22 @@ class Effect:
 
     @property
     def clear(self) -> bool:
-        """Return whether the corrected p-value is at most 0.05."""
+        """Return whether the effect is clear: its corrected p-value is at most 0.05."""
         return self.p is not None and self.p <= LEVEL
 
 
 @dataclass(frozen=True)
 class Halves:
-    """Hold which shares of the variance between cells the choices of ego and helpers explain.
+    """Hold how much of the differences in success is due to the ego's choice, and to the helpers'.
 
-    A cell is one ego agent with one helper agent, each a model with a prompt version and an answer
-    mode. `ego` and `helpers` are shares from 0 to 1, `together` is that of their interaction, and
-    `apart` is `ego` less `helpers`. The variance is that of success over the grid's cells. What the
-    random choice of episodes adds is taken off, as estimated by a bootstrap over episodes, which
-    also makes the intervals.
+    The choices are agents: a model with a prompt version and an answer mode each; a cell is a run
+    of one ego agent with one helper agent. Shares, 0 to 1, are of the variance of success over the
+    cells. What the random choice of episodes adds is taken off, as estimated by a bootstrap over
+    episodes, which also makes the intervals.
     """
 
-    condition: str  # the operating point
+    # name of the settings of radio, asking and fusion
+    condition: str
     ego: Estimate  # share explained by the ego's agent
     helpers: Estimate  # share explained by the helpers' agent
     together: Estimate  # share of their interaction, which is the rest
@@ -156,9 +160,9 @@ class Halves:
 
 
 def level(agent: Agent, field: str) -> str:
-    """Return an agent's level of a factor: its model name, prompt version or answer mode.
+    """Return an agent's model name, prompt version or answer mode, as a grid of runs varies them.
 
-    A factor is what a grid varies, and a level one of its values. `field` is `model`, `prompt` or
+    An agent is a model with a prompt version and an answer mode. `field` is `model`, `prompt` or
     `answer`.
     """
     return {"model": agent.card.name, "prompt": agent.prompt.version, "answer": agent.answer}[field]
@@ -194,7 +198,8 @@ def run_cells(
 ) -> "Grid":
     """Run every combination of ego and helper agents, and return the grid of their runs.
 
-    An agent is a model with a prompt version and an answer mode. Finished runs are read, and all
+    An agent is a model with a prompt version and an answer mode. A combination is one run, in which
+    one agent answers for the ego and the other for all helpers. Finished runs are read, and all
     combinations share answers.
 
     Args:
@@ -255,12 +260,19 @@ class Grid:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Return the names of the operating points that all runs have."""
+        """Return the names of the conditions that all runs have.
+
+        A condition is a named set of settings of radio, asking and fusion.
+        """
         return self.cells[0].run.conditions
 
     @cached_property
     def factors(self) -> tuple[Factor, ...]:
-        """Return the factors that vary: model, prompt or answer mode, of ego or helpers."""
+        """Return what varies over the grid: model, prompt or answer mode, of ego or helpers.
+
+        Only what has several values is a factor. An answer mode is a way to answer, such as free
+        text or one letter.
+        """
         factors = []
         for half, field in product(HALVES, FIELDS):
             levels = tuple(dict.fromkeys(cell.level(half, field) for cell in self.cells))
@@ -271,25 +283,28 @@ class Grid:
     def success(self, cell: Cell, condition: str) -> Estimate:
         """Return a cell's mean success, 0 to 1, under a condition, with its interval over episodes.
 
-        A cell is one ego agent with one helper agent. The condition is the name of an operating
-        point.
+        A cell is a run of one ego agent with one helper agent, each a model with a prompt version
+        and an answer mode. The condition is the name of a set of settings of radio, asking and
+        fusion.
         """
         return self.success_rule.estimate(cell.values[SUCCESS][self.conditions.index(condition)])
 
     def name(self, agent: Agent, half: str) -> str:
-        """Return a short name of an agent: its levels of the factors that vary, else its model.
+        """Return a short name of an agent: what of it varies in the grid, else its model.
 
-        `half` is `ego` or `helper`.
+        An agent is a model with a prompt version and an answer mode. `half` is `ego` or `helper`,
+        for whom it answers.
         """
         varied = [factor.field for factor in self.factors if factor.half == half]
         return " ".join(level(agent, field) for field in varied or ("model",))
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """Return main effects and two-factor interactions on success, under every condition.
+        """Return how success changes with each thing that the grid varies, and with pairs of them.
 
-        A condition is an operating point by its name. Effects are measured from each factor's first
-        level; p-values are corrected together.
+        These factors are model, prompt and answer mode of ego or helpers. Each effect is under one
+        condition, a named set of settings of radio, asking and fusion, and measured from the
+        factor's first value; p-values are corrected together.
         """
         effects, p_values = list[Effect](), list[float | None]()
         for condition in self.conditions:
@@ -329,11 +344,12 @@ class Grid:
                 yield name, (high_low + low_high) / 2, (low_low + high_high) / 2
 
     def halves(self, condition: str) -> Halves | None:
-        """Return the shares of variance that ego and helpers explain under a condition.
+        """Return how much of the differences in success is due to ego and helpers.
 
-        `condition` is the name of an operating point. The result is None if that has no radio
-        channel, if only one of both varies, or if the cells (an ego agent with a helper agent each)
-        may all be equal.
+        They are shares of the variance over cells, runs of one ego agent (model, prompt version and
+        answer mode) with one helper agent. `condition` is the name of a set of settings of radio,
+        asking and fusion. The result is None if that has no radio channel, if only one of both
+        varies, or if the cells may all be equal.
         """
         at = self.conditions.index(condition)
         if (
@@ -378,7 +394,7 @@ MOST_EFFECTS = 8  # that a terminal shows
 
 
 def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
-    """Return the study (tables, pictures, sentences) of a grid of ego and helper agents.
+    """Return the study of a grid of ego and helper agents: tables, pictures and sentences.
 
     An agent is a model with a prompt version and an answer mode. The runs lie in folders under
     `out`, and all share the settings of the evaluation `spec`.
@@ -450,8 +466,8 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
 def headline(grid: Grid) -> list[str]:
     """Return a sentence for each condition: whether the choice of ego or helpers matters more.
 
-    `grid` has a run of each ego agent with each helper agent. A condition is an operating point by
-    its name.
+    `grid` has a run of each ego agent with each helper agent; an agent is a model with a prompt
+    version and an answer mode. A condition is a named set of settings of radio, asking and fusion.
     """
     sentences = []
     for condition in grid.conditions:
@@ -489,8 +505,9 @@ def _halves(grid: Grid, h: Halves) -> str:
 def front(grid: Grid, condition: str) -> list[Cell]:
     """Return the Pareto front under a condition: cells that no other beats in success and latency.
 
-    A cell is one ego agent with one helper agent, and the condition the name of an operating point.
-    The cells are sorted by latency, the fastest first.
+    A cell is a run of one ego agent with one helper agent, each a model with a prompt version and
+    an answer mode. The condition is the name of a set of settings of radio, asking and fusion. The
+    cells are sorted by latency, the fastest first.
     """
 
     def success(cell: Cell) -> float:
@@ -509,8 +526,8 @@ def front(grid: Grid, condition: str) -> list[Cell]:
 def pair(grid: Grid, cell: Cell) -> str:
     """Return a cell's name, such as `model-a + model-b`: its ego's and its helpers' agent.
 
-    A cell is one ego agent with one helper agent. Both are named by what varies in the grid, or by
-    their model.
+    A cell is a run of one ego agent with one helper agent, each a model with a prompt version and
+    an answer mode. Both are named by what varies in the grid, or by their model.
     """
     return f"{grid.name(cell.ego, 'ego')} + {grid.name(cell.helper, 'helper')}"
 
@@ -561,8 +578,10 @@ def _effects(grid: Grid, condition: str, terminal: bool) -> Table:
 def tables(grid: Grid) -> "dict[str, pd.DataFrame]":
     """Return the data frames `cells` and `effects`, by these names, to write as files.
 
-    `cells` has a row for each condition (operating point), metric, ego's and helpers' model,
-    `effects` one for each effect; each row has an estimate and the ends of its interval.
+    A cell is a run of one ego's model with one helpers' model. `cells` has a row for each cell,
+    condition (settings of radio, asking and fusion) and metric; `effects` a row for each change of
+    what the grid varies, such as the ego's prompt. Each row has an estimate and the ends of its 95
+    % interval.
     """
     import pandas as pd
 
