@@ -51,14 +51,10 @@ TIES = "first"  # no two actions that these intents lead to are alike
 class Parameters:
     """Hold the parameters of the calibrated proxy, which draws intents in place of a model.
 
-    An intent is a vehicle's probabilities of the ego's actions. `left_share` and `right_share` are
-    the shares of episodes whose danger the first or second helper sees, the rest the third;
-    `guess_right` and `know_right` are shares of episodes in which an ego that does not see the
-    danger, or does, intends rightly. Entropies of intents, in nats, have a mean and a standard
-    deviation: `ego_nats` and `ego_sd_nats` of the ego, `others_nats` and `others_sd_nats` of
-    helpers that see no danger; `witness_nats` is that of the helper that sees it. `inference_s` is
-    the seconds of one inference. All are computed by `fit.py` from numbers of the paper; none
-    depends on what the paper's study varies.
+    An intent is a vehicle's probabilities of the ego's actions; the danger is the vehicle that the
+    ego would meet if it drove on. Entropies of intents are in nats. All numbers are computed by
+    `fit.py` from results that the SwarmDrive paper states; none depends on what the paper's study
+    varies.
     """
 
     # share of episodes whose danger comes from the approach that the nearest helper watches
@@ -146,12 +142,13 @@ def _below(parts: Sequence[_Drawn]) -> _Drawn:
 
 
 class CalibratedWorld:
-    """Play drawn episodes as a world: the decision points of one step for all episodes at once.
+    """Play drawn episodes as a world: all decisions of one step, of all episodes at once.
 
-    Episodes of all channel seeds are in one row, the first seed's first, and a decision point is an
-    episode's index in it. An ego that has fused the message of the witness (the helper that sees
-    the danger) knows of the danger from its next decision on. The last decision of an episode
-    decides its success.
+    There is no simulator: what vehicles intend is drawn at random by fitted parameters. Episodes of
+    all channel seeds are in one row, the first seed's first, and an episode is known by its index
+    in it. The danger is the vehicle that the ego would meet. An ego that has fused the message of
+    the witness (the helper that sees the danger) knows of it from its next decision on. The last
+    decision of an episode decides its success.
     """
 
     def __init__(self, steps: Sequence[_Drawn], seeds: Sequence[int], numbers: Ints) -> None:
@@ -163,7 +160,10 @@ class CalibratedWorld:
         self.success: Bools = self._knows
 
     def observe(self) -> Sequence[int]:
-        """Begin the next step; return the indices of all episodes, none after the last step."""
+        """Begin the next step of all episodes; return their indices, none after the last step.
+
+        A step is one decision of each episode.
+        """
         self._step += 1
         if self._step == STEPS:
             return ()
@@ -189,9 +189,10 @@ class CalibratedWorld:
     helpers = fusion_call = call_of_agents = others
 
     def due(self, point: OperatingPoint) -> Due:
-        """Return the decisions of this step, one in every episode, with the channel's draws.
+        """Return the decisions of this step, one in every episode, with the channel's random draws.
 
-        The draws are random numbers, the same for every operating point `point`.
+        All operating points (settings of radio, asking and fusion) have the same; `point` is not
+        read.
         """
         return Due(np.arange(len(self._knows)), self._episode, self._seed, self._now.draws)
 
@@ -218,8 +219,8 @@ class CalibratedWorld:
 class Calibrated:
     """Play operating points with the calibrated proxy, as a source of results for studies.
 
-    An operating point is everything a decision depends on besides scene and model. The proxy stands
-    for a model: it draws intents (probabilities of actions) by parameters fitted to numbers of the
+    An operating point is the settings of radio, asking and fusion. The proxy stands for a model: it
+    draws intents (probabilities of actions) by parameters fitted to numbers of the SwarmDrive
     paper.
 
     Attributes:
@@ -239,7 +240,11 @@ class Calibrated:
         self._of_seeds = lru_cache(maxsize=2)(self._drawn)
 
     def manifest(self) -> dict[str, Any]:
-        """Return as plain values the proxy's version, parameters and rows that it was fitted on."""
+        """Return as plain values by what intents (probabilities of actions) are drawn, for records.
+
+        It has the version of the proxy (a rule in place of a model), its parameters, and the rows
+        of the paper's numbers that it was fitted on.
+        """
         rows = sorted({row for rows in FITTED_ON.values() for row in rows})
         return {
             "proxy_model_version": VERSION,
@@ -253,10 +258,11 @@ class Calibrated:
     def walked(
         self, settings: Sequence[Setting], seeds: Sequence[int]
     ) -> Iterator[Iterable[WalkResult]]:
-        """Yield the results of each grid point with all channel seeds, in parts of some episodes.
+        """Yield the results of each grid point with all channel seeds, in chunks of some episodes.
 
-        A grid point is an operating point with a number of vehicles; a part has at most `CHUNK`
-        episodes of each seed.
+        A grid point is an operating point (settings of radio, asking and fusion) with a number of
+        vehicles. A chunk has at most `CHUNK` episodes of each seed: who decided what, and how the
+        episodes ended.
         """
         most = max((setting.vehicles for setting in settings), default=1) - 1
         for setting in settings:
@@ -330,11 +336,11 @@ class Calibrated:
 
 
 def stratified(generator: np.random.Generator, kinds: Ints) -> Floats:
-    """Return uniform draws in [0, 1), (n,), stratified within each of the `kinds`, (n,).
+    """Return uniform draws in [0, 1), (n,), spread more evenly than chance within each kind of row.
 
-    `kinds` has the kind of each of n rows, as whole numbers. Of the k rows of one kind, each of the
-    k equal parts of [0, 1) has one. One such column for each dimension is a Latin hypercube (McKay,
-    Beckman and Conover 1979).
+    `kinds`, (n,), has the kind of each of n rows, as whole numbers. Of the k rows of one kind, each
+    of the k equal parts of [0, 1) has one, so that means over rows vary less. One such column for
+    each dimension is a Latin hypercube (McKay, Beckman and Conover 1979).
     """
     # a kind's rows together, in random order
     order = np.lexsort((generator.random(len(kinds)), kinds))
@@ -366,7 +372,7 @@ def _by_entropy() -> tuple[Floats, Floats]:
 
 
 def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
-    """Return normal draws with mean `mean` and standard deviation `sd`, by quantiles of `uniforms`.
+    """Return normal draws with mean `mean` and standard deviation `sd`, made of uniform ones.
 
     `uniforms` are draws in [0, 1), `(...)`, as is the result. The distribution is cut at `CUT`
     standard deviations on either side.

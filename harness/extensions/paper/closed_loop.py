@@ -34,11 +34,12 @@ RUN = "run"  # the live run's folder
 
 
 def panels() -> dict[str, list[Setting]]:
-    """Return the grid points of the paper's panels, by panel, to drive in closed loop.
+    """Return what the SwarmDrive paper's study varies, by panel, to be driven in the simulator.
 
-    A panel is a set of operating points that are shown together: the paper's, by number of vehicles
-    (`size`), packet loss or tau, the entropy above which the ego asks. Each is named by what it
-    changes; in `size`, loss grows with the density of vehicles.
+    A panel is a set of operating points (settings of radio, asking and fusion) that one figure
+    shows: the paper's own, or others by number of vehicles (`size`), packet loss (`loss`), or
+    `tau`, the entropy in nats above which the ego asks. In `size`, loss grows with the density of
+    vehicles.
     """
 
     def setting(panel: str, value: Value, vehicles: int, changes: str) -> Setting:
@@ -60,12 +61,21 @@ def panels() -> dict[str, list[Setting]]:
 def run_closed_loop(
     spec: Spec, out: Path, workers: Workers, progress: Callable[[int], None], cache: Path | None
 ) -> Study:
-    """Drive all grid points of `panels` as conditions of one run, and return the study.
+    """Drive a model in the simulator under every setting that the SwarmDrive paper varies.
 
-    A grid point is an operating point of a panel of the paper. `spec` has the model and all
-    settings but conditions. A study that was stopped in `out` continues; the run lies in `out/run`.
-    `progress` is called with the number of layouts (start situations) just driven under all
-    conditions. `cache` is the file of stored completions, None for none.
+    The settings are those of radio and asking: the paper's own, other numbers of vehicles, packet
+    loss, and `tau`, the entropy above which the ego asks. All are played in one run, in the folder
+    `out/run`.
+
+    Args:
+        spec: the evaluation: the model, prompt, scenario and layouts (start situations).
+        out: the study's folder; a study that was stopped there continues.
+        workers: the number of processes, or a cluster.
+        progress: called with the number of layouts just driven under all settings.
+        cache: the file of stored completions; None for none.
+
+    Returns the study: sentences, tables and figures of success, crashes and latency under each
+    setting, with 95 % intervals over episodes.
     """
     if (out / RUN / "run.json").is_file():
         stored = finished_run(spec, out / RUN)

@@ -15,10 +15,10 @@ from harness.studies.paper_numbers import paper_numbers
 
 
 def fit() -> Parameters:
-    """Compute the parameters of the rule that stands for the paper's models (the proxy).
+    """Compute the parameters of the proxy, a rule that answers in place of the paper's models.
 
-    They follow in closed form from the paper's results in the rows of `paper_numbers.csv` that
-    `FITTED_ON` names; KeyError if one of these is missing.
+    They follow in closed form from results of the SwarmDrive paper, the rows of `paper_numbers.csv`
+    that `FITTED_ON` names; KeyError if one of these is missing.
     """
     from harness.core.special import ndtri
 

@@ -38,16 +38,18 @@ ASSUMED = {
 
 
 def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
-    """Compare each number of the paper with ours: a table with a row for each.
+    """Compare each number of the SwarmDrive paper with ours: a table with a row for each.
 
-    `summary` has our results, a row for each panel, grid point and metric, as `studies.play` makes
-    it. A panel is a set of operating points that the paper shows together, a condition one by its
-    name. Columns: `id`, `panel`, `condition`, `variable` (what is varied), `value` (of it),
-    `metric`, `unit`, `paper_low`, `paper_high`, `ours`, `ci_low`, `ci_high`, `difference` (to the
-    nearest end of the paper's range), `allowed`, `verdict`, `kind` (`fitted`, `predicted` or
-    `cited`) and `assumed`. Where the paper gives a range over grid points, ours is one row a grid
-    point. A verdict is `within` where the difference is allowed, `unclear` where it is not but the
-    interval reaches what is, `misses` where it does not, or `cited`.
+    `summary` has our results: a row for each panel, grid point and metric, with a mean and the ends
+    of its interval. A panel is a set of operating points (settings of radio, asking and fusion)
+    that the paper shows together; a grid point is one of them, a `value` of the `variable` that is
+    varied in a `condition`. The table has `id`, `panel`, `condition`, `variable`, `value`, `metric`
+    and `unit`; the paper's range `paper_low` to `paper_high`; `ours` with `ci_low` and `ci_high`;
+    `difference` (to the nearest end of the range), `allowed`, `verdict`, `kind` (`fitted`,
+    `predicted` or `cited`) and `assumed`. Where the paper gives a range over grid points, ours is
+    one row a grid point. A verdict is `within` where the difference is allowed, `unclear` where it
+    is not but the interval reaches what is, `misses` where it does not, or `cited` where nothing is
+    played.
     """
     import pandas as pd
 
@@ -85,7 +87,7 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: float) -> str:
-    """Return `within`, `misses` or `unclear` for one of our numbers beside the paper's.
+    """Return how one of our numbers compares with the paper's: `within`, `misses` or `unclear`.
 
     `mean` is ours, with the ends `ci_low` and `ci_high` of its interval, NaN if unknown; from
     `least` to `most` is allowed. It is `unclear` if the mean is not allowed, but its interval
@@ -121,11 +123,12 @@ def _our_rows(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> l
 
 
 def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
-    """Return the paper's values to draw in figures, a row a grid point, by our names.
+    """Return the paper's values to draw in figures beside ours, a row a grid point.
 
-    `ledger` is the table that the function `ledger` returns. Columns: `panel`, `condition`
-    (operating point), `value` (of what is varied), `metric`, `low` and `high`, which are in the
-    unit of the ledger and equal where the paper gives one value.
+    `ledger` has a row for each number of the paper, with ours. A grid point is a value of what a
+    panel (a figure's set of operating points) varies. Columns: `panel`, `condition` (settings of
+    radio, asking and fusion), `value` (of what is varied), `metric`, `low` and `high`, which are in
+    the unit of the ledger and equal where the paper gives one value.
     """
     ran = ledger[ledger.kind != "cited"]
     our_metrics = {paper_name: our_name for paper_name, (our_name, *_) in METRICS.items()}
@@ -137,7 +140,7 @@ def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
 def tally(ledger: "pd.DataFrame") -> dict[str, int]:
     """Count the numbers of the paper that can be played, by how they compare with ours.
 
-    `ledger` is the table that the function `ledger` returns. The keys are `total`, the verdicts
+    `ledger` has a row for each number, with the verdict on ours. The keys are `total`, the verdicts
     `within`, `unclear` and `misses`, and `predicted`: those on which no parameter was fitted.
     """
     ran = ledger[ledger.kind != "cited"]
@@ -155,8 +158,8 @@ def tally(ledger: "pd.DataFrame") -> dict[str, int]:
 def headline(ledger: "pd.DataFrame") -> list[str]:
     """Return sentences on how many of the paper's numbers lie within the aim, and which do not.
 
-    `ledger` is the table that the function `ledger` returns, with a row for each number: its
-    difference to ours, the aim for that, and the verdict.
+    `ledger` has a row for each number of the paper: its difference to ours, the aim (the difference
+    that is allowed), and the verdict.
     """
     counts = tally(ledger)
     sentences = [
@@ -175,9 +178,10 @@ def headline(ledger: "pd.DataFrame") -> list[str]:
 
 
 def tables(ledger: "pd.DataFrame") -> list[Table]:
-    """Return two tables to show: the numbers that the proxy plays, and those that are only cited.
+    """Return two tables to show: numbers of the paper that are played here, and those only cited.
 
-    `ledger` is the table that the function `ledger` returns.
+    `ledger` has a row for each number of the paper, with ours, which a rule in place of a model
+    played.
     """
     played, cited = list[Sequence[str]](), list[Sequence[str]]()
     for row in ledger.to_dict("records"):

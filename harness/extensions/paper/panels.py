@@ -26,23 +26,25 @@ VEHICLES = 4  # the ego and the cooperative neighbourhood of three
 
 @dataclass(frozen=True)
 class Panel:
-    """Hold one panel of the paper's study: what is varied, and over how many episodes.
+    """Hold one panel of the SwarmDrive paper's study: what is varied, and over how many episodes.
 
-    A panel is a set of operating points that are shown together. `settings` are its grid points:
-    operating points, each with a number of vehicles. `episodes` is their number for each seed.
+    A panel is a set of operating points (settings of radio, asking and fusion) that one figure
+    shows.
     """
 
     name: str  # the panel's name in `paper_numbers.csv`
-    settings: tuple[Setting, ...]  # its grid points: operating points with numbers of vehicles
+    # its grid points: settings of radio, asking and fusion, each with a number of vehicles
+    settings: tuple[Setting, ...]
     episodes: int  # number of episodes per seed
 
 
 def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
-    """Return the paper's four panels, and one of our own with equal weights in Equation 2.
+    """Return the four panels of the SwarmDrive paper, and one of our own with equal weights.
 
-    A panel is a set of operating points that are shown together. `core` and `sweep` are episodes
-    per seed: of the paper's operating points, and at each grid point of the other panels. The
-    paper's numbers are read as 5 seeds x 1 500, and 5 x 300.
+    A panel is a set of operating points (settings of radio, asking and fusion) that one figure
+    shows. The paper's Equation 2 weighs messages by their sender's distance; ours weighs all alike.
+    `core` and `sweep` are episodes per seed: of the paper's operating points, and at each value
+    that the other panels vary. The paper's numbers are read as 5 seeds x 1 500, and 5 x 300.
     """
     # Helpers whose entropy is above tau open rounds of their own everywhere; at 0.7 nats none is.
     points = {name: point.changed(helper_rounds=True) for name, point in POINTS.items()}
@@ -68,11 +70,12 @@ def panels(core: int = 1500, sweep: int = 300) -> list[Panel]:
 def run_paper(
     panels: Sequence[Panel], seeds: Sequence[int], progress: Callable[[int], None]
 ) -> Study:
-    """Play the panels with the calibrated proxy, and return the study that compares both numbers.
+    """Play the SwarmDrive paper's study with a rule in place of a model, and compare the numbers.
 
-    The proxy is a rule that draws intents (probabilities of actions) in place of a model. `seeds`
-    are those of episodes and channel; `progress` is called with 1 after each operating point of a
-    panel.
+    The rule, the calibrated proxy, draws intents (probabilities of actions). `panels` are sets of
+    operating points (settings of radio, asking and fusion), `seeds` those of episodes and channel;
+    `progress` is called with 1 after each operating point of a panel. Returns a study: sentences,
+    tables and figures with the paper's numbers and ours, and the verdict on each.
     """
     sources = {panel.episodes: Calibrated(panel.episodes) for panel in panels}
     results = [play(sources[p.episodes], p.name, p.settings, seeds, progress) for p in panels]
@@ -147,10 +150,10 @@ def _figures(
 
 
 def equation_2(weights: "pd.DataFrame") -> str:
-    """Return a sentence on the effect of weighing messages by distance in the calibrated proxy.
+    """Return a sentence on what it changes to weigh messages by their sender's distance.
 
-    Equation 2 of the paper has these weights. `weights` is the summary of the panel (set of
-    operating points) that varies them: a row for each of their values and each metric.
+    Equation 2 of the paper has these weights. `weights` has the results of a rule in place of a
+    model: a row for each metric, with such weights and with equal ones.
     """
     success = weights[weights.metric == "success_rate"].set_index("value")
     with_it = percent(success.loc[1.0], "mean", "ci_low", "ci_high")
