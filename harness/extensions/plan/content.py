@@ -21,8 +21,8 @@ class OfPlan(Content):
     """Describe a message that holds what its sender will do: the content `plan`.
 
     It is the probabilities of actions by which an agent, a vehicle that decides for itself, acts. A
-    condition (operating point) has it by its setting `content`; it needs a run in which several
-    vehicles decide.
+    condition (settings of radio, asking and fusion) has it by its setting `content`; it needs a run
+    in which several vehicles decide.
     """
 
     holds = frozenset((PLANS,))

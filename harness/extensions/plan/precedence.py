@@ -18,15 +18,15 @@ from harness.core.arrays import Floats
 
 @dataclass(frozen=True)
 class Precedence:
-    """Decide by precedence: an agent waits for a near one of lower rank that plans to go on.
+    """Decide who waits: an agent waits for a near one of lower rank that plans to go on.
 
-    It is a consensus rule, by which messages make a policy, for agents, vehicles that each decide
-    for themselves. To wait is to take action 0, the most careful one; else the agent acts by its
-    own intent, its probabilities of actions. `rank` returns the rank of the agent and of its H
-    helpers, `(..., 1+H)`, from their plans. Two are near if they reach the conflict (where paths
-    meet) less than `apart_s` seconds apart. An agent that itself plans action 0, stands, or has
-    passed the conflict makes nobody wait. Equal ranks go by the vehicles' numbers in the world.
-    `needs` says that it reads plans, `by_distance` that distances weigh nothing.
+    An agent is a vehicle that decides for itself, and this is a consensus rule: it makes an agent's
+    policy of its own plan and of those that others sent. To wait is to take action 0, the most
+    careful one; else the agent acts by its own probabilities of actions. Two are near if they reach
+    the conflict (where paths meet) less than `apart_s` seconds apart. An agent that itself plans
+    action 0, stands, or has passed the conflict makes nobody wait. Equal ranks go by the vehicles'
+    numbers in the world. `needs` says that the rule reads plans, `by_distance` that distances weigh
+    nothing.
     """
 
     # returns the rank of the agent and of its H helpers, `(..., 1+H)`; the lowest goes first

@@ -33,8 +33,9 @@ MOST_ROUNDS = 3
 class Negotiated(Part, frozen=True, kw_only=True):
     """Hold the setting `rounds`: how often agents tell each other their plans before they act.
 
-    Agents are vehicles that each decide for themselves; 1 is once. It is a part of an operating
-    point, which adds a setting to it; in records that stands behind the setting `behind`.
+    Agents are vehicles that each decide for themselves; 1 is once. It is one of the settings of an
+    operating point, which has those of radio, asking and fusion; in records it stands behind the
+    setting `behind`.
     """
 
     behind: ClassVar[str] = "fallback"
@@ -71,12 +72,13 @@ def further_rounds(
     """Play the negotiation rounds after the first, in which agents exchange revised plans.
 
     An agent is a vehicle that decides for itself; a plan is its probabilities of its own actions.
-    Returns the last plans that each agent knows, and one exchange that sums all rounds.
+    Returns the last plans that each agent knows, and one exchange (what was sent, what arrived, and
+    when) that sums all rounds.
 
     Args:
-        point: the operating point, which says how many rounds there are.
+        point: the settings of radio, asking and fusion, with the number of rounds.
         sent_intents: what was sent in the first round, in n decisions.
-        heard: the exchange of the first round: which messages arrived, and when.
+        heard: the exchange of the first round.
         fused: returns the n decisions, given an exchange and the intents known after it.
     """
     from harness.coordination.exchange import exchange
