@@ -20,7 +20,7 @@ SATURATED = 0.6  # above this busy ratio, vehicles that all hear each other neve
 
 
 def begin_per_s(busy: Floats | float, packet_s: float) -> Floats | float:
-    """Return the number of packets that begin in a second of idle time, of the shape of `busy`.
+    """Return how many packets begin in a second of idle medium, of the shape of `busy`.
 
     `busy` is the channel busy ratio, the share of time, from 0 to below 1, in which the medium is
     sensed as busy, and `packet_s` a packet's time on air, s.

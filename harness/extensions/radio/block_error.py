@@ -29,7 +29,7 @@ BlockError = Callable[[Floats], Floats]
 def block_error(curve: str) -> BlockError:
     """Return a published curve by its name, such as `11p-goubet`: the loss of blocks by their SINR.
 
-    A block is what is coded and sent as one. The curve takes an array of
+    A block is what is coded and sent as one. The curve is a function: it takes an array of
     signal-to-interference-and-noise ratios in dB and returns the probabilities, of the same shape,
     that a block is lost. Points are interpolated linearly, and the end values hold beyond them.
     Raises UserError for an unknown name.

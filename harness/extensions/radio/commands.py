@@ -298,11 +298,10 @@ def _refuse_format(out: Path | None) -> None:
 
 
 def channel_of(text: str) -> "tuple[str, Channel]":
-    """Return a channel profile's name and its channel, with changed settings if any.
+    """Return a radio's name and its channel, given how `--condition` names it, such as `mode4`.
 
-    A channel profile is a radio by name, one file of `channels/`. `text` is a condition (an
-    operating point), as --condition takes it, such as `mode4:power_dbm=20`. Raises UserError if
-    there is no such condition, or it has no channel.
+    A radio, a channel profile, is one file of `channels/`. `text` may change its settings, such as
+    `mode4:power_dbm=20`. Raises UserError if nothing has the name, or what has it has no channel.
     """
     from harness.coordination.named_points import named_point
     from harness.radio.wrapped import innermost

@@ -140,7 +140,7 @@ class ItsG5(Transceiver):
 
     @property
     def packet_bits(self) -> int:
-        """Return the size of a background packet without headers, bits."""
+        """Return the size of a background packet (of other vehicles) without headers, in bits."""
         return 8 * self.packet_bytes
 
     @property
@@ -153,9 +153,9 @@ class ItsG5(Transceiver):
     def busy_ratio(self) -> float:
         """Return the channel busy ratio, the share of time in which the medium is sensed as busy.
 
-        It is by a fit to simulations (Sepulcre et al., equation 35), a parabola of the load of
-        background traffic (34), fitted up to 1.3; beyond its maximum, 0.84 at a load of 1.84, it
-        stays constant.
+        It is by a fit to simulations (Sepulcre et al., equation 35), a parabola of the load by
+        other vehicles' packets (34), fitted up to 1.3; beyond its maximum, 0.84 at a load of 1.84,
+        it stays constant.
         """
         sensed_m = 2 * float(_sensed(self, np.arange(0.5, SENSED_M)).sum())
         load = min(
@@ -173,9 +173,10 @@ class ItsG5(Transceiver):
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the packet reception ratio, the share of packets received, at n distances, (n,).
 
-        `distance_m` (n,) is in metres, and packets are those of background traffic. It is averaged
-        over shadowing; without `sight` (what stands between, such as `CLEAR`) also over clear and
-        blocked links by the environment's shares.
+        `distance_m` (n,) is in metres, and packets are those that other vehicles send all the time.
+        It is averaged over shadowing (the slow change of power by what stands around); without
+        `sight` (what stands between, such as `CLEAR`) also over clear and blocked links by the
+        environment's shares.
         """
         shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         distance_m = np.asarray(distance_m, dtype=float)[:, None]

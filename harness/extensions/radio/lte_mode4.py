@@ -22,15 +22,16 @@ CODINGS = {4: ("lte-qpsk-0.7-190B", 10), 2: ("lte-qpsk-0.5-190B", 12)}
 class LteMode4(Sidelink):
     """Model LTE-V2X Mode 4 in a 10 MHz channel, where vehicles choose resources by sensing.
 
-    A resource is a sub-channel, one of `subchannels` bands of frequency, in a slot of 1 ms: what
-    one packet takes. Vehicles rank those that they have not sensed as taken by received power
-    (`ranks`), and choose among the weakest. Other settings are those of `Sidelink`, the part that
-    it shares with NR Mode 2.
+    A resource is what one packet takes: a sub-channel, one of `subchannels` bands of frequency, in
+    a slot of 1 ms. Vehicles rank those that they have not sensed as taken by received power, and
+    choose among the weakest. Other settings are those of `Sidelink`, which it shares with NR Mode
+    2.
     """
 
     # packets beside each other in a subframe, and with them the coding: 4 of QPSK at rate 0.7, or 2
     # at 0.5
     subchannels: Literal[2, 4] = 4
+    # that free resources are ranked by received power
     ranks: ClassVar[bool] = True
 
     @property

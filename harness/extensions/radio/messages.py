@@ -145,9 +145,10 @@ def message_bits(name: str, content: Counts) -> Floats:
 
 
 def shares(name: str, content: Counts) -> list[Share]:
-    """Return the bits of each member (field) of a message; the last entry is the padding.
+    """Return how many bits each member (field) of a message takes; the last entry is the padding.
 
-    `name` is one of `NAMES`, such as CPM, and `content` says how much it lists, such as objects.
+    `name` is one of `NAMES`, such as CPM (a list of objects seen), and `content` says how much it
+    lists, such as objects.
     """
     counts = {**content._asdict(), "path": np.asarray(content.points) > 0}
     members = list(_shares(name, counts, 1.0, ()))
@@ -206,9 +207,10 @@ def wraps(
 
 
 def size(name: str, content: Counts) -> Size:
-    """Return the size of a message in bits: alone, with its envelope, and with headers.
+    """Return the size of a message in bits: alone, with its signed envelope, and with headers.
 
-    `name` is one of `NAMES`, such as CPM, and `content` what it lists.
+    `name` is one of `NAMES`, such as CPM (a list of objects seen), and `content` says how much it
+    lists.
     """
     bits = message_bits(name, content)
     signed, packet = packet_bits(name, bits, headers=False), packet_bits(name, bits)
@@ -230,8 +232,8 @@ def beacon_bytes(encoding: Encoding, rate_hz: float) -> int:
 class Standard:
     """Compute the sizes of messages by a standard, ETSI's or SAE's, for radios that send them.
 
-    It is a `harness.coordination.encodings.Encoding`, which an operating point names by its setting
-    `encoding`.
+    The setting `encoding` of radio, asking and fusion names it. `packet_bits` returns the size of a
+    packet by what it holds, and `beacon_bytes` that of a beacon, by which a vehicle tells its pose.
     """
 
     encoding: Encoding  # the standard's name

@@ -97,7 +97,7 @@ class NrMode2(Sidelink):
 
     @property
     def block_bits(self) -> int:
-        """Return the bits that fit into the sub-channels of a background packet.
+        """Return how many bits fit into one block, the sub-channels of a background packet.
 
         A sub-channel is a band of frequency; background packets are those of other vehicles.
         """

@@ -164,9 +164,14 @@ class Propagation:
         Shadowing is the slow change of received power by what stands around; blockage is a vehicle
         between. It is 3 dB in line of sight, with the blockage's own deviation behind a vehicle, 4
         dB behind a building (TR 37.885, table 6.2.1-1; WINNER+ B1 has the same 3 and 4), 4.1 dB
-        round a corner (Mangel et al.). `sight`, `(...)`, is what stands between, such as `CLEAR`,
-        `blocker_m` the height of a vehicle there, `corner_m`, `(..., 2)`, both distances to a
-        crossing and `first_m` one antenna's height, m, as in `path_loss_db`.
+        round a corner (Mangel et al.).
+
+        Args:
+            sight: what stands between: `CLEAR`, `VEHICLE` or `BUILDING`, `(...)`.
+            blocker_m: height of a vehicle between, m; None for the setting of that name.
+            corner_m: distances of both ends to the crossing's centre, m, `(..., 2)`; NaN if there
+                is none.
+            first_m: height of one antenna, m, if it is not `antenna_m`.
         """
         behind: Floats | float = 4.0
         if corner_m is not None:
@@ -178,11 +183,12 @@ class Propagation:
 
     @property
     def decorrelation_m(self) -> float:
-        """Return the distance, m, over which a vehicle moves until shadowing's correlation is 1/e.
+        """Return over how many metres of driving a link's shadowing stays alike: correlation 1/e.
 
-        It is 25 m on a highway, else 10 m, by TR 37.885, 6.2.1, and by TR 36.885 for `winner-b1`.
-        In a town TR 37.885 has 13 m for links without line of sight; here these have 10 m as well,
-        so that shadowing does not jump when sight is lost.
+        Shadowing is the slow change of power by what stands around. It is 25 m on a highway, else
+        10 m, by TR 37.885, 6.2.1, and by TR 36.885 for `winner-b1`. In a town TR 37.885 has 13 m
+        for links without line of sight; here these have 10 m as well, so that shadowing does not
+        jump when sight is lost.
         """
         return 25.0 if self.environment == "tr37885-highway" else 10.0
 

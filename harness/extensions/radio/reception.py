@@ -137,9 +137,10 @@ def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int =
     """Simulate the time between received packets on `n` trips of two vehicles at each distance.
 
     `channel` is their radio, and `distances_m` are the metres between them. They drive in line of
-    sight at 14 m/s on one road, for `PACKETS` packets. Their shadowing changes as they go; a packet
-    is drawn by its own loss, as in runs, and draws are made from `seed`. Gaps that a trip's end
-    cuts off are left out, so ones that would be longer than a tenth of a trip are unknown.
+    sight at 14 m/s on one road, for `PACKETS` packets. Their shadowing (change of power by what
+    stands around) changes as they go; a packet is drawn by its own loss, as in runs, and draws are
+    made from `seed`. Gaps that a trip's end cuts off are left out, so ones that would be longer
+    than a tenth of a trip are unknown.
     """
     moved_m = MPS / channel.rate_hz * np.arange(PACKETS)
     numbers = np.broadcast_to(np.arange(n)[:, None], (n, PACKETS))
@@ -196,11 +197,12 @@ class Curve:
 
 
 def curves_of(path: Path) -> list[Curve]:
-    """Return the curves in a CSV file with the columns `distance_m` and `reception`.
+    """Return the published curves of reception in a CSV file, to compare a radio with.
 
-    It may also have the columns `configuration` and `source` (see `Curve`); rows with the same pair
-    of these are one curve. Raises UserError, with file, line and value, if it is no such table or a
-    value is not allowed.
+    It has the columns `distance_m` and `reception` (share of packets received), and may have
+    `configuration` (the radio's settings, such as `rate_hz=10`) and `source` (who published it);
+    rows with the same pair of these are one curve. Raises UserError, with file, line and value, if
+    it is no such table or a value is not allowed.
     """
     file = printable(path)
     _, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)
@@ -223,31 +225,28 @@ def curves_of(path: Path) -> list[Curve]:
 
 @dataclass(frozen=True)
 class Compared:
-    """Hold a published curve beside the channel model's reception at the same n distances.
-
-    `reception` (n,) is the share of packets received by the model.
-    """
+    """Hold a published curve of reception beside the radio model's at the same n distances."""
 
     curve: Curve  # the curve
     reception: Floats  # share of packets received by the model, `(n,)`
 
     @property
     def mean_difference(self) -> float:
-        """Return the mean absolute difference of model and curve at its points, 0 to 1."""
+        """Return the mean absolute difference of the model's reception from the curve's, 0 to 1."""
         return float(np.abs(self.reception - self.curve.reception).mean())
 
     @property
     def largest_difference(self) -> float:
-        """Return the difference of largest size, the model's reception less the curve's."""
+        """Return the largest difference, -1 to 1: the model's reception less the curve's."""
         apart = self.reception - self.curve.reception
         return float(apart[np.abs(apart).argmax()])
 
 
 def compared(channel: Channel, curve: Curve, where: str) -> Compared:
-    """Return a curve beside the channel's reception, with the settings that the curve states.
+    """Return a published curve of reception beside that of a radio's model, at the same distances.
 
-    `channel` is the radio, and `where` names it for errors. Raises UserError for a setting that it
-    does not have.
+    The model has the settings that the curve states. `channel` is the radio, and `where` names it
+    for errors. Raises UserError for a setting that it does not have.
     """
     adapted = changed(channel, pairs(curve.configuration), where)
     assert isinstance(adapted, Physical)
@@ -275,18 +274,19 @@ class Check:
 
     @property
     def mean_difference(self) -> float:
-        """Return the mean absolute difference of reception from the curves, equally weighted.
+        """Return the mean absolute difference of model and published curves, 0 to 1.
 
-        It is from 0 to 1.
+        It is of reception, the share of packets received; each curve weighs alike.
         """
         return float(np.mean([curve.mean_difference for curve in self.curves]))
 
 
 def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check:
-    """Simulate `n` messages at each of `DISTANCES_M`, and compare a radio with curves of files.
+    """Check a radio's model: simulate its messages, and compare it with published curves.
 
-    `files` are CSV files as `curves_of` reads them. `where` names the radio for errors. Raises
-    UserError if a file has no curves, or one states a setting that the radio does not have.
+    `n` messages are simulated at each of `DISTANCES_M`. `files` are CSV files of distances and
+    shares of packets received. `where` names the radio for errors. Raises UserError if a file has
+    no curves, or one states a setting that the radio does not have.
     """
     curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
     return Check(
@@ -303,12 +303,13 @@ def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check
 def crowds(
     channels: Mapping[str, Channel], radius_m: float, distance_m: float, sight: str
 ) -> dict[str, Floats]:
-    """Return the loss of one transmission for each of the n numbers in `VEHICLES`, `(n,)`.
+    """Return how much of a radio's messages is lost, by the number of vehicles around.
 
-    The keys are those of `channels`, and `paper` for the paper's line; values are shares of
-    transmissions. Vehicles are within `radius_m` metres; sender and receiver, `distance_m` metres
-    apart with `sight` between (a key of `SIGHTS`), are two of them, and the others are background
-    load, evenly along one road.
+    Values are shares of single transmissions lost, `(n,)`, for each of the n numbers in `VEHICLES`.
+    The keys are those of `channels`, the radios, and `paper` for the line that the SwarmDrive paper
+    assumes. Vehicles are within `radius_m` metres; sender and receiver, `distance_m` metres apart
+    with `sight` between (a key of `SIGHTS`, such as `clear`), are two of them, and the others are
+    background load, evenly along one road.
     """
     losses = {"paper": density_coupled_loss(np.array(VEHICLES))}
     for name, channel in channels.items():

@@ -76,12 +76,18 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def blocks_per_slot(self) -> int:
-        """Return the number of blocks that fit into one slot, side by side in frequency."""
+        """Return how many blocks fit into one slot of time, side by side in frequency.
+
+        A block is what one packet of a vehicle takes.
+        """
 
     @property
     @abstractmethod
     def block_bits(self) -> int:
-        """Return the bits in one block; a larger message takes several, and all must arrive."""
+        """Return the bits in one block, what one packet takes: some frequency in one slot of time.
+
+        A larger message takes several blocks, and all must arrive.
+        """
 
     @property
     def packet_bits(self) -> int:
@@ -90,12 +96,16 @@ class Sidelink(Transceiver):
     @property
     @abstractmethod
     def noise_dbm(self) -> float:
-        """Return the noise power of a receiver in the bandwidth of a block, dBm."""
+        """Return the noise power, dBm, of a receiver in the bandwidth of one packet."""
 
     @property
     @abstractmethod
     def block_error(self) -> BlockError:
-        """Return the function from SINR in dB to the probability that a block is lost."""
+        """Return the function that says how probably a block is lost, by its signal's strength.
+
+        A block is what is coded and sent as one. The function takes ratios of signal to
+        interference and noise (SINR) in dB, an array, and returns probabilities of the same shape.
+        """
 
     def busy_ratio(self) -> float:
         return self._scheduling().busy_ratio
@@ -103,10 +113,10 @@ class Sidelink(Transceiver):
     def reception(self, distance_m: Floats, sight: Ints | int | None = None) -> Floats:
         """Return the packet reception ratio, the share of packets received, at n distances, (n,).
 
-        `distance_m` (n,) is in metres, and packets are those of background traffic. It is equation
-        6 of Gonzalez-Martin et al. (2019), averaged over shadowing. `sight` is what stands between,
-        such as `CLEAR`; without it no building does, and vehicles with the environment's
-        probability.
+        `distance_m` (n,) is in metres, and packets are those that other vehicles send all the time.
+        It is equation 6 of Gonzalez-Martin et al. (2019), averaged over shadowing (the slow change
+        of power by what stands around). `sight` is what stands between, such as `CLEAR`; without it
+        no building does, and vehicles with the environment's probability.
         """
         distance_m = np.asarray(distance_m, dtype=np.float64)
         success = np.array(
@@ -121,7 +131,8 @@ class Sidelink(Transceiver):
     def message_s(self, bits: Floats | float) -> Floats:
         """Return the time on air of a message of so many bits, s, of the shape of `bits`.
 
-        It is one slot for each block and repetition, one after another.
+        A message takes several blocks if it is large, and each is sent several times; each takes
+        one slot, one after another.
         """
         return self._blocks(bits) * (self.transmissions * self.slot_s)
 

@@ -28,12 +28,10 @@ STEP_DB = 0.1  # step by which Step 3 raises the threshold until enough resource
 class Scheduling:
     """Hold what a vehicle's choice of a resource depends on in semi-persistent scheduling.
 
-    A resource is what one packet takes of the channel: some frequency in one slot of time. A period
-    is the time from one packet of a vehicle to its next: `per_m` packets for each metre of road and
-    `resources` resources are in it. `forgotten` is the share of choices that a vehicle could sense
-    and does not know of. `sensed` takes metres, as an array, and a threshold in dBm, and returns
-    the share of a vehicle's packets received above it at each; `threshold_dbm` is that of a
-    receiver. Equations are those of Gonzalez-Martin et al. (IEEE TVT 68(2), 2019).
+    A resource is what one packet takes of the channel: some frequency in one slot of time. A
+    vehicle keeps the same resource for several packets; a period is the time from one of its
+    packets to the next. Equations, whose numbers stand in brackets below, are those of
+    Gonzalez-Martin et al. (IEEE TVT 68(2), 2019).
     """
 
     per_m: float  # packets that the vehicles on one metre of road send in a period
@@ -102,11 +100,12 @@ class Scheduling:
 
 
 def taken(packets: float, resources: float) -> float:
-    """Return how many of `resources` resources `packets` packets take in a period.
+    """Return how many of the resources of a radio channel the packets in one period take.
 
-    A period is the time from one packet of a vehicle to its next. By equation 29 of Gonzalez-Martin
-    et al. (2019), half of the packets do not overlap and the others fall at random. The equation
-    does not state the limit `resources`, but it holds in its range.
+    A resource is what one packet takes: some frequency in one slot of time. A period is the time
+    from one packet of a vehicle to its next; `packets` are sent in it and `resources` are there. By
+    equation 29 of Gonzalez-Martin et al. (2019), half of the packets do not overlap and the others
+    fall at random. The equation does not state the limit `resources`, but it holds in its range.
     """
     half = packets / 2
     free = resources - half

@@ -19,7 +19,8 @@ def rows_of(
     """Return the column names of a CSV file, and its rows, each with its line number in the file.
 
     A row is a dict of the cells' texts by column. Raises UserError if it is no table, lacks a
-    column that is `needed`, or has one that is not in `known_columns`.
+    column that is `needed`, or has one that is not in `known_columns`; nothing is checked of the
+    cells.
     """
     file = printable(path)
     try:

@@ -73,10 +73,11 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Hold the rows of a table of reception over distance, with its file's path and digest."""
+    """Hold the rows of a user's table of reception over distance, and which file it is."""
 
     file: str  # path of the file
-    sha256: str  # its digest
+    # hex SHA-256 of the file
+    sha256: str
     points: tuple[Point, ...]  # its rows
 
 
@@ -84,14 +85,12 @@ class Table:
 class Trace:
     """Define a channel by a table of reception over distance, such as another simulator's.
 
-    `receptions` is the table, averaged over shadowing and for one packet size, so a link's own
-    shadowing and a message's bits change nothing, and replies do not wait for each other. A request
-    reaches each helper after the latency of its own distance, or `latency_s` seconds if the table
-    has none. Between two percentiles a message's latency is drawn from the lognormal distribution
-    that has them; that it is lognormal, and that messages draw independently, is assumed. `beyond`
-    says what reception is beyond the last distance: `zero`, or `held`, that of the last row.
-    `decorrelation_m` is infinite, since shadowing plays no part, and `of_loss` names the settings
-    that change losses alone.
+    The table is averaged over shadowing (change of power by what stands around) and for one packet
+    size, so a link's own shadowing and a message's bits change nothing, and replies do not wait for
+    each other. A request reaches each helper after the latency of its own distance. Between two
+    percentiles a message's latency is drawn from the lognormal distribution that has them; that it
+    is lognormal, and that messages draw independently, is assumed. `decorrelation_m`, over which
+    shadowing stays alike, is infinite, since it plays no part.
     """
 
     receptions: Table  # the table
@@ -113,9 +112,10 @@ class Trace:
         return math.nan
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return a request's times, both NaN: each helper has it after the latency of its own link.
+        """Return when helpers have the ego's request: NaN, since each has a latency of its own.
 
-        `bits` and `draws` are not read. Its time on air is unknown.
+        It is that of its distance in the table. The request's time on air is unknown, NaN as well.
+        `bits` and `draws` are not read.
         """
         return Broadcast(math.nan, math.nan)
 
@@ -129,7 +129,10 @@ class Trace:
 
     @property
     def spread(self) -> bool:
-        """Return whether the table has two percentiles of latency (`Spread`) for each distance."""
+        """Return whether the table has the median and 95th percentile of latency for each distance.
+
+        Then each message's latency is drawn at random; else it is the same for all at a distance.
+        """
         return any(isinstance(point.latency_s, Spread) for point in self.receptions.points)
 
     def percentiles_s(self, distance_m: Floats, sight: Ints | int) -> tuple[Floats, Floats]:
@@ -197,9 +200,10 @@ def from_profile(parameters: Mapping[str, Any], folder: Path, where: str) -> Tra
 
 
 def read(path: Path) -> tuple[Point, ...]:
-    """Return the rows of a CSV table of reception over distance, sorted by obstacle and distance.
+    """Return the rows of a user's CSV table of reception, sorted by obstacle and distance.
 
-    Raises UserError if the table is wrong.
+    It has `distance_m` and `reception` (share of packets received), and may have what stands
+    between and latencies. Raises UserError if the table is wrong.
     """
     file = printable(path)
     columns, rows = rows_of(path, ("distance_m", "reception"), COLUMNS)

@@ -55,12 +55,12 @@ class Transceiver(Propagation, Physical):
 
     @abstractmethod
     def message_s(self, bits: Floats | float) -> Floats:
-        """Return the time on air of messages of so many bits, s, of the shape of `bits`."""
+        """Return the time on air, s, of messages of so many bits, of the shape of `bits`."""
 
     @property
     @abstractmethod
     def packet_bits(self) -> int:
-        """Return the size of a background packet, bits."""
+        """Return the size of a background packet, one of the other vehicles', in bits."""
 
     @abstractmethod
     def _fate(self, distance_m: Floats, power_dbm: Floats) -> Any:
@@ -96,10 +96,10 @@ class Transceiver(Propagation, Physical):
         return self._lost(self._fate_at(site, shadow), bits)
 
     def request(self, bits: Floats | float, draws: Draws) -> Broadcast:
-        """Return when all helpers have a broadcast request of so many bits, and its time on air, s.
+        """Return when all helpers have the ego's broadcast request, and its time on air, s.
 
-        They have it after its wait for the medium, of which `draws` has the random numbers, and its
-        time on air. `bits` is one number or `(...)`.
+        They have it after the ego's wait for the medium, of which `draws` has the random numbers,
+        and the time on air. `bits` is the request's size, one number or `(...)`.
         """
         airtime_s = self.message_s(bits)
         return Broadcast(self.wait_s(draws.wait) + airtime_s, airtime_s)
