@@ -26,14 +26,10 @@ Place = Annotated[float, Meta(ge=-10_000, le=10_000, description="metres from -1
 class Roadside(Part, frozen=True, kw_only=True):
     """Hold the settings of a roadside unit: what it does, where it stands and how fast it is.
 
-    A roadside unit is an antenna beside the road. The settings are a part of an operating point,
-    the settings under which a run's decisions are played. `edge` is `none` for no unit, `relay` for
-    one that sends helpers' replies once more, or `fusion` for one that asks the helpers in the
-    ego's place and fuses what they say; `edge_delay_s` is the seconds from what it receives to what
-    it sends. It stands `edge_x_m` m to the east and `edge_y_m` m to the south of the middle of the
-    conflict zone, where paths meet, and its antenna at the height `edge_antenna_m`. `behind` is the
-    setting after which they stand in records, and `of_radio` says that they mean nothing without a
-    radio.
+    A roadside unit is an antenna beside the road. The settings belong to an operating point, which
+    has those of radio, asking and fusion. The conflict zone is where the vehicles' paths meet.
+    `behind` is the setting after which they stand in records, and `of_radio` says that they mean
+    nothing without a radio.
     """
 
     behind: ClassVar[str] = "helper_rounds"

@@ -27,10 +27,10 @@ EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and thos
 class Relay(Wrapped):
     """Add to a channel a roadside unit, an antenna beside the road, that sends replies once more.
 
-    A reply arrives if it reaches the ego, or the unit and from there the ego. The ego takes the one
-    that comes first: the direct one, unless latencies depend on the link. The unit repeats every
-    reply, needed or not, since it cannot know, `delay_s` seconds after that reply has ended, and
-    what it sends does not wait for other messages.
+    A helper's reply arrives if it reaches the ego, or the unit and from there the ego. The ego
+    takes the one that comes first: the direct one, unless latencies depend on the positions. The
+    unit repeats every reply, needed or not, since it cannot know, and what it sends does not wait
+    for other messages.
     """
 
     unit: Antenna  # position and antenna height of the unit
@@ -39,8 +39,9 @@ class Relay(Wrapped):
     def deliver(self, links: Links, draws: Draws) -> Delivery:
         """Return which replies arrive, directly or by the unit, and when the first of both does.
 
-        `links` has who was asked and what is sent; `draws` are the channel's random numbers. A
-        lost reply keeps its slot on the medium, and that of its repetition if there is one.
+        `links` has, for the ego and each helper, who was asked and what is sent; `draws` are the
+        channel's random numbers. A lost reply keeps its slot on the medium, and that of its
+        repetition if there is one.
         """
         up, delay_s, loss, airtime_s = delivered(self.channel, links, draws)
         has_request = draws.packet[..., 0] >= link_loss(
@@ -83,12 +84,13 @@ def by_unit(
     ready: Callable[[Floats], Floats],
     left_s: Floats,
 ) -> Consulted:
-    """Play a roadside unit, an antenna beside the road, that asks for the ego and fuses for it.
+    """Play a roadside unit, an antenna beside the road, that asks helpers and fuses for the ego.
 
     It sends the ego a policy, the probabilities of the ego's actions. It does so when the last
     reply's slot has ended, but not so late that its own wait and time on air take the policy out of
     the window: it knows the slot that it has taken, or a table's latency, and until when the ego
-    waits. An ego without a policy by then acts alone.
+    waits. An ego without a policy by then acts alone. Returns whom the unit heard, and when the ego
+    has the policy.
 
     Args:
         channel: the channel between vehicles.
@@ -147,7 +149,8 @@ def by_unit(
 def link_loss(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
     """Return the probability that one transmission is lost on each of H links, `(..., H)`.
 
-    `site` has the positions, `draws` the random numbers of which each link's shadowing is made, and
-    `bits` is the transmission's size, one for all or `(..., H)`.
+    A link is that of two ends, such as the ego and a helper. `site` has their positions, `draws`
+    the random numbers of which each link's shadowing (change of power by what stands around) is
+    made, and `bits` is the transmission's size, one for all or `(..., H)`.
     """
     return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)
