@@ -38,14 +38,12 @@ PRICE = 1e-6  # of a message in successes, where the fewest messages break a tie
 
 @dataclass(frozen=True)
 class Level:
-    """Hold what the ego does, and what it costs, by whom it asks at the decision points of a step.
+    """Hold what the ego does, and what it costs, by whom it asks, at the decision points of a step.
 
-    A step has N decision points: all that are as many decisions from the start; `at` (N,) has their
-    indices in the dataset's decision trees. The other axes are S channel seeds, K sets of helpers
-    that could be asked, and C costs (`COSTS`): `action` (S, N, K) is the index of the ego's action
-    if a set is asked, and `costs` (S, N, K, C) what that costs. Where an axis is S x N, as of
-    `intents` (all vehicles' probabilities of actions) and `draws` (the channel's), the first seed's
-    N points come first.
+    A decision point is a situation in which the ego must act, and a step has all N that are equally
+    many decisions from the start. The other axes are S channel seeds, K sets of helpers that could
+    be asked, and C costs (`COSTS`: messages, air time and so on). Where an axis is S x N, the first
+    seed's N points come first.
     """
 
     # indices of the decision points in the forest, the dataset's decision trees, ascending, (N,)
@@ -65,9 +63,9 @@ Choose = Callable[[Level, Floats, Floats], Ints]
 class Choices:
     """Hold what follows at each decision point of a dataset if the ego asks each set of helpers.
 
-    There are K sets of some of H helpers; the empty one, of nobody, is the first. `sets` (K, H)
-    says which helpers are in each, and `levels` has the decision points by step. `forest` has the
-    decision trees: where actions lead, and how each course ends.
+    A decision point is a situation in which the ego must act. There are K sets of some of H
+    helpers; the empty one, of nobody, is the first. With it, any rule for whom to ask can be scored
+    exactly, without asking the model again.
     """
 
     # the dataset's decision trees: every decision point that actions can lead to, and how each
@@ -77,12 +75,12 @@ class Choices:
     levels: tuple[Level, ...]  # the decision points by step, the first step's first
 
     def backwards(self, choose: Choose) -> Iterator[tuple[Level, Floats, Floats, Ints]]:
-        """Yield each level, the last first, with what its sets lead to and the chosen sets.
+        """Yield, for each step from the last to the first, what asking each set of helpers does.
 
-        A set is helpers who are asked together. A level has the decision points of one step. The
-        axes are S channel seeds, N decision points, K sets of helpers and C costs. A tuple has the
-        level, success (S, N, K), 1 or 0, and costs (S, N, K, C) from there to the episode's end,
-        and the indices in `sets` of the chosen sets, (S, N).
+        This is dynamic programming from an episode's end. The axes are S channel seeds, N decision
+        points of the step, K sets of helpers who are asked together, and C costs (`COSTS`). A tuple
+        has the step's level, success (S, N, K), 1 or 0, and costs (S, N, K, C) from there to the
+        episode's end, and the indices in `sets` of the chosen sets, (S, N).
 
         Args:
             choose: returns the index of the set asked in each decision, (S, N), given the level,
@@ -110,10 +108,10 @@ class Choices:
     def played(self, choose: Choose) -> tuple[Floats, Floats]:
         """Return success, (S, E), and costs, (S, E, C), of every episode under the rule `choose`.
 
-        The axes are S channel seeds, E episodes and C costs (`COSTS`). Success is 1 or 0. `choose`
-        is called for each step, the last first, with its N decision points, and the success, (S, N,
-        K), and costs, (S, N, K, C), to which each of K sets of helpers leads; it returns the index
-        of the set to ask, (S, N).
+        A decision point is a situation in which the ego must act. The axes are S channel seeds, E
+        episodes and C costs (`COSTS`). Success is 1 or 0. `choose` is called for each step, the
+        last first, with its N decision points, and the success, (S, N, K), and costs, (S, N, K, C),
+        to which each of K sets of helpers leads; it returns the index of the set to ask, (S, N).
         """
         [*_, (level, ends, spent, k)] = self.backwards(choose)
         root = np.searchsorted(level.at, self.forest.root)
@@ -134,9 +132,10 @@ class Choices:
         return self.played(best)
 
     def index(self, mask: Bools) -> Ints:
-        """Return the index in `sets` of each set of helpers, `(...)`.
+        """Return the index in `sets` of each set of helpers that is given as a mask, `(...)`.
 
-        `mask`, `(..., H)`, says which of the H helpers are in it; it may leave out the last ones.
+        `mask`, `(..., H)`, says which of the H helpers are in the set; it may leave out the last
+        ones.
         """
         helpers = self.sets.shape[1]
         bits = 1 << np.arange(helpers)
@@ -148,14 +147,15 @@ class Choices:
         return places
 
     def scheduled(self, point: OperatingPoint, worths: Sequence[Floats] | None = None) -> Choose:
-        """Return the rule by which an operating point's schedule chooses whom to ask, a function.
+        """Return the rule by which an operating point chooses whom to ask, a function.
 
-        A schedule says what asking each helper is worth, and the operating point above which worth,
-        and how many at most, the ego asks. `worths` is what the method `worths` returned for the
-        point; without it the worth is computed. The function takes a level (the decision points of
-        one step), and the success, (S, N, K), and costs, (S, N, K, C), to which each of K sets of
-        helpers leads, by S channel seeds, N decision points and C costs; it returns the index of
-        the set to ask, (S, N).
+        An operating point is the settings of radio, asking and fusion. Its schedule says what
+        asking each helper is worth, and it has the threshold above which, and how many at most, the
+        ego asks. `worths` is what asking is worth, as the method `worths` returned it for the
+        point; without it that is computed. The function takes a level (the decision points,
+        situations in which the ego must act, of one step), and the success, (S, N, K), and costs,
+        (S, N, K, C), to which each of K sets of helpers leads, by S channel seeds, N decision
+        points and C costs; it returns the index of the set to ask, (S, N).
         """
         lookup = None if worths is None else dict(zip(map(id, self.levels), worths, strict=True))
 
@@ -169,12 +169,12 @@ class Choices:
         return choose
 
     def worths(self, point: OperatingPoint) -> list[Floats]:
-        """Return what asking each helper is worth to the point's schedule, in the schedule's unit.
+        """Return what asking each helper is worth by an operating point's schedule, in its unit.
 
-        The schedule of an operating point is its rule for whom to ask. One array for each level of
-        the decision trees (the decision points that are equally many decisions from the start), `(S
-        x N, H)`: S channel seeds by N decision points, and H helpers; `(S x N, 1)` where the worth
-        is the same for all helpers.
+        An operating point is the settings of radio, asking and fusion, and its schedule the rule
+        for whom to ask. The list has one array for each step, the first first: `(S x N, H)`, for S
+        channel seeds by N decision points (situations in which the ego must act) and H helpers; `(S
+        x N, 1)` where the worth is the same for all helpers.
         """
         return [worth_of(point, level.intents, level.draws) for level in self.levels]
 
@@ -190,11 +190,11 @@ def _values_of(values: Floats, k: Ints) -> Floats:
 def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     """Raise UserError if decisions depend on more than whom the ego hears now.
 
-    Then the oracle, an ego that knows how each episode ends, is not exact. It is so if an operating
-    point has a fusion call (the model is asked again with the messages), a consensus rule with
-    memory, another content of messages than intents (probabilities of actions), or settings by
-    which extensions change messages. `helpers` and `actions` are the numbers of helpers and of
-    meta-actions.
+    Then what each set of helpers leads to cannot be computed apart, and the best choice is not
+    known. It is so if the settings `point` have a fusion call (the model is asked again with the
+    messages), a consensus rule (how messages are fused) with memory, another content of messages
+    than intents (probabilities of actions), or what changes messages. `helpers` and `actions` are
+    the numbers of helpers and of meta-actions.
     """
     name, consensus = printable(point.name), point.fusion.consensus
     if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
@@ -220,12 +220,14 @@ def choices(
     seeds: Sequence[int],
     progress: Callable[[int], None],
 ) -> Choices:
-    """Compute what each set of helpers leads to, at every decision point that any choice leads to.
+    """Compute what asking each set of helpers leads to, in each situation that a choice leads to.
+
+    With the result, rules for whom to ask can be compared without asking the model again.
 
     Args:
         stored: the run whose answers are used; its model is asked for those that it lacks.
-        point: the operating point, on which a decision depends besides scene and model; its limit
-            of helpers counts, and its schedule (whom to ask) does not.
+        point: the operating point (settings of radio, asking and fusion); its limit of helpers
+            counts, and its schedule, the rule for whom to ask, does not.
         seeds: the channel seeds that draws are made from.
         progress: called with 1 for each step.
 

@@ -15,8 +15,8 @@ def always(inputs: ScheduleInputs) -> Floats:
     """Return an infinite worth of asking, the same for every helper, `(..., 1)`.
 
     It is a schedule, a rule for whom the ego asks: those whose worth is above a threshold. So all
-    helpers are always asked, as far as the operating point's limit allows. `inputs` has what the
-    ego knows before it asks, with leading axes `(...)`.
+    helpers are always asked, up to the number that the settings allow. `inputs` has what the ego
+    knows before it asks, with leading axes `(...)`.
     """
     return np.full((*inputs.entropy_nats.shape, 1), np.inf)
 

@@ -38,11 +38,12 @@ THRESHOLDS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 
 
 def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun] = ()) -> str:
-    """Return a run's name, its dataset and the seeds of its layouts (start situations), in words.
+    """Return in words what a run is of: its name, its dataset and the seeds of its layouts.
 
-    `stored` is the run. Raises UserError unless all seeds are for the purpose `wanted`, such as
-    `train`, the layouts are those that the seeds give, and none of them is in one of the `reported`
-    runs, on which results are measured.
+    Layouts are start situations, and their seeds say what they are for. `stored` is the run. Raises
+    UserError unless all seeds are for the purpose `wanted`, such as `train`, the layouts are those
+    that the seeds give, and none of them is in one of the `reported` runs, on which results are
+    measured.
     """
     seeds = stored.dataset.forest.seeds
     first, count = int(seeds.min()), int(seeds.max() - seeds.min()) + 1
@@ -59,14 +60,20 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
 
 
 def gains(tree: Choices, point: OperatingPoint, choose: Choose) -> tuple[Floats, Floats]:
-    """Return what a network learns from: inputs (n, F), and the gains (n,) that it should predict.
+    """Return what a network learns whom to ask from: inputs (n, F), and gains (n,) to predict.
 
     A gain is success if one helper alone is asked, less success if nobody is, -1 to 1, averaged
     over the seeds of the channel. Each of the n rows is a helper that may be asked at a decision
-    point of `tree`, with the F inputs of a learnt schedule (`learnt.INPUTS`), under the operating
-    point `point`. `choose` is the rule for whom the ego asks in the rest of the episode: a function
-    that takes the decision points of a step, and the success and costs to which each set of helpers
-    leads, and returns the index of the set to ask in each.
+    point, a situation in which the ego must act; the F inputs are numbers that the ego knows of it,
+    named by `learnt.INPUTS`.
+
+    Args:
+        tree: the decision points, and what asking each set of helpers leads to.
+        point: the operating point: settings of radio, asking and fusion.
+        choose: the rule for whom the ego asks in the rest of the episode. It takes the N decision
+            points of a step, and the success (S, N, K) and costs (S, N, K, C) to which each of K
+            sets of helpers leads, and returns the index of the set to ask, (S, N), by S channel
+            seeds.
     """
     alone = [tree.index(one_helper) for one_helper in np.eye(tree.sets.shape[1], dtype=bool)]
     rows, targets = [], []
@@ -118,12 +125,12 @@ def fit(x: Floats, y: Floats) -> Network:
 def learn(
     train: Sequence[ReplayedRun], point: OperatingPoint, progress: Callable[[int], None]
 ) -> Network:
-    """Learn a network that predicts the gain in success from asking each helper.
+    """Learn whom to ask: a network that predicts the gain in success from asking each helper.
 
     `train` are runs on layouts (start situations) that are for learning. `point` is the operating
-    point: its limit of helpers holds, and its schedule (its rule for whom to ask) decides in the
-    rest of an episode in the first round, the network in later ones. `progress` is called with 1
-    for each step and round.
+    point (settings of radio, asking and fusion): its limit of helpers holds, and its schedule (its
+    rule for whom to ask) decides in the rest of an episode in the first round, the network in later
+    ones. `progress` is called with 1 for each step and round.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rules = None, [tree.scheduled(point) for tree in trees]
@@ -145,10 +152,11 @@ def learn(
 def by_network(tree: Choices, point: OperatingPoint, network: Network, threshold: float) -> Choose:
     """Return the rule that asks the helpers whose predicted gain in success is above `threshold`.
 
-    It is for the decision points of `tree`, and asks as many helpers as the operating point `point`
-    allows; `network` predicts the gain of each helper alone. The rule is a function that takes the
-    N decision points of a step, and what each of K sets of helpers leads to, which it does not
-    read, and returns the index of the set to ask, (S, N), for S channel seeds.
+    A decision point is a situation in which the ego must act. `network` predicts the gain of each
+    helper alone, -1 to 1. The rule is for the decision points of `tree`, and asks as many helpers
+    as the operating point `point` (settings of radio, asking and fusion) allows. It is a function
+    that takes the N decision points of a step, and what each of K sets of helpers leads to, which
+    it does not read, and returns the index of the set to ask, (S, N), for S channel seeds.
     """
     schedule = Learnt(network, threshold)
     worths = [schedule.worth(known_of(point, level.intents, level.draws)) for level in tree.levels]
@@ -161,12 +169,12 @@ def tuned(
     point: OperatingPoint,
     progress: Callable[[int], None],
 ) -> float:
-    """Return the threshold of predicted gain with the most success; of equal ones the highest.
+    """Return the threshold of predicted gain that gives most success; of equal ones the highest.
 
     A helper is asked if the gain in success that `network` predicts is above the threshold, as far
-    as the operating point `point` allows. `tune` are runs on layouts (start situations) that are
-    for choosing settings. Success is by each run's success rule, averaged over runs. `progress` is
-    called with 1 for each step of a run.
+    as the operating point `point` (settings of radio, asking and fusion) allows. `tune` are runs on
+    layouts (start situations) that are for choosing settings. Success is averaged over runs.
+    `progress` is called with 1 for each step of a run.
     """
     success = np.zeros(len(THRESHOLDS))
     with_outlook = point.changed(schedule="coverage", threshold=None)
@@ -201,20 +209,21 @@ def run_learn(
 ) -> Stated:
     """Learn a schedule, choose its threshold, write its file `out`, and return the file's content.
 
-    A schedule is a rule for whom the ego asks: here those whose predicted gain is above the
-    threshold.
+    A schedule is a rule for whom the ego asks: here those whose predicted gain in success is above
+    the threshold.
 
     Args:
         train: runs on train layouts (start situations), from which the network is learnt.
         tune: runs on tune layouts, on which the threshold is chosen.
-        point: the operating point: its limit of helpers, and the schedule of the first round.
+        point: the operating point (settings of radio, asking and fusion): its limit of helpers, and
+            the schedule of the first round.
         out: the TOML file to write.
         command: the command line that makes the file, which the file states.
         progress: called with 1 for each step and round.
 
     Raises:
         UserError: a run is on layouts for another purpose, or its decisions depend on more than who
-            is heard (see `choices.refuse`).
+            is heard: the model is asked again with messages, or fusion has a memory.
         Unanswered: too many questions got no answer.
     """
     learnt_from = tuple(layouts(stored, "train") for stored in train)

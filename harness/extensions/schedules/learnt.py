@@ -62,10 +62,10 @@ class Network:
 class Learnt:
     """Decide whom the ego asks by the gain in success that a network expects of each helper alone.
 
-    A helper is asked if its gain is above `threshold`, or above the threshold of the condition (the
-    operating point), if that has one. It is a schedule, a rule for whom to ask. `needs` names what
-    it reads beside intents and positions: `outlook`, what each vehicle sees of where a danger may
-    come from.
+    It is a schedule, a rule for whom to ask: a helper is asked if its gain is above `threshold`, or
+    above the threshold of the condition (settings of radio, asking and fusion), if that has one.
+    `needs` names what it reads beside intents and positions: `outlook`, what each vehicle sees of
+    where a danger may come from.
     """
 
     network: Network  # from `inputs` to the gain in success probability
@@ -102,19 +102,18 @@ class Weights:
 class Stated:
     """Hold the content of a schedule's file in `schedules/`: a learnt rule of whom the ego asks.
 
-    `command` made the file. `learnt_from` and `tuned_on` name the runs from which it was learnt and
-    on which `threshold` was chosen, with the seeds of their layouts (start situations), and
-    `condition` the operating point of both. A helper is asked if the gain that the network expects
-    of it is above the threshold; `inputs` names the network's inputs.
+    A helper is asked if the gain in success that the network expects of it is above the threshold.
     """
 
     description: str  # one sentence
     command: str  # the command that made the file
     learnt_from: tuple[str, ...]  # the runs that it was learnt from, with their layout seeds
     tuned_on: tuple[str, ...]  # the runs on which the threshold was chosen, with their layout seeds
-    condition: str  # the operating point under which it was learnt
+    # the settings of radio, asking and fusion under which it was learnt, as they are typed
+    condition: str
     threshold: float  # the schedule's threshold
-    inputs: tuple[str, ...]  # the names of the network's inputs, `INPUTS`
+    # names of the network's inputs, numbers that the ego knows of a helper; must be `INPUTS`
+    inputs: tuple[str, ...]
     network: Weights  # the network's weights
 
     def schedule(self, where: str) -> Learnt:

@@ -54,9 +54,8 @@ FIRST = (PAPER, NEVER, ALWAYS, "margin", "risk", "deadline", "coverage", RANDOM)
 class Candidate:
     """Describe one setting of a schedule: its threshold and how many helpers it asks at most.
 
-    A schedule says what asking each helper is worth in a decision, in its own unit; those worth
-    more than the `threshold` are asked, `most` of them at most. The threshold is None for a
-    schedule without.
+    A schedule is a rule for whom the ego asks. It says what asking each helper is worth in a
+    decision, in its own unit, such as nats of doubt; those worth more than the threshold are asked.
     """
 
     schedule: str  # its name
@@ -65,9 +64,10 @@ class Candidate:
     most: int  # most helpers asked in a decision
 
     def at(self, point: OperatingPoint) -> OperatingPoint:
-        """Return a copy of an operating point that asks by this schedule and setting.
+        """Return a copy of an operating point that asks by this schedule, threshold and limit.
 
-        An operating point is everything a decision depends on besides scene and model.
+        An operating point is the settings of radio, asking and fusion; a schedule is the rule for
+        whom to ask.
         """
         if self.schedule == PAPER and self.threshold is not None:
             changed = point.changed(schedule=PAPER, threshold=None, tau_nats=self.threshold)
@@ -81,12 +81,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Play:
-    """Hold the outcome of one setting of a schedule for S channel seeds and E episodes.
+    """Hold how episodes go, and what they cost, under one setting of a schedule.
 
-    A schedule is a rule for whom the ego asks. `success` (S, E) is 1 or 0. `costs` (S, E, C) has
-    what each episode costs, in the order of `COSTS`: messages, air time (ms), latency (ms),
-    decisions and energy (J). `success_rule` says how success is averaged, such as balanced over
-    layouts with a danger (a vehicle that the ego would meet) and without.
+    A schedule is a rule for whom the ego asks. There are S channel seeds, E episodes and C costs,
+    in the order of `COSTS`: messages, air time (ms), latency (ms), decisions and energy (J).
     """
 
     candidate: Candidate  # the schedule and its setting
@@ -96,14 +94,17 @@ class Play:
 
     @property
     def rate(self) -> float:
-        """Return the mean success of all episodes, 0 to 1, by `success_rule`."""
+        """Return the mean success of all episodes, 0 to 1, averaged as `success_rule` says.
+
+        That is plainly, or balanced over episodes with a danger and without.
+        """
         return self.success_rule.mean(self.success)
 
     def of(self, cost: str) -> Floats:
         """Return one of the costs of each episode, (S, E), for S channel seeds and E episodes.
 
-        `cost` is its name in `COSTS`, such as `messages`; it is summed over the episode's
-        decisions.
+        `cost` is its name in `COSTS`, such as `messages` or `latency_ms`; it is summed over the
+        episode's decisions.
         """
         return np.asarray(self.costs[..., COSTS.index(cost)])
 
@@ -114,10 +115,9 @@ class Play:
 
     @property
     def means(self) -> dict[str, float]:
-        """Return mean costs by name, those of `COSTS` but `decisions`.
+        """Return mean costs by name, such as `messages`, `airtime_ms`, `latency_ms` and `energy_j`.
 
-        They are per episode (messages, air time in ms, energy in J), but latency (ms) is per
-        decision.
+        They are per episode, but latency is per decision.
         """
         of_episode = self.costs.sum(axis=(0, 1)) / self.success.size
         means = dict(zip(COSTS, of_episode.tolist(), strict=True))
@@ -131,8 +131,8 @@ def plays(
     """Play settings of one schedule, which differ in threshold or limit; return their outcomes.
 
     A schedule is a rule for whom to ask. `choices` has what follows from asking each set of
-    helpers, under the operating point `point`; `success_rule` says how success is averaged over
-    episodes. What asking is worth is computed once for all settings.
+    helpers, and `point` is the other settings of radio, asking and fusion; `success_rule` says how
+    success is averaged over episodes. What asking is worth is computed once for all settings.
     """
     worths = choices.worths(candidates[0].at(point))
     rules = [choices.scheduled(candidate.at(point), worths) for candidate in candidates]
@@ -144,8 +144,8 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
     """Return the settings of a schedule to try: thresholds, each with every limit of helpers.
 
     A schedule is a rule for whom to ask, here given by its name; `choices` has what follows from
-    asking under the operating point `point`. The thresholds are deciles of what asking is worth
-    there, the schedule's own, and 0.
+    asking each set of helpers, and `point` is the other settings of radio, asking and fusion. The
+    thresholds are deciles of what asking is worth there, the schedule's own, and 0.
     """
     most = range(1, point.ask.max_helpers + 1)
     usual = point.changed(schedule=schedule, threshold=None)
@@ -159,16 +159,12 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
 
 @dataclass(frozen=True)
 class Chosen:
-    """Compare a schedule, at its chosen setting, with the paper's schedule and the oracle.
+    """Compare a schedule, at its chosen setting, with the paper's and with the best possible one.
 
-    A schedule is a rule for whom to ask. The paper's asks by the entropy of the ego's intent; the
-    oracle is the best that an ego could do which knows how each episode ends. Success is a share of
-    episodes, 0 to 1: `success` by the success rule, `plain` over all episodes alike, `over_paper`
-    and `over_random` less that of the paper's schedule and of asking at random as often. `closed`
-    is the share of the gap from the paper's to the oracle that it closes, `messages` its messages
-    as a share of the paper's. `area` is success averaged over budgets of messages, `area_j` over
-    budgets of energy; a budget is how much an episode may take. `p` is the corrected p-value of no
-    difference from the paper's. Every estimate has an interval over episodes.
+    A schedule is a rule for whom the ego asks. The paper's asks if the ego is in doubt, by the
+    entropy of its answer; the oracle, which bounds all, knows how each episode ends. Success is a
+    share of episodes, 0 to 1; a budget is how much of a cost an episode may take. Every estimate
+    has an interval over episodes.
     """
 
     play: Play  # the setting, with success and costs of every episode
@@ -191,16 +187,13 @@ class Chosen:
 class Compared:
     """Hold all schedules that were compared on one run, with the outcome of every setting.
 
-    A schedule is a rule for whom to ask. `name` says which model, prompt and answer mode, and
-    `names` are the schedules'. All played the same episodes with the same draws of the channel, at
-    the operating point `point`. `plays` has the outcomes by schedule, one for each setting, and
-    `tune` the same on tune layouts, start situations on which settings are chosen; `oracle` is the
-    outcome of an ego that knows how each episode ends. `budget` is the share of the messages of the
-    paper's schedule that a chosen setting may take.
+    A schedule is a rule for whom the ego asks. All played the same episodes with the same draws of
+    the channel, so that differences are paired.
     """
 
     name: str  # the run's model, prompt and answer mode
-    point: OperatingPoint  # the operating point; each play has a schedule of its own in it
+    # settings of radio, asking and fusion; each play has a schedule of its own in it
+    point: OperatingPoint
     names: tuple[str, ...]  # names of the schedules that are compared
     plays: Mapping[str, Sequence[Play]]  # of every candidate, by schedule
     # the same on tune layouts, start situations on which settings are chosen; empty without
@@ -210,16 +203,20 @@ class Compared:
 
     @property
     def paper(self) -> Play:
-        """Return the outcome of the paper's schedule at the operating point's own setting.
+        """Return the outcome of the paper's schedule with its threshold and limit as they are set.
 
-        The paper's schedule asks where the entropy of the ego's intent (its probabilities of
-        actions) is above a threshold.
+        They are those of the run's operating point (settings of radio, asking and fusion). The
+        paper's schedule, a rule for whom to ask, asks where the entropy of the ego's intent (its
+        probabilities of actions) is above a threshold.
         """
         return _at(self.plays[PAPER], self._untuned(PAPER))
 
     @property
     def everybody(self) -> Play:
-        """Return the outcome of always asking all helpers that the operating point allows."""
+        """Return the outcome of always asking all helpers that the operating point allows.
+
+        The operating point is the settings of radio, asking and fusion.
+        """
         return _at(self.plays[ALWAYS], self._untuned(ALWAYS))
 
     def _untuned(self, schedule: str) -> Candidate:
@@ -240,7 +237,8 @@ class Compared:
     def counts(self) -> Ints:
         """Return how often each episode counts in each bootstrap resample, (1 + RESAMPLES, E).
 
-        There are E episodes; the first row has them as played, once each.
+        All intervals of the comparison use the same resamples. There are E episodes; the first row
+        has them as played, once each.
         """
         return self.success_rule.resampled(noise.generator("schedule", "episodes"), RESAMPLES)
 
@@ -264,7 +262,7 @@ class Compared:
 
     @property
     def energy(self) -> bool:
-        """Return whether energy in joules is known."""
+        """Return whether the energy of decisions is known, in joules, so that tables show it."""
         return bool(np.isfinite(self.oracle.means["energy_j"]))
 
     def front(self, schedule: str, cost: str = "messages") -> list[Play]:
@@ -337,16 +335,16 @@ class Compared:
 
     @cached_property
     def regret(self) -> Estimate:
-        """Return the success of the oracle less that of the paper's schedule, paired by episode.
+        """Return how much success better asking could add, at most: the oracle's less the paper's.
 
-        The oracle is an ego that knows how each episode ends; the paper's asks by the entropy of
-        its intent.
+        The oracle is an ego that knows how each episode ends; the paper's schedule (rule for whom
+        to ask) asks by the entropy of the ego's intent. The difference is paired by episode.
         """
         return self.success_rule.difference(self.oracle.success, self.paper.success)
 
     @cached_property
     def rows(self) -> list[Chosen]:
-        """Return the rows to show: the paper's schedule, all compared ones, then the oracle.
+        """Return the rows of the table of schedules: the paper's, all compared ones, the oracle.
 
         A schedule is a rule for whom the ego asks; the paper's asks by the entropy of its answer.
         The oracle is an ego that knows how each episode ends.
@@ -451,12 +449,14 @@ def run_schedules(
     """Compare schedules on runs, each with its run on tune layouts, or without any.
 
     A schedule is a rule for whom the ego asks; tune layouts are start situations for choosing
-    settings.
+    settings. Returns a comparison for each run, with the outcome of every setting of every
+    schedule.
 
     Args:
         runs: the runs whose answers are used.
         tune: a run on tune layouts for each of `runs`, in their order; or none.
-        condition: the operating point, as it is typed, such as `6g:max_helpers=1`.
+        condition: the settings of radio, asking and fusion, as they are typed, such as
+            `6g:max_helpers=1`.
         names: names of the schedules.
         seeds: the channel's seeds.
         budget: share of the messages of the paper's schedule that a chosen setting may take.
@@ -629,16 +629,17 @@ def schedule_study(
 def name_of(row: Chosen) -> str:
     """Return the label of a row, such as `entropy 1, 0.8`: schedule, most helpers and threshold.
 
-    A schedule is a rule for whom the ego asks: those worth more than the threshold.
+    A schedule is a rule for whom the ego asks: the helpers for whom asking is worth more than the
+    threshold. `row` has the comparison of one.
     """
     return f"{row.play.candidate.schedule} {row.play.candidate}"
 
 
 def headline(compared: Compared) -> list[str]:
-    """Return sentences on the oracle's lead over the paper's schedule, and the best schedule.
+    """Return sentences on how much better asking could be done, and which schedule does best.
 
-    The oracle knows how each episode ends; the paper's schedule asks by the entropy of the ego's
-    intent.
+    A schedule is a rule for whom the ego asks. They compare the oracle, an ego that knows how each
+    episode ends, with the paper's schedule, which asks by the entropy of the ego's answer.
     """
     regret, words = compared.regret, compared.success_rule.words
     bound = compared.oracle.means["messages"]
