@@ -15,10 +15,8 @@ from harness.dataset.select import NONE, Choice, Selection, drawn
 class Episodes(Selection):
     """Select the episodes of a run that meet all conditions that are set; None sets none.
 
-    `only` lists numbers and ranges, such as `3,10:20`, which leave out their end. `danger` is the
-    sector (such as `left`) from which the hidden danger comes, or `none`. `sample` is how many to
-    draw at random, with the seed `sample_seed`; a larger sample contains the smaller one.
-    `chosen_by` names the settings that choose this selection.
+    The danger is the vehicle that the ego would meet if it drove on, and a sector, such as `left`,
+    the side from which it comes. `chosen_by` names the settings that choose this selection.
     """
 
     chosen_by: ClassVar[tuple[str, ...]] = ("only", "danger", "sample", "sample_seed")
