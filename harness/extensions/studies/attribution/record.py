@@ -17,14 +17,9 @@ FILE = "attribution.json"
 class LeftOut(Struct, frozen=True, kw_only=True):
     """Hold what changed when one object or message was left out of a prompt or of the fusion.
 
-    An object is a vehicle or the like that a prompt lists; the fusion makes the ego's policy of its
-    own answer and of helpers' messages. Answers and policies are probabilities of actions. `scene`
-    is the decision point's id, `episode` its episode's number, `seed` that of the channel for a
-    message, and `viewer` the vehicle whose answer changes, asked as `ego` or `helper` (`role`;
-    `fusion` for a message). `item` is the object, or the message's sender, and `kind` what it is.
-    `action` was the likeliest with it, `instead` is so without it; `change` is by how much the
-    probability of `action` rises, and `shift` the total variation distance of both. These three are
-    None if that answer failed.
+    It shows what an answer depends on. An object is a vehicle or the like that a prompt lists; the
+    fusion makes the ego's policy of its own answer and of helpers' messages. Answers and policies
+    are probabilities of actions.
     """
 
     scene: str  # id of the decision point
@@ -47,9 +42,9 @@ class LeftOut(Struct, frozen=True, kw_only=True):
 class Attribution(Struct, frozen=True, kw_only=True):
     """Hold the result of leaving out objects and messages of a run, one at a time.
 
-    A sample of `decision_points` situations in which the ego decided was drawn, by the seed
-    `sample_seed`, out of all `of` that the condition (an operating point by its name) has.
-    `left_out` has an item for each object or message.
+    It shows what answers depend on. A sample of decision points, situations in which the ego
+    decided, was drawn from those that the run has under one condition, a named set of settings of
+    radio, asking and fusion.
     """
 
     condition: str  # name of the condition whose decision points were drawn

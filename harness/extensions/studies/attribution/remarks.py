@@ -19,14 +19,15 @@ MOVED = 5  # decision points whose answers moved most
 class Remarks:
     """Tell a run's page what an attribution found: what answers are without an object or message.
 
-    It is an extension's `harness.report.remarks.Remarks`, which the page asks for sentences.
+    Its methods are those of `harness.report.remarks.Remarks`, which the page asks for sentences.
     """
 
     def sentences(self, runs: Runs) -> Iterator[Markup]:
         """Yield a sentence, as HTML, for each of these runs that has an attribution.
 
-        An attribution says what answers become without one object or message. The sentence says how
-        many decision points were drawn, and at which of them answers moved most.
+        A decision point is a situation in which the ego must act. An attribution says what answers
+        become without one object or message. The sentence says how many decision points were drawn,
+        and at which of them answers moved most.
         """
         template = environment(Path(__file__).parent).get_template("remark.html.j2")
         for n, run in enumerate(runs.runs):
@@ -44,8 +45,10 @@ class Remarks:
     def left_out(self, run: Run) -> LeftOut:
         """Return, by decision point's id, the objects and messages left out, what moved most first.
 
-        Each is a dict with the fields of `record.LeftOut`, which say what changed without it, and
-        the `condition` (operating point); the mapping is empty without attribution.
+        A decision point is a situation in which the ego must act. Each item is a dict with the
+        fields of `record.LeftOut`, such as `item`, `action`, `instead` and `shift`, which say what
+        changed without it, and the `condition` (settings of radio, asking and fusion). The mapping
+        is empty for a run without attribution.
         """
         of: dict[str, list[dict[str, Any]]] = {}
         if a := of_run(run):

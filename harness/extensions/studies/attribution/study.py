@@ -66,15 +66,16 @@ class Row:
 
 
 def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> Attribution:
-    """Measure what each listed object and each message heard changes, by leaving it out.
+    """Measure what answers depend on, by leaving out each listed object and each message heard.
 
-    `stored` is the run, and `condition` the name of one of its operating points. At most `sample`
-    of its decision points, situations in which the ego decided, are drawn, by `seed`. Questions
-    that the run has no answer for are put to its model.
+    `stored` is the run, and `condition` the name of one of its operating points (settings of radio,
+    asking and fusion). At most `sample` of its decision points, situations in which the ego
+    decided, are drawn, by `seed`. Items are left out one at a time; questions that the run has no
+    answer for are put to its model. Returns what each item changed in the probabilities of actions.
 
     Raises:
-        UserError: the run has no such condition,
-            or its model is not available or cannot be asked otherwise.
+        UserError: the run has no such condition, or its model is not available or cannot be asked
+            otherwise.
         Unanswered: too many questions got no answer; the run keeps all others.
     """
     for agent in stored.spec.agents:
@@ -112,10 +113,10 @@ def attribute(stored: ReplayedRun, condition: str, sample: int, seed: int) -> At
 def draw(stored: ReplayedRun, condition: str, sample: int, seed: int) -> tuple[dict[str, int], int]:
     """Draw at most `sample` decision points of a condition, and for each a channel seed.
 
-    `stored` is the run, and `condition` the name of one of its operating points. Returns the seed
-    of each decision point by its id, and how many decision points the condition has. All points are
-    equally likely, and so are the seeds of each; `seed` is that of the draw. A larger sample
-    contains a smaller one.
+    A decision point is a situation in which the ego decided. `stored` is the run, and `condition`
+    names settings of radio, asking and fusion in it. Returns the seed of each decision point by its
+    id, and how many decision points there are. All are equally likely, and so are the seeds of
+    each; `seed` is that of the draw. A larger sample contains a smaller one.
     """
     run = stored.run
     here = run.decisions.codes("condition", run.conditions) == run.conditions.index(condition)
@@ -138,7 +139,8 @@ def objects(stored: ReplayedRun, scenes: Sequence[Scene]) -> Iterator[LeftOut]:
 
     Objects are vehicles and the like that a prompt lists; a viewer is the vehicle that is asked.
     This is done for every viewer of these scenes whose prompt lists the object. `stored` is the
-    run, whose model is asked what it has no answer for.
+    run, whose model is asked what it has no answer for. An item says how the probabilities of
+    actions change.
     """
     questions = [each for scene in scenes for each in _questions(stored, scene)]
     whole = requests(stored.spec, scenes)
@@ -197,9 +199,9 @@ def messages(
 ) -> Iterator[LeftOut]:
     """Yield what each message that came in time changes when it is left out of the fusion.
 
-    The fusion makes the ego's policy of its own answer and of messages. `stored` is the run, and
-    `point` the operating point. `drawn` has, by decision point's id, the channel seed of the
-    decision that is taken.
+    The fusion makes the ego's policy (probabilities of actions) of its own answer and of messages.
+    `stored` is the run, and `point` the settings of radio, asking and fusion. `drawn` has the
+    situations to take: by id of the decision point, the channel seed of its decision.
     """
     memory, world = Memory(), FrozenWorld(stored.dataset, [point], stored.seeds)
     for [part] in walk(world, [point], stored, stored.spec.ties):
@@ -305,7 +307,10 @@ def _what(row: Row) -> str:
 
 
 def headline(table: Sequence[Row]) -> str:
-    """Return a sentence on which kind of object or message moved answers most, if that is clear."""
+    """Return a sentence on which kind of object or message moved answers most, if that is clear.
+
+    `table` has a row for each kind, with how much answers change without it.
+    """
     rows = [row for row in table if row.shift.n]
     if not rows:
         return (
@@ -328,7 +333,7 @@ def headline(table: Sequence[Row]) -> str:
 
 
 def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
-    """Return the study of an attribution, for the terminal and `--json`.
+    """Return the study of an attribution, tables and sentences for the terminal and `--json`.
 
     `result` has what the answers become without one object or message, and `run` is the run whose
     answers they are.
@@ -379,7 +384,8 @@ def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
 def write(result: Attribution, run: Path) -> Path:
     """Write an attribution to its file in a run's folder, and return the file's path.
 
-    An attribution says what answers become without one object or message.
+    An attribution, here `result`, says what answers become without one object or message. `run` is
+    the folder.
     """
     write_whole(run / FILE, msgspec.json.format(msgspec.json.encode(result), indent=1) + b"\n")
     return run / FILE

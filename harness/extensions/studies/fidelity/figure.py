@@ -19,7 +19,7 @@ def scatter(table: "pd.DataFrame", models: Sequence[str]) -> Figure:
     """Draw closed-loop over frozen success, a point a model and condition, with 95 % intervals.
 
     Closed loop means driven in the simulator, frozen means decided on recorded scenes. A condition
-    is an operating point by its name.
+    is a set of settings of radio, asking and fusion, by its name.
 
     Args:
         table: `Fidelity.table`, a row a point.

@@ -43,10 +43,11 @@ class Fidelity:
     """Hold the comparison of success on frozen scenes with success in closed loop.
 
     On frozen scenes, models decide at recorded points; in closed loop they drive in the simulator.
-    A condition is an operating point by its name. `table` has a row for each model, prompt, answer
-    mode and condition, with both rates (`frozen`, `closed`), their `difference` and the share of
-    episodes that end alike (`agreement`); `episodes` one for each episode, condition and seed.
-    `rank` is Spearman's correlation of both rates over `ranked` rows, NaN for too few.
+    A condition is a set of settings of radio, asking and fusion, by its name. `table` has a row for
+    each model, prompt, answer mode and condition, with both rates (`frozen`, `closed`), their
+    `difference` and the share of episodes that end alike (`agreement`); `episodes` one for each
+    episode, condition and seed. `rank` is Spearman's correlation of both rates over `ranked` rows,
+    NaN for too few.
     """
 
     # a row a model, prompt, answer mode and condition: `frozen`, `closed`, `difference` (frozen
@@ -65,8 +66,8 @@ class Fidelity:
 def fidelity(runs: Sequence[Path]) -> Fidelity:
     """Compare runs of `harness eval` (frozen scenes) with runs of `harness drive` (closed loop).
 
-    `runs` are their folders. They are paired by episode, channel seed and condition (operating
-    point).
+    `runs` are their folders. They are paired by episode, channel seed and condition (settings of
+    radio, asking and fusion).
 
     Raises:
         UserError: a folder is no run, a kind of run is missing, two runs have the same episodes, or
@@ -166,8 +167,8 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
 
     The worlds are frozen (recorded) scenes and the closed loop (driven in the simulator). `both` is
     `Fidelity.episodes`. The table has a row for each model, prompt, answer mode, condition
-    (operating point), `frozen_end` and `closed_end` (`success` or a failure), with `count`, the
-    most frequent first.
+    (settings of radio, asking and fusion), `frozen_end` and `closed_end` (`success` or a failure),
+    with `count`, the most frequent first.
     """
     ends = both.assign(
         frozen_end=both.failure_frozen.where(~both.success_frozen, "success"),
@@ -180,9 +181,10 @@ def disagreements(both: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
-    """Return the study (table, figure and sentences) of a comparison of frozen and driven runs.
+    """Return the study (table, figure and sentences) that compares frozen with driven runs.
 
-    `runs` are the folders that it names as sources.
+    Frozen runs decide on recorded scenes, driven ones in the simulator. `result` has the comparison
+    of their success, and `runs` are the folders that the study names as sources.
     """
     from harness.studies.study import Study, percent
 
@@ -227,7 +229,11 @@ def _scatter(result: Fidelity) -> "Figure":
 
 
 def headline(result: Fidelity) -> list[str]:
-    """Return sentences on the largest difference, and the rank correlation or why there is none."""
+    """Return sentences on how far success on recorded scenes is from that in the simulator.
+
+    They name the largest difference, and the rank correlation or why there is none. `result` has
+    the comparison of both.
+    """
     rows: list[dict[Any, Any]] = result.table.to_dict("records")
     worst = max(rows, key=lambda row: abs(row["difference"]))
     points, low, high = (100 * worst[f"difference{end}"] for end in ENDS)

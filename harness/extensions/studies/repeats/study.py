@@ -51,8 +51,8 @@ STATED, SAMPLED, DOUBT = "stated_entropy_nats", "sampled_entropy_nats", "stated_
 def each(spec: Spec, repeats: int) -> dict[str, Spec]:
     """Return the evaluations of several repeats by folder name, each with the next sampling seed.
 
-    The sampling seed is that of the model's answers. `spec` is the first of them; the others differ
-    from it in nothing else.
+    A repeat is a run that differs from others only in the random sampling of the model's answers,
+    which the sampling seed determines. `spec` is the first of them.
     """
     first = spec.settings.sampling_seed
     return {f"repeat-{n + 1}": spec.changed(sampling_seed=first + n) for n in range(repeats)}
@@ -65,11 +65,11 @@ def run_repeats(
     progress: Progress,
     cache_file: Path | None,
 ) -> "Repeats":
-    """Evaluate every repeat in a folder of its own under `out`; finished ones are kept.
+    """Evaluate every repeat in a folder of its own under `out`, and return their runs.
 
     A repeat differs from others only in the random sampling of the model's answers: `spec` is the
-    first of `repeats`. `progress` is called with the number of items just done in a run.
-    `cache_file` keeps completions between runs; None for no cache.
+    first of `repeats`. Finished ones are kept. `progress` is called with the number of items just
+    done in a run. `cache_file` keeps completions between runs; None for no cache.
 
     Raises:
         UserError: the folder holds something else, or a model is not available.
@@ -85,14 +85,15 @@ def run_repeats(
 class Wavering(NamedTuple):
     """Hold a decision point at which repeats, runs that differ by chance alone, act differently.
 
-    `flips` is the share, 0 to 1, of pairs of repeats that take different actions there under the
-    `condition`, an operating point by its name; `actions` is how often each was taken, by its name.
+    A decision point is a situation in which the ego must act.
     """
 
     scene: str  # id of the decision point
-    condition: str  # name of the operating point
+    # name of the settings of radio, asking and fusion
+    condition: str
     flips: float  # share of pairs of repeats that take different actions there, 0 to 1
-    actions: dict[str, int]  # how often each action was taken
+    # how often each action was taken, by its name
+    actions: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -114,17 +115,21 @@ class Repeats:
 
     @property
     def k(self) -> int:
-        """Return the number of repeats."""
+        """Return how many runs there are that differ only in the sampling of answers."""
         return len(self.runs)
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Return the names of the conditions (operating points)."""
+        """Return the names of the runs' conditions: settings of radio, asking and fusion."""
         return self.runs[0].conditions
 
     @cached_property
     def scores(self) -> tuple[Score, ...]:
-        """Return all metrics of the repeats, with intervals over episodes, like a run's summary."""
+        """Return all metrics of the repeats together, with intervals over episodes.
+
+        A score has the estimate of one metric under one condition (settings of radio, asking and
+        fusion).
+        """
         scores = []
         for place, condition in enumerate(self.conditions):
             for metric, estimate in self._of_condition(place):
@@ -136,7 +141,8 @@ class Repeats:
     def estimate(self, condition: str, metric: str) -> Estimate:
         """Return a metric's estimate in a condition, with its interval over episodes.
 
-        Both are names, the condition that of an operating point. It is NaN where it is unknown.
+        Both are names; the condition is a set of settings of radio, asking and fusion. It is NaN
+        where it is unknown.
         """
         key = (condition, metric)
         return next(s.estimate for s in self.scores if (s.condition, s.metric) == key)
@@ -185,9 +191,10 @@ class Repeats:
         return scenes, counts, episodes
 
     def wavering(self, most: int) -> list[Wavering]:
-        """Return up to `most` decision points at which repeats act differently, most pairs first.
+        """Return up to `most` decision points at which repeats act differently, most divided first.
 
-        Pairs are those of repeats that take different actions.
+        A repeat is a run that differs from others by chance alone; a decision point is a situation
+        in which the ego decides.
         """
         scenes, counts, _ = self._actions
         shares = np.nan_to_num(known_mean(flips(counts), axis=-1))
@@ -202,9 +209,10 @@ class Repeats:
         return [point for point in points if point.flips > 0]
 
     def copies(self) -> Iterator[str]:
-        """Yield a sentence for each group of repeats whose answers are identical texts.
+        """Yield a sentence of warning for each group of repeats whose answers are identical texts.
 
-        Then chance changed nothing, or one run is a copy of the other.
+        A repeat is a run that differs by sampling alone. Then chance changed nothing, or one run is
+        a copy of the other.
         """
         alike: dict[frozenset[tuple[str, str]], list[str]] = {}
         for run in self.runs:
@@ -240,9 +248,10 @@ class Repeats:
 
 
 def flips(counts: Ints) -> Floats:
-    """Return the share of pairs of repeats with different actions, (...); NaN without any pair.
+    """Return how often chance changes a decision: the share of pairs of repeats that differ, (...).
 
-    `counts` (..., A) is the number of repeats that took each of A actions.
+    A repeat is a run that differs by sampling alone. `counts` (..., A) is the number of repeats
+    that took each of A actions in a decision. NaN without any pair.
     """
     n = counts.sum(axis=-1)
     pairs, same = n * (n - 1), (counts * (counts - 1)).sum(axis=-1)
@@ -252,26 +261,28 @@ def flips(counts: Ints) -> Floats:
 def stable(counts: Ints) -> Floats:
     """Return 1 where all repeats took the same action, else 0, (...); NaN for fewer than two.
 
-    `counts` (..., A) is the number of repeats that took each of A actions.
+    A repeat is a run that differs by sampling alone. `counts` (..., A) is the number of repeats
+    that took each of A actions in a decision.
     """
     n = counts.sum(axis=-1)
     return np.where(n > 1, counts.max(axis=-1) == n, np.nan)
 
 
 def all_of(wins: Floats, k: int, j: int) -> Floats:
-    """Return pass^j: the probability that j of k repeats, drawn without replacement, all succeed.
+    """Return pass^j: the probability that j repeats of an episode, drawn of its k, all succeed.
 
-    `wins` is the number of successes among the k repeats, `(...)`; the result has its shape. It is
-    for each episode by itself.
+    A repeat differs by chance alone, and draws are without replacement. `wins` is the number of
+    successes among the k repeats of an episode, `(...)`; the result has its shape.
     """
     return np.asarray(_choose(wins, j) / math.comb(k, j))
 
 
 def any_of(wins: Floats, k: int, j: int) -> Floats:
-    """Return any@j: the probability that one or more of j of k repeats succeed.
+    """Return any@j: the probability that one or more of j repeats of an episode succeed.
 
-    The j are drawn without replacement. It is the unbiased estimate of pass@k (Chen et al. 2021).
-    `wins` is the number of successes among the k repeats, `(...)`; the result has its shape.
+    A repeat differs by chance alone; the j are drawn of k without replacement. It is the unbiased
+    estimate of pass@k (Chen et al. 2021). `wins` is the number of successes among the k repeats of
+    an episode, `(...)`; the result has its shape.
     """
     return 1 - all_of(k - wins, k, j)
 
@@ -458,12 +469,15 @@ def _tables(repeats: Repeats) -> Iterator[Table]:
 
 
 def nats(e: Estimate) -> str:
-    """Return an entropy with its interval as text; a dash where it is unknown."""
+    """Return an entropy in nats with its interval as text; a dash where it is unknown."""
     return interval_of(e, NATS)
 
 
 def headline(repeats: Repeats) -> list[str]:
-    """Return sentences on how often decisions differ between repeats, on success and entropy."""
+    """Return sentences on how far chance moves results: decisions, success and entropy.
+
+    `repeats` are runs that differ only in the random sampling of the model's answers.
+    """
     return [_flip_sentence(repeats), *_variance_sentence(repeats), *_entropy_sentence(repeats)]
 
 

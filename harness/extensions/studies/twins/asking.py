@@ -37,13 +37,13 @@ Asked = tuple[Twin, str, Request, Request]  # the role, the question and its twi
 class Questions:
     """Describe what is asked in a study of twins: a model, decision points, and their twins.
 
-    A twin is the same question put another way, to which the answer is known to be related. `spec`
-    is the evaluation, with the model, the prompt and the episodes. `twins` has names of kinds of
-    twins, and `seed` is that of the draw of decision points.
+    A decision point is a situation in which the ego must act. A twin is the same question put
+    another way, to which the answer is known to be related.
     """
 
     spec: Spec  # the evaluation: model, prompt, answer mode and episodes
-    twins: tuple[str, ...]  # names of the twins
+    # names of the kinds of twins, such as `mirrored`
+    twins: tuple[str, ...]
     seed: int  # seed of the draw of decision points
 
     def __post_init__(self) -> None:
@@ -63,22 +63,24 @@ class Questions:
     def lacks(self, names: Sequence[str]) -> str:
         """Return in words what each of these twins needs to apply, such as a language model.
 
-        A twin is a question put another way; `names` are those of kinds of twins.
+        A twin is a question put another way, to test whether the answer stays; `names` are those of
+        kinds of twins.
         """
         needs = ((name, lack(self.spec, TWINS[name]) or TWINS[name].needs) for name in names)
         return "; ".join(f"{name} needs {what}" for name, what in needs)
 
     @property
     def dataset(self) -> Dataset:
-        """Return the dataset of the drawn episodes."""
+        """Return the dataset of the episodes from which decision points are drawn."""
         assert isinstance(self.spec.source, FrozenSource)
         return self.spec.source.dataset
 
     def points(self) -> dict[int, list[str]]:
         """Draw a decision point for each step of each episode; return their ids by episode number.
 
-        Only points that a reference driver (a rule that needs no model) visits are drawn. The ids
-        of an episode are in the order of its steps.
+        A decision point is a situation in which the ego must act. Only points that a reference
+        driver (a rule that needs no model) visits are drawn. The ids of an episode are in the order
+        of its steps.
         """
         forest = self.dataset.forest
         drawn: dict[int, dict[int, str]] = {}  # by episode and step
@@ -96,7 +98,10 @@ class Questions:
         return points
 
     def count(self) -> int:
-        """Return how many decision points are drawn in all."""
+        """Return how many decision points are drawn in all.
+
+        A decision point is a situation in which the ego must act.
+        """
         return sum(map(len, self.points().values()))
 
     def begin(self, identity: str) -> work.WorkStart:
@@ -114,7 +119,10 @@ class Questions:
         return work.WorkStart(settings=msgspec.json.decode(msgspec.json.encode(settings)))
 
     def goes_on(self, out: Path) -> bool:
-        """Return whether the folder `out` has this study, stopped, with no process on it."""
+        """Return whether the folder `out` holds this study, stopped, with no process on it.
+
+        Then it can be continued.
+        """
         try:
             left = work.start_of(out, work.WorkStart)
             if work.idle(out):
@@ -150,7 +158,8 @@ def ask(
 ) -> tuple[list[Pair], str]:
     """Ask a model about decision points and their twins; any number of workers gives the same.
 
-    A twin is the same question put another way. A stopped study in the folder `out` goes on.
+    A decision point is a situation in which the ego must act, and a twin the same question put
+    another way. A stopped study in the folder `out` goes on.
 
     Args:
         questions: the model, the decision points and the twins.

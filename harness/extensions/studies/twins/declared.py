@@ -44,14 +44,12 @@ LANES = {"LANE_LEFT": "LANE_RIGHT", "LANE_RIGHT": "LANE_LEFT"}
 class Twin:
     """Describe one change of a question, and how the answers to both versions must agree.
 
-    A twin is the question put another way. It changes the scene graph (what the asked vehicle knows
-    of the scene: `graph`, or `view` for a driver that reads no text), the `text`, the `image` or
-    the `senders` of messages, by the functions that are not None; each gets the original and
-    returns the changed one. Both answers, distributions over actions, must have the same likeliest
-    action, or be `within` a total variation distance. `actions` gives the question's name for an
-    action that the twin calls otherwise. `name` is what commands call it, `says` what it changes,
-    in words, and `needs` what it needs to apply; `modes` are the answer modes in which it does.
-    `constant` says whether an ego that always gives the same answer agrees with itself.
+    A twin is the question put another way, to test whether the answer stays. It changes the scene
+    graph (what the asked vehicle knows of the scene), the text, the picture or the senders of
+    messages, by the functions that are not None; each takes the original last, and returns the
+    changed one. `spec` is the evaluation and `scene` the situation, for those that need them. Both
+    answers are distributions over actions: they must have the same likeliest action, or differ by
+    no more than a total variation distance.
     """
 
     name: str  # how commands call it
@@ -97,10 +95,11 @@ class Twin:
 
 
 def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
-    """Return a copy of a record in which each leaf value is replaced by `leaf(key, value)`.
+    """Return a copy of a record in which each leaf value is replaced by what a function returns.
 
     `value` is a msgspec struct; its leaves are the values in it, and in structs and tuples in it,
-    that are neither. The key is the name of the field; values in a tuple have the key of the tuple.
+    that are neither. `leaf` takes the key and the value of a leaf. The key is the name of the
+    field; values in a tuple have the key of the tuple. `key` is that of `value` itself.
     """
     if isinstance(value, Struct):
         values = {name: getattr(value, name) for name in value.__struct_fields__}
@@ -111,11 +110,11 @@ def changed(value: Any, leaf: Leaf, key: str = "") -> Any:
 
 
 def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph with left and right swapped: a change that makes a twin of a question.
+    """Return a scene graph with left and right swapped, for a twin of a question.
 
-    A twin is a question put another way. A scene graph is what the asked vehicle knows of the
-    scene. It is unchanged if the scenario of the evaluation `spec` may not be mirrored, or its road
-    lacks a mirrored path. `scene` is not read.
+    A twin is the question put another way, to test whether the answer stays, mirrored. A scene
+    graph is what the asked vehicle knows of the scene. It is unchanged if the scenario of the
+    evaluation `spec` may not be mirrored, or its road lacks a mirrored path. `scene` is not read.
     """
     if spec.scenario.one_sided is not None:
         return graph
@@ -127,8 +126,9 @@ def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 def swapped(graph: SceneGraph) -> SceneGraph:
     """Return a scene graph with left and right swapped in positions, headings and words.
 
-    A scene graph is what the asked vehicle knows of the scene. Sectors, from which a danger may
-    come, stay in the order that they had.
+    It is what the mirrored question of a twin shows: a question put another way. A scene graph is
+    what the asked vehicle knows of the scene. Sectors, the sides from which a vehicle that the ego
+    would meet may come, stay in the order that they had.
     """
 
     def leaf(key: str, value: Any) -> Any:
@@ -148,15 +148,19 @@ def swapped(graph: SceneGraph) -> SceneGraph:
 
 
 def flipped(image: Image) -> Image:
-    """Return a camera picture mirrored left to right, as the mirrored scene would look."""
+    """Return a camera picture mirrored left to right, as the mirrored scene would look.
+
+    It is the picture of a twin, the same question put another way.
+    """
     return Image(np.ascontiguousarray(image.pixels[:, ::-1]))
 
 
 def permuted_ids(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph in which every vehicle has the id of another.
+    """Return a scene graph in which every vehicle has the id of another, for a twin of a question.
 
-    It is what one vehicle of `scene` knows; all graphs of the scene are renamed alike. `spec` is
-    the evaluation, not read.
+    A twin is the question put another way, to test whether the answer stays. `graph` is what one
+    vehicle of `scene` knows; all graphs of the scene are renamed alike. `spec` is the evaluation,
+    not read.
     """
     ids = [vehicle.id for vehicle in scene.state.vehicles]
     order = noise.generator("twins", "ids", scene.id).permutation(len(ids)).tolist()
@@ -172,10 +176,11 @@ NAMES = ("id", "vehicle", "viewer", "by")
 
 
 def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph with distances (m) and speeds (m/s) in whole numbers.
+    """Return a scene graph with whole metres and m/s, for a twin of a question.
 
-    It is what one vehicle knows. The visible share of a sector has one decimal. Times stay: half a
-    second decides conflicts. `spec` and `scene` are not read.
+    A twin is the question put another way, to test whether the answer stays. `graph` is what one
+    vehicle knows. The visible share of a sector (a side from which a danger may come) has one
+    decimal. Times stay: half a second decides conflicts. `spec` and `scene` are not read.
     """
 
     def leaf(key: str, value: Any) -> Any:
@@ -188,11 +193,11 @@ def rounded(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 
 
 def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph with one more vehicle, parked off the road.
+    """Return a scene graph with one more vehicle, parked off the road, for a twin of a question.
 
-    The graph is what one vehicle (the viewer) of `scene` knows, in a scenario of the evaluation
-    `spec`. The new one is at least 100 m from the viewer, and 65 m from the conflict zone, where
-    paths meet.
+    A twin is the question put another way, to test whether the answer stays. `graph` is what one
+    vehicle (the viewer) of `scene` knows, in a scenario of the evaluation `spec`. The new one is at
+    least 100 m from the viewer, and 65 m from the conflict zone, where paths meet.
     """
     away = max(FAR_M, CLEAR_M + graph.itself.zone_m)
     ahead = graph.ego.forward_m < 0  # the other way than the ego; behind the ego itself
@@ -215,10 +220,11 @@ def far_vehicle(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 
 
 def jittered(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph whose measured distances have the sensors' noise added once more.
+    """Return a scene graph whose distances have the sensors' noise added again, for a twin.
 
-    It is what one vehicle (the viewer) of `scene` knows, in a scenario of the evaluation `spec`.
-    The noise is Gaussian, in metres, keyed by scene and viewer.
+    A twin is the question put another way, to test whether the answer stays. `graph` is what one
+    vehicle (the viewer) of `scene` knows, in a scenario of the evaluation `spec`. The noise is
+    Gaussian, in metres, keyed by scene and viewer.
     """
     draws = noise.generator("twins", "jitter", scene.id, graph.viewer)
     nodes, moved_m = [], {}
@@ -244,9 +250,11 @@ def _farther(conflict: Conflict, by_m: float | None) -> Conflict:
 
 
 def reversed_lines(spec: Spec, request: Request) -> Request:
-    """Return a request in whose texts runs of lines about vehicles are in reverse order.
+    """Return a request whose lines about vehicles are in reverse order, for a twin of a question.
 
-    A request is what a model is sent. `spec` is the evaluation, not read.
+    A twin is the question put another way, to test whether the answer stays. A request is what a
+    model is sent; each run of such lines in its texts is reversed. `spec` is the evaluation, not
+    read.
     """
 
     def turned(run: re.Match[str]) -> str:
@@ -256,18 +264,20 @@ def reversed_lines(spec: Spec, request: Request) -> Request:
 
 
 def reversed_lists(graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph with its objects and its conflicts in reverse order.
+    """Return a scene graph with its objects and its conflicts in reverse order, for a twin.
 
-    It is what one vehicle knows of a scene, as a driver that reads no text gets it.
+    A twin is the question put another way, to test whether the answer stays. `graph` is what one
+    vehicle knows of a scene, as a driver that reads no text gets it.
     """
     return replace(graph, nodes=graph.nodes[::-1], conflicts=graph.conflicts[::-1])
 
 
 def in_feet(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
-    """Return a scene graph with distances in feet and speeds in km/h.
+    """Return a scene graph with distances in feet and speeds in km/h, for a twin of a question.
 
-    It is what one vehicle knows of a scene. It is unchanged if the words for the units in the
-    prompt of the evaluation `spec` cannot be replaced. `scene` is not read.
+    A twin is the question put another way, to test whether the answer stays. `graph` is what one
+    vehicle knows of a scene. It is unchanged if the words for the units in the prompt of the
+    evaluation `spec` cannot be replaced. `scene` is not read.
     """
     return changed(graph, _in_feet) if _says_units(spec, graph.role) else graph
 
@@ -301,10 +311,11 @@ def _speeds(spec: Spec, factor: float) -> str:
 
 
 def other_units(spec: Spec, request: Request) -> Request:
-    """Return a request whose texts say feet and km/h, with the target speeds converted.
+    """Return a request whose texts say feet and km/h, for a twin of a question.
 
-    A request is what a model is sent. It is unchanged if the words for the units in the prompt of
-    the evaluation `spec` cannot be replaced.
+    A twin is the question put another way, to test whether the answer stays. A request is what a
+    model is sent; target speeds in it are converted. It is unchanged if the words for the units in
+    the prompt of the evaluation `spec` cannot be replaced.
     """
     if not _says_units(spec, request.role):
         return request
@@ -319,10 +330,11 @@ def other_units(spec: Spec, request: Request) -> Request:
 
 
 def paraphrased(spec: Spec, request: Request) -> Request:
-    """Return a request in which sentences are replaced by others of the same meaning.
+    """Return a request in which sentences are replaced by others of the same meaning, for a twin.
 
-    The others are those of `paraphrases`. A request is what a model is sent. `spec` is the
-    evaluation, not read.
+    A twin is the question put another way, to test whether the answer stays. A request is what a
+    model is sent; the file `paraphrases.toml` has the sentences. `spec` is the evaluation, not
+    read.
     """
 
     def reworded(text: str) -> str:
@@ -341,9 +353,11 @@ def paraphrases() -> dict[str, str]:
 
 
 def reordered_keys(spec: Spec, request: Request) -> Request:
-    """Return a request in which JSON objects that the prompt shows have their keys reversed.
+    """Return a request whose JSON objects have their keys in reverse order, for a twin.
 
-    A request is what a model is sent. `spec` is the evaluation that asks.
+    A twin is the question put another way, to test whether the answer stays. A request is what a
+    model is sent, and the objects are those that its prompt shows. `spec` is the evaluation that
+    asks.
     """
     return _reworded(request, _reversed_members)
 
@@ -378,10 +392,11 @@ def _closing(text: str, start: int) -> int:
 
 
 def permuted_letters(spec: Spec, request: Request) -> Request:
-    """Return a read-out request in which each letter stands for the next action, cyclically.
+    """Return a read-out request in which each letter stands for the next action, for a twin.
 
-    In a read-out, a model answers with one letter for an action. `spec` is the evaluation that
-    asks.
+    A twin is the question put another way, to test whether the answer stays. In a read-out, a model
+    answers with one letter for an action; the last letter gets the first action. `spec` is the
+    evaluation that asks.
     """
     moved = (*request.actions[-1:], *request.actions[:-1])
     letters = readout.letters(moved)

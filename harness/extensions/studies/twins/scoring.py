@@ -20,11 +20,8 @@ ROUNDING = 1e-9
 class Pair:
     """Hold the answers to a question and to its twin, the same question put another way.
 
-    An answer is a distribution over A actions, (A,): `p` is the question's and `q` the twin's, None
-    where it failed. The twin says how both must be related: the same likeliest action, or a total
-    variation `distance` of at most so much; `holds` says whether they are. `role` and `viewer` say
-    who was asked: `ego`, `helper` or `fusion`, and the vehicle's id. `said` has the raw texts of
-    both answers, `status` how parsing them went, and `messages` the texts of both questions.
+    An answer is a distribution over A actions, (A,). The twin says how both must be related: the
+    same likeliest action, or a total variation distance of at most so much.
     """
 
     twin: str  # name of the twin
@@ -45,12 +42,10 @@ class Pair:
 
 @dataclass(frozen=True)
 class Row:
-    """Hold the result of one twin in one role (who was asked), over all its pairs of answers.
+    """Hold how often answers stay the same if a question is put another way, for one such change.
 
-    A twin is a question put another way. A pair holds if its two answers are related as the twin
-    demands: `invariance_rate` is the share that does, `tv_distance` the mean total variation
-    distance, and `failed_rate` the share in which an answer failed. `broken` has the pairs that do
-    not hold, the farthest apart first; `episodes` is how many the pairs are of.
+    The change is a twin, and a role who was asked. A pair has the answers to both versions, and
+    holds if they are related as the twin demands, such as by the same likeliest action.
     """
 
     twin: Twin  # how the questions were changed
@@ -65,9 +60,10 @@ class Row:
 
 
 def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | None:
-    """Return the total variation distance of two distributions, 0 to 1; None if one is missing.
+    """Return the total variation distance of two answers, 0 to 1; None if one is missing.
 
-    Each has the probabilities of the same A actions, (A,).
+    An answer is a distribution over A actions, (A,): `p` to a question, and `q` to it put another
+    way.
     """
     return float(np.abs(np.subtract(p, q)).sum() / 2) if p and q else None
 
@@ -75,8 +71,9 @@ def distance(p: Sequence[float] | None, q: Sequence[float] | None) -> float | No
 def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bool:
     """Return whether two answers (A,) are related as a twin demands; false if one is missing.
 
-    A twin is a question put another way. Answers are distributions over A actions, and must be
-    within a total variation distance of each other, or have the same likeliest action.
+    A twin is a question put another way. `p` is the answer to the question and `q` that to the
+    twin, distributions over A actions; they must be within a total variation distance of each
+    other, or have the same likeliest action.
     """
     if not p or not q:
         return False
@@ -86,9 +83,10 @@ def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bo
 
 
 def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
-    """Return a row of results for each twin and role that has pairs, in the order of the twins.
+    """Return the results of a study of twins: a row for each twin and role, in their order.
 
-    A twin is a question put another way, and a pair the answers to both versions.
+    A twin is a question put another way, a role is who was asked, and a pair has the answers to
+    both versions. Twins without a pair have no row.
     """
     by_place: dict[tuple[str, str], list[Pair]] = {}  # by twin and role
     for pair in pairs:
@@ -140,10 +138,11 @@ def headline(table: Sequence[Row]) -> str:
 
 
 def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
-    """Test a gate, a condition typed with `--fail-if`, on the rows of the twin that it names.
+    """Test a gate, a limit that the user typed with `--fail-if`, on a study of twins' results.
 
-    A twin is a question put another way. The verdict says whether the gate fails, and in which
-    rows. If it names no twin, all rows of `table` are tested.
+    A twin is a question put another way, and a row the result of one twin in one role (who was
+    asked). The gate names a figure and a limit, and perhaps a twin; without one, all rows of
+    `table` are tested. The verdict says whether the gate fails, and in which rows.
 
     Raises:
         UserError: the named twin has no row, or the number that is tested is unknown.

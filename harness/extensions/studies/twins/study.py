@@ -61,9 +61,9 @@ def twins_study(
 ) -> Study:
     """Return the study of twins (questions put another way) for page, terminal and `--json`.
 
-    `questions` says what was asked, and `rows` have the results by twin and role. `verdicts` are
-    those of the gates, conditions that the user set on results; `unanswered` says in words which
-    questions got no answer.
+    `questions` says what was asked, and `rows` have the results by twin and role (who was asked).
+    `verdicts` are those of the gates, limits that the user set with `--fail-if`; `unanswered` says
+    in words which questions got no answer.
     """
     answer, spec = mapping(questions, rows, verdicts, unanswered), questions.spec
     return Study(
@@ -159,10 +159,10 @@ def mapping(
     """Return the result of a study of twins as plain values, with null for unknown numbers.
 
     A twin is a question put another way. `questions` says what was asked, `rows` have the results
-    by twin and role (who was asked), `verdicts` those of the gates that the user set with
+    by twin and role (who was asked), `verdicts` those of the gates, limits that the user set with
     `--fail-if`, and `unanswered` says in words which questions got no answer. In the dict `rows`
-    have each twin and role with the three metrics, `left_out` the twins that no question has, and
-    `gates` the verdicts.
+    have each twin and role with the share of pairs that hold, the distance of their answers and the
+    share that failed; `left_out` has the twins that no question has, and `gates` the verdicts.
     """
     table, gates = list[dict[str, Any]](), list[dict[str, Any]]()
     for row in rows:
@@ -226,10 +226,12 @@ def notes(questions: Questions, rows: Sequence[Row], unanswered: str = "") -> li
 
 
 def constant_holds(questions: Questions, twin: Twin) -> bool:
-    """Return whether a twin's demand is met by an ego that always gives the same answer.
+    """Return whether an ego that always gives the same answer would pass a twin's test.
 
-    A twin demands how the answers to both versions of a question are related. If the letters of a
-    read-out are asked in cyclic orders it is met: one letter then is every action alike.
+    A twin is a question put another way, and its test how the answers to both versions must be
+    related. Such an ego reads nothing, so its passing is no merit. If letters that stand for
+    actions are asked in several orders and averaged, it always passes: one letter then stands for
+    every action alike.
     """
     return twin.constant or questions.spec.ego.letters == "cyclic"
 
