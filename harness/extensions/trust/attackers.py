@@ -28,9 +28,9 @@ from harness.radio.fading import Trips
 class Attackers:
     """Play the attackers of one condition: helpers that send something else than they intend.
 
-    A condition is an operating point. It is made from the attacks, in the order in which they act,
-    and remembers what helpers intended at past steps, which some repeat. It is a `Speaker`, the
-    part of a condition that says what helpers send.
+    A condition is an operating point: settings of radio, asking and fusion. It is made from the
+    attacks, in the order in which they act, and remembers what helpers intended at past steps,
+    which some attacks repeat. It is a `Speaker`, which says what helpers send.
     """
 
     def __init__(self, attacks: Sequence[Attack]) -> None:

@@ -41,7 +41,8 @@ class Turn:
     `truth` has what every vehicle truly intends now, and `attackers` (n, H) says which helpers
     attack. `first` (n, H, A) is each helper's intent at the episode's first step, and `past` (n, K,
     H, A) those of the last K steps, the latest first, NaN if there was no such step; K is as many
-    as the attacks of the condition (operating point) need. `uniforms` (n, H) are draws in [0, 1).
+    as the attacks of the condition (settings of radio, asking and fusion) need. `uniforms` (n, H)
+    are draws in [0, 1).
     """
 
     truth: Intents  # what every vehicle truly intends now, and where it is
@@ -88,9 +89,10 @@ class Attack:
 
     @property
     def acts_on(self) -> tuple[str, ...]:
-        """Return the kinds of message content that it changes, such as intents or words.
+        """Return which contents of messages it changes: objects, words, or intents and plans.
 
-        An intent is probabilities of actions. They are some of `contents.KINDS`.
+        An intent is a vehicle's probabilities of the ego's actions. Names are those of
+        `contents.KINDS`.
         """
         if self.in_objects:
             return (OBJECTS,)
@@ -98,14 +100,18 @@ class Attack:
 
     @property
     def steps(self) -> int:
-        """Return how many past steps of intents, probabilities of actions, the attack needs."""
+        """Return how many past steps the attack needs to know the helpers' intents of; 0 for most.
+
+        An intent is probabilities of actions, and a step one decision of an episode.
+        """
         return 0
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
-        """Return what vehicles send and claim after this attack, for the n decisions of `turn`.
+        """Return what vehicles send and claim after this attack, in n decisions.
 
         `sent` is what they would send without it: their intents (probabilities of actions) and
-        positions, as earlier attacks changed them. By default it is returned unchanged.
+        positions, as earlier attacks changed them. `turn` says who attacks in each decision, and
+        what is true. By default `sent` is returned unchanged.
         """
         return sent
 
@@ -129,10 +135,10 @@ class Attack:
         return graph
 
     def intend(self, sent: Intents, turn: Turn, intents: Floats) -> Intents:
-        """Return `sent` with the attackers' intents replaced by `intents` `(n, H, A)`.
+        """Return what vehicles send, with the attackers' intents replaced by `intents` `(n, H, A)`.
 
-        The axes are n decisions, H helpers and A actions; an intent is probabilities of actions. A
-        row with NaN changes nothing. `turn` says who attacks.
+        `sent` is what they would send. The axes are n decisions, H helpers and A actions; an intent
+        is probabilities of actions. A row with NaN changes nothing. `turn` says who attacks.
         """
         lies = turn.attackers[..., None] & ~np.isnan(intents).any(axis=-1, keepdims=True)
         return replace(sent, helpers=np.where(lies, intents, sent.helpers))
@@ -145,11 +151,12 @@ class Attack:
         to_ego_m: Floats,
         claims: Claims | None,
     ) -> Intents:
-        """Return `sent` with false positions of the attackers, in metres.
+        """Return what vehicles send, with false positions of the attackers.
 
-        `turn` says who attacks. `to_zone_m` (a number or `(n, H)`, for n decisions and H helpers)
-        is the claimed distance to the conflict zone, where paths meet, and `to_ego_m` `(n, H)` that
-        to the ego; `claims` has the claimed coordinates, or is None where nothing needs them.
+        `sent` is what they would send, and `turn` says who attacks. `to_zone_m` (a number or `(n,
+        H)`, for n decisions and H helpers) is the claimed distance, m, to the conflict zone, where
+        paths meet, and `to_ego_m` `(n, H)` that to the ego; `claims` has the claimed coordinates,
+        or is None where nothing needs them.
         """
         ego_m, helpers_m = np.split(sent.distance_m, [1], axis=1)
         return replace(
@@ -166,17 +173,16 @@ class Attack:
 class Liar(Attack):
     """Attack by stating the opposite of one's intent, from one's true position.
 
-    An intent is a vehicle's probabilities of actions. `says` is the opposite: `one-hot` is
-    certainty of the least likely action, `permuted` the probabilities in reverse order of size. For
-    the class variables see `Attack`.
+    An intent is a vehicle's probabilities of actions. `says` is which opposite: `one-hot` is
+    certainty of the least likely action, `permuted` the probabilities in reverse order of size.
     """
 
     # `one-hot` is sure of the action that it finds least likely; `permuted` is its own distribution
     # with the largest probability where the smallest was, and so on
     says: Literal["one-hot", "permuted"] = "one-hot"
-    by_scene: ClassVar[bool] = True
-    in_text: ClassVar[bool] = True
-    risk: ClassVar[str] = "low"
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
+    in_text: ClassVar[bool] = True  # changes what a fusion prompt shows
+    risk: ClassVar[str] = "low"  # what the message states of risk
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         p = turn.truth.helpers
@@ -243,12 +249,12 @@ class RandomIntent(Attack):
 class FeignedBraking(Attack):
     """Attack by being always certain of the first, most careful action: safe, but it obstructs.
 
-    The message states a high risk. For the class variables see `Attack`.
+    The message states a high risk.
     """
 
-    by_scene: ClassVar[bool] = True
-    in_text: ClassVar[bool] = True
-    risk: ClassVar[str] = "high"
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
+    in_text: ClassVar[bool] = True  # changes what a fusion prompt shows
+    risk: ClassVar[str] = "high"  # what the message states of risk
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         braking = np.zeros(sent.helpers.shape[:-1], dtype=int)
@@ -259,13 +265,12 @@ class FeignedBraking(Attack):
 class Overconfident(Attack):
     """Attack by being too certain: the own probabilities to a power, scaled to sum to 1.
 
-    They are those of actions, the helper's intent; `power` is the exponent. For the class variables
-    see `Attack`.
+    They are those of actions, the helper's intent; `power` is the exponent.
     """
 
     power: Annotated[float, Meta(ge=1, le=100)] = 5.0  # the exponent; 1 changes nothing
-    by_scene: ClassVar[bool] = True
-    in_text: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
+    in_text: ClassVar[bool] = True  # changes what a fusion prompt shows
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         p = turn.truth.helpers
@@ -279,13 +284,12 @@ class Spoof(Attack):
 
     The paper's consensus rule (Eq. 2), by which the ego fuses messages, gives helpers weight by
     their distance to that zone, where paths meet. Alone, the attack states the true intent
-    (probabilities of actions); with `liar`, it is the worst case for a rule with weights. For the
-    class variable see `Attack`.
+    (probabilities of actions); with `liar`, it is the worst case for a rule with weights.
     """
 
     # claimed distance to the centroid of the conflict zone, m
     distance_m: Annotated[float, Meta(ge=0, le=1000)] = 3.0
-    by_scene: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         claims = sent.claims
@@ -322,11 +326,10 @@ class Jump(Attack):
 class Silent(Attack):
     """Attack by not replying if one's likeliest action is not the ego's.
 
-    The slot of the channel in which the reply would be sent stays empty. For the class variable see
-    `Attack`.
+    The slot of the channel in which the reply would be sent stays empty.
     """
 
-    by_scene: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         ego, helpers = np.nan_to_num(turn.truth.own), np.nan_to_num(turn.truth.helpers)
@@ -339,10 +342,10 @@ class Absent(Attack):
     """Leave the attackers out, so that they send nothing: no attack, but a bound for others.
 
     It is what a consensus rule, by which the ego fuses messages, could reach that knows who
-    attacks. For the class variable see `Attack`.
+    attacks.
     """
 
-    by_scene: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
 
     @property
     def acts_on(self) -> tuple[str, ...]:
@@ -357,12 +360,11 @@ class Sybil(Attack):
     """Attack under several identities (voices), 2 m apart, which all send the same message.
 
     `voices` is how many each attacker has, itself included. The ego asks voices as it asks
-    vehicles, nearest first, so that they displace other helpers. For the class variable see
-    `Attack`.
+    vehicles, nearest first, so that they displace other helpers.
     """
 
     voices: Annotated[int, Meta(ge=2, le=MOST_VOICES)] = 3  # the number of voices of each attacker
-    adds: ClassVar[bool] = True
+    adds: ClassVar[bool] = True  # no other attack changes the voices that it adds
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
         return with_voices(sent, turn.attackers, self.voices)
@@ -385,13 +387,13 @@ class Injection(Attack):
     """Attack by prompt injection: write instructions to the ego's model into a message's words.
 
     The intent, the message's probabilities of actions, stays true. `language` is that of the
-    instructions, such as `english`. For the class variables see `Attack`.
+    instructions, such as `english`.
     """
 
     language: str = "english"  # language of the instructions, a key of `INSTRUCTIONS`
-    by_scene: ClassVar[bool] = True
-    in_text: ClassVar[bool] = True
-    in_words: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
+    in_text: ClassVar[bool] = True  # changes what a fusion prompt shows
+    in_words: ClassVar[bool] = True  # writes words of its own
 
     def __post_init__(self) -> None:
         """Raise UserError for an unknown language."""
@@ -411,19 +413,18 @@ class Injection(Attack):
 class _OfObjects(Attack):
     """Lists other objects than it sees; its intent stays true."""
 
-    by_scene: ClassVar[bool] = True
-    in_objects: ClassVar[bool] = True
+    by_scene: ClassVar[bool] = True  # draws and past steps do not matter
+    in_objects: ClassVar[bool] = True  # changes the objects that a message lists
 
 
 @dataclass(frozen=True)
 class Ghost(_OfObjects):
     """Attack by listing, among the objects that one sees, a car that does not exist.
 
-    The ego would meet it on its way, as `harness.world.perception.shared.invented` places it. For
-    the class variable see `Attack`.
+    It stands in the ego's way, so that the ego would meet it.
     """
 
-    adds: ClassVar[bool] = True
+    adds: ClassVar[bool] = True  # no other attack changes the object that it adds
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
         """Return the scene graph with the `invented` car, which does not exist, among its objects.
@@ -437,7 +438,8 @@ class Ghost(_OfObjects):
 class Hide(_OfObjects):
     """Attack by listing no object and reporting every sector as visible.
 
-    A sector is a region from which a danger may come.
+    A sector is a side (left, right, oncoming) from which a vehicle that the ego would meet may
+    come.
     """
 
     def listed(self, graph: SceneGraph, invented: Node) -> SceneGraph:
@@ -517,11 +519,12 @@ def attacks_of(text: str) -> tuple[Attack, ...]:
 
 
 def in_question(text: str, words: bool, objects: bool) -> str:
-    """Return those attacks of a text that change a fusion prompt, joined by `&`, without shares.
+    """Return those attacks of a text that change what the ego's model reads, joined by `&`.
 
-    A fusion prompt shows the ego's model the helpers' messages. The attacks change their words, if
-    the prompt shows `words`, or their lists of objects, if it shows `objects`. They are in the
-    order in which they act. The result is part of the key by which an answer is stored.
+    The text has names and shares, such as `liar:share=1/3+spoof`; shares of attackers are left out.
+    The attacks change the words of messages, if the prompt shows `words`, or their lists of
+    objects, if it shows `objects`. They are in the order in which they act. The result is part of
+    the key by which an answer is stored.
     """
     named = sorted(
         (part.split(":") for part in text.split("+") if part), key=lambda p: ATTACKS[p[0]].adds
@@ -574,10 +577,11 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
 
 
 def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:
-    """Return `sent` with `voices` - 1 more identities (voices) of each of the `talkers`, `(n, H)`.
+    """Return what vehicles send, with more identities (voices) for each of the `talkers`, `(n, H)`.
 
-    `talkers` is a mask of H helpers in n decisions. The voices follow all helpers and claim places
-    2 m apart; `voice_of` of the result has the index of the helper behind each voice.
+    `sent` has what the ego and its H helpers send in n decisions; `talkers` says which helpers get
+    `voices` - 1 more. The new voices follow all helpers and claim places 2 m apart; `voice_of` of
+    the result has the index of the helper behind each voice.
     """
     n, helpers = talkers.shape
     places = np.argsort(~talkers, axis=-1, kind="stable")[

@@ -32,7 +32,10 @@ class Schema:
 
 
 class Quoted(Schema):
-    """Quote a helper's words as a JSON string, so that they are no orders: the defence `quoted`."""
+    """Quote a helper's words as a JSON string, so that they are no orders: the defence `quoted`.
+
+    It is called for each message before a prompt shows it to the ego's model.
+    """
 
     def message(self, message: Mapping[str, Any], actions: Sequence[str]) -> dict[str, Any]:
         return {**message, "evidence": json.dumps(message["evidence"], ensure_ascii=False)}

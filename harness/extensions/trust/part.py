@@ -57,14 +57,13 @@ def _defences_on(holds: frozenset[str]) -> list[str]:
 
 
 class Guard(Part, frozen=True, kw_only=True):
-    """Hold a condition's settings `attack` and `defence`.
+    """Hold a condition's settings `attack` and `defence`, each a text of names; empty is none.
 
-    A condition is an operating point, of which this is a part. `attack` names helpers' lies and
-    failures, such as `liar:share=1/3+spoof`. `defence` names defences of a fusion call, in which
-    the ego's model reads the helpers' messages, joined by `+`: `quoted`, `schema` or `majority`.
-    Empty is none. `behind` is the setting after which both stand in records, `named` has what
-    returns the names that there are, and `usual` the values that a sweep takes if none are given,
-    joined by commas.
+    A condition is an operating point: settings of radio, asking and fusion. `attack` names helpers'
+    lies and failures. `defence` names what protects a fusion call, in which the ego's model reads
+    the helpers' messages. `behind` is the setting after which both stand in records, `named` has
+    what returns the names that there are, and `usual` the values that a sweep takes if none are
+    given, joined by commas.
     """
 
     behind: ClassVar[str] = "fallback"
@@ -82,7 +81,8 @@ class Guard(Part, frozen=True, kw_only=True):
     def defences(self) -> tuple[str, ...]:
         """Return the names of the defences of a fusion call in this condition, such as `quoted`.
 
-        A condition is an operating point. In a fusion call the ego's model reads helpers' messages.
+        A condition is a set of settings of radio, asking and fusion. In a fusion call the ego's
+        model reads helpers' messages.
         """
         return tuple(part for part in DEFENCES if part in self.defence.split("+"))
 
@@ -160,8 +160,9 @@ class Guard(Part, frozen=True, kw_only=True):
 
 
 def setting_of(attacks: str) -> str:
-    """Return the setting of an operating point under attacks, such as `attack=liar:share=1/3`.
+    """Return the setting under which helpers attack, such as `attack=liar:share=1/3`, as a text.
 
-    `attacks` names them: `liar:share=1/3+spoof`.
+    It is added to the settings of radio, asking and fusion. `attacks` names the lies:
+    `liar:share=1/3+spoof`.
     """
     return f"attack={attacks}"

@@ -56,14 +56,11 @@ LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, 
 
 @dataclass(frozen=True)
 class Cell:
-    """Hold the result of one consensus rule under one attack: S channel seeds, E episodes.
+    """Hold how one consensus rule fares under one attack, for S channel seeds and E episodes.
 
     A consensus rule makes the ego's policy, its probabilities of actions, of its own intent and of
-    the messages that it heard. Some rules also judge helpers: whom they trust little they suspect.
-    `success` and `unsafe` (S, E) say which episodes end so, 1 or 0, and `nats` (S, E) how little
-    probability the policy gives to safe actions. `flagged` (4, E) counts messages heard: suspected
-    and other ones of attackers, then of honest helpers. `first` is messages until an attacker was
-    suspected, 0 for never. `share` is the share of helpers that attack.
+    the messages that it heard. In an attack, a share of the helpers sends what is false. Some rules
+    also judge helpers: whom they trust little they suspect.
     """
 
     rule: str  # the consensus rule, such as `linear:weight_cap=0.3`
@@ -108,8 +105,8 @@ class Cell:
     def caught(self) -> list[int]:
         """Return, for each attacker that the rule suspected, its messages heard until then.
 
-        The rule is the consensus rule, by which the ego fuses messages. It is a number for each
-        attacker, episode and channel seed.
+        The rule is the consensus rule, by which the ego fuses messages. The list has a number for
+        each attacker, episode and channel seed.
         """
         return [n for n in self.first if n]
 
@@ -125,9 +122,10 @@ class Cell:
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
     """Return an operating point with another rule, and with attacks by a share of the helpers.
 
-    `rule` is a consensus rule, by which the ego fuses messages, such as `linear:weight_cap=0.3`.
-    Each attack of `attack`, joined by `+`, gets the share, 0 to 1. Raises UserError for another
-    setting of a rule.
+    An operating point is the settings of radio, asking and fusion; an attack is how some helpers
+    lie. `rule` is a consensus rule, by which the ego fuses messages, such as
+    `linear:weight_cap=0.3`. Each attack of `attack`, joined by `+`, gets the share, 0 to 1. Raises
+    UserError for another setting of a rule.
     """
     text = "+".join(f"{part}:share={share:.10g}" for part in attack.split("+") if part)
     consensus, *settings = rule.split(":")
@@ -159,9 +157,10 @@ def names_of(option: str, text: str, allowed: Sequence[str]) -> tuple[str, ...]:
 
 
 def shares_of(text: str) -> tuple[float, ...]:
-    """Return the shares of attackers above 0 in a list such as `0,1/3,2/3`; 0 is always played.
+    """Return the shares of attackers in a list such as `0,1/3,2/3`, without 0, always played.
 
-    Raises UserError if it has no share above 0, or one that is not from 0 to 1.
+    A share is that of the helpers that attack. Raises UserError if the text has no share above 0,
+    or one that is not from 0 to 1.
     """
     try:
         shares = [float(Fraction(part.strip())) for part in text.split(",")]
@@ -222,59 +221,68 @@ def _flagged(result: WalkResult) -> tuple[Floats | None, list[int]]:
 
 @dataclass(frozen=True)
 class Bench:
-    """Hold a study of trust: a cell for every consensus rule, attack and share of attackers.
+    """Hold a study of trust: how every consensus rule fares under every attack.
 
-    A consensus rule is how the ego fuses messages; `cells` has the result by rule, attack and
-    share. The linear pool, the weighted mean of intents (probabilities of actions), is the paper's
-    rule, with which others are compared. `name` and `source` are those of the run that is played
-    again and of its dataset, `condition` is the operating point that is attacked, `seeds` are the S
-    channel seeds, and `alone` (S, E) is success, 1 or 0, of an ego that never asks, for E episodes.
-    `success_rule` says how success is averaged, `caveats` what a reader must know first, and
-    `unfused` why rules change nothing, if so.
+    A consensus rule is how the ego fuses messages, and an attack how some of the helpers lie. A
+    cell is the result of one rule, one attack and one share of attackers. The linear pool, the
+    weighted mean of intents (probabilities of actions), is the paper's rule, with which others are
+    compared. Arrays are (S, E), for S channel seeds and E episodes.
     """
 
     name: str  # name of the run that is played again
     source: str  # name of the run's dataset
-    condition: str  # the operating point that is attacked
-    seeds: tuple[int, ...]  # of the channel
-    cells: Mapping[Key, Cell]  # by rule, attack and share
+    # name of the operating point (settings of radio, asking and fusion) that is attacked
+    condition: str
+    # the channel seeds, keys of the radio's random draws
+    seeds: tuple[int, ...]
+    # the results, by consensus rule, attack (empty for none) and share of the helpers that attack
+    cells: Mapping[Key, Cell]
     alone: Floats  # success of an ego that never asks, 1 or 0, (S, E)
     success_rule: Success  # how success of every cell is averaged, such as balanced by danger
-    caveats: tuple[str, ...] = ()  # what the run lacks
-    # why no rule fuses here, where the only one is the linear pool in name
+    # sentences on what the run lacks, to be read before the numbers
+    caveats: tuple[str, ...] = ()
+    # why no rule changes anything here, in words; None where rules do. The linear pool is then the
+    # only rule, in name
     unfused: str | None = None
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
-        """Return the names of the consensus rules, which fuse messages, the paper's first.
+        """Return the names of the consensus rules that are compared, the paper's first.
 
-        They are as typed, such as `linear:weight_cap=0.3`.
+        A consensus rule is how the ego fuses messages. Names are as typed, such as
+        `linear:weight_cap=0.3`.
         """
         return tuple(dict.fromkeys(rule for rule, _, _ in self.cells))
 
     @cached_property
     def attacks(self) -> tuple[str, ...]:
-        """Return the attacks' names, without `absent` (a bound) and the empty one of no attack."""
+        """Return the names of the attacks that the study plays on rules, such as `liar+spoof`.
+
+        An attack is how some helpers lie; a rule is how the ego fuses messages. Two entries of the
+        study are no attacks and are left out: that in which nobody attacks, and `absent`, in which
+        attackers send nothing, which bounds what a rule could reach that knows who attacks.
+        """
         return tuple(dict.fromkeys(a for _, a, _ in self.cells if a not in (PEACE, EXCLUDED)))
 
     @cached_property
     def shares(self) -> tuple[float, ...]:
-        """Return the shares of attackers above 0."""
+        """Return the shares of the helpers that attack, above 0 to 1, that the study plays."""
         return tuple(dict.fromkeys(share for _, _, share in self.cells if share))
 
     def at(self, rule: str, attack: str = PEACE, share: float = 0.0) -> Cell:
-        """Return the cell: how a consensus rule fares under an attack by a share of the helpers.
+        """Return the result of a consensus rule under an attack by a share of the helpers.
 
-        A consensus rule is how the ego fuses messages; both are named as typed. By default it is
-        that of no attack.
+        A consensus rule is how the ego fuses messages, and an attack how some helpers lie; both are
+        named as typed. By default nobody attacks.
         """
         return self.cells[rule, attack, share]
 
     def success(self, *key: Any) -> Estimate:
-        """Return the success of a cell, 0 to 1, averaged over episodes by `success_rule`.
+        """Return the success of one rule under one attack, 0 to 1, averaged over episodes.
 
-        A cell is how one rule fares under one attack. `key` has the arguments of `at`: consensus
-        rule (how the ego fuses messages), attack and share of the helpers.
+        `key` is the consensus rule (how the ego fuses messages), the attack and the share of the
+        helpers that attack; without the last two, nobody attacks. Episodes are averaged by
+        `success_rule`, such as balanced over those with a danger and without.
         """
         return self.success_rule.estimate(self.at(*key).success)
 
@@ -301,9 +309,9 @@ class Bench:
     def holm(self) -> Mapping[Key, float | None]:
         """Return p-values of no difference to the linear pool under the same attack, by cell.
 
-        The linear pool is the paper's consensus rule, by which the ego fuses messages; the key of a
-        cell is rule, attack and share. They are corrected by Holm's method over all cells with an
-        attack; None without an interval.
+        A cell is the result of one rule under one attack. The linear pool is the paper's consensus
+        rule, by which the ego fuses messages; the key of a cell is rule, attack and share. They are
+        corrected by Holm's method over all cells with an attack; None without an interval.
         """
         keys = [key for key in self.cells if key[0] != BASE and key[1] not in (PEACE, EXCLUDED)]
         pairs = ((self.cells[key].success, self.at(BASE, *key[1:]).success) for key in keys)
@@ -314,8 +322,9 @@ class Bench:
     def clear(self, *key: Any) -> bool:
         """Return whether a rule differs from the linear pool under an attack (corrected p <= 0.05).
 
-        The linear pool, the weighted mean of intents (probabilities of actions), is the paper's
-        rule to fuse messages. `key` is rule, attack and share of attackers.
+        A rule is how the ego fuses messages. The linear pool, the weighted mean of intents
+        (probabilities of actions), is the paper's. `key` is the rule, the attack and the share of
+        the helpers that attack.
         """
         return (self.holm.get(key) or 1.0) <= LEVEL
 
@@ -338,7 +347,7 @@ class Bench:
         """Return a rule's success of every seed and episode, (S, E), as a mean over all attacks.
 
         A rule is a consensus rule, by which the ego fuses messages. The axes are S channel seeds
-        and E episodes; `share` is that of the attackers.
+        and E episodes; `share` is the share of the helpers that attack.
         """
         values = [self.at(rule, attack, share).success for attack in self.attacks]
         return np.asarray(np.mean(values, axis=0))
@@ -354,19 +363,21 @@ def run_bench(
     out: Path,
     progress: Progress,
 ) -> Bench:
-    """Play every rule under every attack and share on a run's stored answers.
+    """Play every consensus rule under every attack on a run's stored answers.
 
-    A rule is a consensus rule, by which the ego fuses messages.
+    A consensus rule is how the ego fuses messages, and an attack how some helpers lie. Returns how
+    the episodes end under each rule, attack and share of attackers.
 
     Args:
         run: the run whose answers are used; its model is asked for those that it lacks.
-        condition: the operating point that is attacked, as it is typed.
+        condition: the operating point (settings of radio, asking and fusion) that is attacked, as
+            it is typed.
         rules: consensus rules, such as `linear:weight_cap=0.3`. The linear pool is always among
             them; without any, the usual ones are played, as far as the condition allows them.
         attacks: attacks without shares, such as `liar+spoof`; without any, the usual ones.
         shares: shares of the helpers that attack, above 0 to 1; nobody is always played as well.
         seeds: the channel's seeds.
-        out: the study's folder; cells that it has already are read.
+        out: the study's folder; results that it has already are read.
         progress: told how much there is to do, and called with what is done.
 
     Raises:
@@ -460,9 +471,10 @@ def run_bench(
 
 
 def trust_study(bench: Bench) -> Study:
-    """Return the study of a bench: a heat map, and tables of rules, of success and of detection.
+    """Return the study of how consensus rules fare under attacks, for page, terminal and `--json`.
 
-    Rules are consensus rules, by which the ego fuses messages, and detection is how well they tell
+    A rule is how the ego fuses messages, and `bench` has the result of each under each attack. The
+    study has a heat map, and tables of rules, of success and of detection: how well rules tell
     attackers' messages from honest ones.
     """
     import pandas as pd
@@ -541,9 +553,9 @@ def _heat_map(bench: Bench) -> "Figure":
 
 
 def headline(bench: Bench) -> list[str]:
-    """Return sentences on what asking gains, which attack harms most, and who withstands it.
+    """Return sentences on what asking gains, which attack harms most, and which rule withstands it.
 
-    `bench` has how each consensus rule fares under each attack.
+    `bench` has how each consensus rule, by which the ego fuses messages, fares under each attack.
     """
     share, peace = bench.shares[0], bench.success(BASE)
     alone, worst = bench.success_rule.estimate(bench.alone), bench.worst(BASE, share)
