@@ -74,7 +74,8 @@ OF_RUNS = {  # in the place of those above, for what a run's folder holds
 def app(folder: Path, token: str) -> ASGIApp:
     """Return the web application that `harness view` serves for one folder of runs.
 
-    Requests need the secret `token`, in the address or in a cookie.
+    Requests need the secret `token`, in the address or in a cookie, so that other users of the
+    machine see nothing.
     """
     view = View(folder)
     routes = {
@@ -243,9 +244,9 @@ class View:
         return FileResponse(file, headers=policy, media_type=PICTURES[file.suffix])
 
     async def compare(self, request: Request) -> Response:
-        """Return the page that compares two runs, named by `path` in the address.
+        """Return the page that compares two runs, named by two values of `path` in the address.
 
-        Run A is the one of `a` in the address, else the one that began first.
+        Run A is the one that `a` in the address names, else the one that began first.
         """
         picked = await run_in_threadpool(self._picked, request)
         if len(picked) != 2:
@@ -263,7 +264,10 @@ class View:
         return await self._drawn(request, partial(pages.report, self._whole(picked), None, scene))
 
     def wrong(self, request: Request, error: Exception) -> Response:
-        """Return an error page of one line, with the error's HTTP status, 400 for a UserError."""
+        """Return an error page of one line, with the error's HTTP status, 400 for a UserError.
+
+        `request` is not read.
+        """
         status, reason = (
             (error.status_code, error.detail) if isinstance(error, HTTPException) else (400, error)
         )
@@ -271,7 +275,10 @@ class View:
         return HTMLResponse(pages.wrong(str(reason)), status, headers)
 
     def bug(self, request: Request, error: Exception) -> Response:
-        """Return an error page of one line for a bug (status 500), and print its traceback."""
+        """Return an error page of one line for a bug (status 500), and print its traceback.
+
+        `error` is what was raised; `request` is not read.
+        """
         traceback.print_exception(error)
         return HTMLResponse(pages.wrong("this page cannot be made; the terminal says why"), 500)
 

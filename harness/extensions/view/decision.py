@@ -26,8 +26,8 @@ def with_decision(page: str, runs: Runs, scene: str) -> str:
 def everything(runs: Runs, name: str) -> dict[str, Any]:
     """Return all details of one decision point as plain values, for the script of a run's page.
 
-    `name` is the point's id. They are its prompts, answers, decisions and picture. Raises UserError
-    if no run has it.
+    A decision point is a situation in which the ego decided, and `name` is its id. The details are
+    prompts, answers, decisions and the picture. Raises UserError if no run has the point.
     """
     if not any(name in run.decisions.scenes for run in runs.runs):
         raise UserError(

@@ -49,8 +49,9 @@ NOTE = (
 def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[str]:
     """Write the pages of a folder's finished runs, suites and studies to a new folder, to publish.
 
-    Every page of a run is drawn anew: what else lies in its folder is not published. A study's page
-    is published as it is, if it begins as one that may run no script.
+    A suite is one model's runs on several scenarios. Every page of a run is drawn anew: what else
+    lies in its folder is not published. A study's page is published as it is, if it begins as one
+    that may run no script.
 
     Args:
         folder: the folder whose runs `harness view` lists.

@@ -27,13 +27,15 @@ class Line:
     """Hold one run in a history: a list of runs on the same scenes, with one metric, by date.
 
     `name` is its folder, relative to the folder of all runs, `date` is when it began, and `score`
-    its value of the metric under the list's condition (operating point); None where it has none.
+    its value of the metric under the list's condition (settings of radio, asking and fusion); None
+    where it has none.
     """
 
     name: str  # its folder, relative to the folder of all runs
     date: datetime  # when it began, UTC
     run: Run  # the run as it was read
-    # its value of the metric in the group's condition (operating point); None where it has none
+    # its value of the metric in the group's condition (settings of radio, asking and fusion); None
+    # where it has none
     score: Score | None
 
 
@@ -41,9 +43,7 @@ class Line:
 class Group:
     """Hold the runs of the same scenes, by date, and the metric and condition of their values.
 
-    A condition is an operating point by its name: everything that a decision depends on besides
-    scene and model, such as the radio. `of` names the scenes for people, `metric` is such as
-    `success_rate`, and `lines` has the runs, the oldest first.
+    A condition is an operating point by its name: settings of radio, asking and fusion.
     """
 
     of: str  # the scenes, for people: a dataset with its digest, or a scenario with its layouts
@@ -63,13 +63,13 @@ def history(
 ) -> list[Group]:
     """Return the finished runs in a folder in groups of the same scenes, by date.
 
-    The group with the newest run comes first.
+    So one sees how a metric went from run to run. The group with the newest run comes first.
 
     Args:
         folder: is searched for runs, with folders below it.
         metric: a metric of `summary.csv`; None for each group's headline success.
-        condition: name of an operating point; None for the last of those that most of a group's
-            runs have.
+        condition: name of settings of radio, asking and fusion in the runs; None for the last of
+            those that most of a group's runs have.
         dataset: name of the dataset, or of the scenario of driven runs; None for all.
         wrong: called with the name of a run that is left out since a file of it is broken, and the
             error.
@@ -133,7 +133,7 @@ def _group(lines: Sequence[Line], metric: str | None, condition: str | None) -> 
 
 
 def write(groups: Sequence[Group], out: Path) -> None:
-    """Write a history, as `history` returns it, to `out` as an HTML page.
+    """Write a history, groups of runs on the same scenes by date, to `out` as an HTML page.
 
     Raises UserError if the file cannot be written.
     """

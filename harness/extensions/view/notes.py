@@ -16,7 +16,10 @@ MOST, LONGEST = 1000, 4000  # notes of a run, and characters of one
 
 
 class Note(msgspec.Struct, frozen=True, kw_only=True):
-    """Hold a user's note on a decision point, one situation of a run in which the ego decided."""
+    """Hold a user's note on a decision point, one situation of a run in which the ego decided.
+
+    A decision point has one note at most.
+    """
 
     scene: str  # id of the decision point, which has one note at most
     text: str  # what the user wrote
@@ -24,9 +27,10 @@ class Note(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def notes(run: Path) -> list[Note]:
-    """Return the notes in a run's folder, sorted by decision point; empty if nobody wrote one.
+    """Return the users' notes in a run's folder, sorted by decision point; empty if there are none.
 
-    Raises UserError if the file of notes is broken.
+    A decision point is a situation in which the ego decided. Raises UserError if the file of notes
+    is broken.
     """
     try:
         return msgspec.json.decode(text_of(run / FILE, "text"), type=list[Note])

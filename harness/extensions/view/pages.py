@@ -62,7 +62,7 @@ def with_way_back(page: str, links: Sequence[tuple[str, str]] = (), home: str = 
 
 
 def whole_text(page: Path) -> str:
-    """Return the text of an HTML page that lies in a run's folder, read at once."""
+    """Return the text of an HTML page that lies in a run's folder, read at once to be whole."""
     return bytes_of(page, "rows").decode("utf-8", "replace")
 
 
@@ -116,9 +116,9 @@ def listed(folder: Path, words: str, order: str) -> str:
     """Return the HTML list of the runs in `folder` that match, sorted by a column.
 
     `words` are separated by spaces; a run matches if its name, kind, state, model, prompt, answer
-    mode, condition (operating point) and tags contain each of them. `order` is one of `COLUMNS`,
-    with `-` before it for the reverse order. While a run goes on, the page has a script, allowed by
-    its digest.
+    mode, condition (settings of radio, asking and fusion) and tags contain each of them. `order` is
+    one of `COLUMNS`, with `-` before it for the reverse order. While a run goes on, the page has a
+    script, allowed by its digest.
     """
     every = runs(folder)
     how_far = extents(folder, every)
@@ -144,21 +144,22 @@ def listed(folder: Path, words: str, order: str) -> str:
 
 
 def extents(folder: Path, every: Sequence[Listed]) -> dict[str, Extent]:
-    """Return how far each unfinished run is, by its name, such as its episodes done and due.
+    """Return how far each unfinished run is, by its name: its episodes or answers done, and due.
 
-    `every` are all runs in `folder`.
+    `every` are all runs in `folder`, finished ones included.
     """
     return {run.name: extent(folder / run.name) for run in every if run.state == "unfinished"}
 
 
 def now(every: Sequence[Listed], how_far: Mapping[str, Extent]) -> dict[str, Any]:
-    """Return what changes in the list while runs go on.
+    """Return what changes in the list of runs while runs go on, as plain values for JSON.
 
-    `every` are all runs listed, and `how_far` is what `extents` returned.
+    `every` are all runs listed, and `how_far` says of each unfinished one, by name, what is done
+    and due.
 
     Returns:
-        `listed`, a digest that changes once a run begins or ends; `going`, whether one goes on;
-        and `unfinished`, how far each is in words, by the run's name.
+        `listed`, a digest that changes once a run begins or ends; `going`, whether one goes on; and
+        `unfinished`, how far each is in words, by the run's name.
     """
     states = json.dumps([(run.name, run.state) for run in every])
     return {
@@ -185,9 +186,9 @@ def progress(run: Listed, extent: Extent) -> str:
 
 
 def sort(runs: Sequence[Listed], order: str) -> list[Listed]:
-    """Return listed runs sorted by a column; those without a value are last.
+    """Return runs of the list sorted by a column; those without a value are last.
 
-    `order` is the column's name, with `-` before it for the reverse order.
+    `order` is the column's name, such as `date`, with `-` before it for the reverse order.
     """
     column = attrgetter(order.removeprefix("-"))
     with_value = [run for run in runs if column(run) is not None]
@@ -209,7 +210,7 @@ def wrong(reason: str) -> str:
 
 
 def style() -> str:
-    """Return the CSS of all pages of the list."""
+    """Return the CSS of the web application's own pages, such as the list of runs."""
     return environment().get_template("style.css").render() + text_of(TEMPLATES / "list.css")
 
 
@@ -263,7 +264,7 @@ def note(path: Path, scene: str, text: str, before: str) -> None:
 
 
 def script() -> str:
-    """Return the JavaScript of the list, its only script."""
+    """Return the JavaScript of the page that lists runs, its only script: it shows progress."""
     return text_of(TEMPLATES / "list.js")
 
 

@@ -13,9 +13,9 @@ from harness.runs.folder import Run
 
 
 class Remarks:
-    """Show users' notes on the page of their run.
+    """Show users' notes on single decisions, on the page of their run.
 
-    It is an extension's `harness.report.remarks.Remarks`, which the page asks for sentences.
+    Its methods are those of `harness.report.remarks.Remarks`, which the page asks for sentences.
     """
 
     def sentences(self, runs: Runs) -> Iterator[Markup]:
@@ -29,7 +29,10 @@ class Remarks:
                         yield Markup(template.render(note=note, place=place, runs=runs))
 
     def left_out(self, run: Run) -> LeftOut:
-        """Return an empty mapping: notes are not about what was left out of a prompt."""
+        """Return an empty mapping, as notes do not say what was left out of a prompt.
+
+        The page asks all that may remark on decisions for it. `run` is not read.
+        """
         return {}
 
 
