@@ -349,6 +349,8 @@ def _of_latency(run: Run) -> Iterator[str]:
         yield change
     if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
         yield "run.json has another latency than the paper, which it names as the source"
+    if latency.source in ("declared", latencies.MEASURED) and not _is_typed(run):
+        yield f"run.json has times that are {latency.source}, and its settings do not have them"
     if latency.source in ("card", "paper"):
         others = {"a fusion call": latency.fusion_s}
         if not run.manifest.helpers:
@@ -357,6 +359,18 @@ def _of_latency(run: Run) -> Iterator[str]:
             yield "run.json has another latency of the helpers than their cards, or the paper, have"
         for whose in (whose for whose, seconds in others.items() if seconds != latency.ego_s):
             yield f"run.json has another latency of {whose} than of the ego, whose source it names"
+
+
+def _is_typed(run: Run) -> bool:
+    """Return whether a run's settings have its times, as a finished run's do, or its model has."""
+    typed = run.manifest.settings.latency
+    if typed is None:
+        return registration(run.manifest.model["engine"]).capabilities.own_latency
+    if typed in latencies.NAMES:
+        return False
+    latency = run.manifest.latency
+    of_typed = structs.replace(latencies.declared(typed), source=latency.source)
+    return latencies.same_times(of_typed, latency)
 
 
 def _helpers_s(run: Run, in_manifest: Sequence[float]) -> tuple[float | None, ...]:

@@ -216,9 +216,10 @@ class AnswerFacts(Struct, frozen=True):
     `first_token_s` and `token_s` times of the answer, of its first token and of each further one;
     None where unknown. `retries` counts failed attempts, `cached` says that it was stored earlier,
     and `first` is the failed answer before a second question. Of an answer by one letter per
-    action, `label_mass` is the letters' total probability; `letter_share` (0 to 1) and
-    `follows_letter` say how far it goes by the letter, and `flipped` whether the list reversed
-    changes it.
+    action, `label_mass` is the letters' total probability; `letter_share`, from 0 to 1, is how much
+    of it stays with a letter whatever action that letter stands for, `follows_letter` says whether
+    one letter is always the likeliest, and `flipped` whether reversing the list of actions changes
+    the likeliest action.
     """
 
     scene: str

@@ -65,9 +65,10 @@ class Timer(ABC):
 
     @abstractmethod
     def speeds(self, models: Sequence[str]) -> tuple[Any, ...]:
-        """Return the speed of each of a run's agents, given their models' names, the ego's first.
+        """Return how fast each of a run's models answers, given the models' names, the ego's first.
 
-        Raises UserError for a model that it cannot time.
+        An entry is an object of the timer's own, such as a device's token rates, which `answer_s`
+        takes. Raises UserError for a model that it cannot time.
         """
 
     @abstractmethod

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 DRAWN: "tuple[Format, ...]" = ("svg", "pdf", "png")  # the kinds of picture in a study's folder
 WIDEST_REM, REM_PER_INCH = 66, 10.5
-SOURCE = ("name", "latency")  # of a source, what makes a study another one
+SOURCE = ("name", "latency", "dataset_sha256")  # of a source, what makes a study another one
 
 
 @dataclass(frozen=True)

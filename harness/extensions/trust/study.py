@@ -23,7 +23,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import as_mapping, crossed, interval_of, some_of
-from harness.core.files import digest
+from harness.core.files import digest, sha256_file
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, negative_log_likelihood, resampled, resampled_estimate
@@ -32,6 +32,7 @@ from harness.dataset.load import Scene
 from harness.evaluate.walk import Decided
 from harness.radio.profiles import CHANNELS
 from harness.report.document import Table, strong
+from harness.runs.alike import setup
 from harness.runs.estimates import over_episodes
 from harness.runs.headline import SUCCESS
 from harness.runs.places import mean_by_place
@@ -432,7 +433,8 @@ def run_bench(
     )
     depends_on = [
         run.manifest(),
-        str(run.run.manifest.identity),
+        str(setup(run.run)),
+        sha256_file(run.run.path / "answers.jsonl", "rows"),
         point.record(),
         list(seeds),
         point.radio.profile and CHANNELS.record(point.radio.profile),

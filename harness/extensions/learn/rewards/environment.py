@@ -116,8 +116,9 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
         The keys are drivers, such as `constant`, `uniform` and `full-view`, which sees everything.
         Each has `advantage`, the mean reward over `rows(per_level)` (0 for `constant`), and
         `success`, the share of successful episodes on their layouts (start situations), balanced
-        over those with and without a danger, a vehicle that a cruising ego would meet. Raises
-        UserError if the episodes are driven, or if no decision of the layouts matters.
+        over those with and without a danger, a vehicle that a cruising ego would meet. `per_level`
+        is about how many decision points are drawn at each step of each layout. Raises UserError if
+        the episodes are simulated and have no stored trees, or if no decision matters.
         """
         trees = self._trees("references()")
         return trees.references(trees.drawn(per_level))
