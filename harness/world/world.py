@@ -272,8 +272,9 @@ class World:
     def passed(self, poses: Floats) -> None:
         """Add the beacons of the last F simulated frames to those that vehicles have received.
 
-        A beacon is a vehicle's message about itself. It is called after each advance. `poses` are x and y (m from the origin of the scenario's road), heading (rad) and speed
-        (m/s) of each of V vehicles in each frame, (F, V, 4).
+        A beacon is a vehicle's message about itself. It is called after each advance. `poses` are x
+        and y (m from the origin of the scenario's road), heading (rad) and speed (m/s) of each of V
+        vehicles in each frame, (F, V, 4).
         """
         self._broadcast(poses, self.frame + 1 - len(poses))
 
