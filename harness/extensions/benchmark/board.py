@@ -1,7 +1,8 @@
 """The board of an edition: its entries by success under one condition, with ties, on one page."""
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from markupsafe import Markup
@@ -40,6 +41,7 @@ class Line:
     # success under the first condition less that under `BASELINE`, an ego without a radio; None if
     # the edition has no such condition
     gain: Score | None
+    file: str = ""  # the name of its file, where another entry is of the same models and prompts
 
     @property
     def name(self) -> str:
@@ -48,10 +50,11 @@ class Line:
         For a rule, which reads no prompt, it is the model alone.
         """
         variant, manifest = self.entry.suite.variant, self.entry.suite.manifest
+        file = f" · {self.file}" if self.file else ""
         if not reads_prompts(str(manifest.model["engine"])):
-            return f"{variant.model} · a rule"
+            return f"{variant.model} · a rule{file}"
         orders = " · cyclic letters" if manifest.letters == "cyclic" else ""
-        return f"{variant}{' · thinking' if manifest.thinking else ''}{orders}"
+        return f"{variant}{' · thinking' if manifest.thinking else ''}{orders}{file}"
 
 
 def lines(entries: Sequence[Rescored]) -> list[Line]:
@@ -80,7 +83,11 @@ def lines(entries: Sequence[Rescored]) -> list[Line]:
             rank = _rank(suite, contestants, edition, metric)
         success = {condition: suite.score(condition, metric) for condition in conditions}
         board.append(Line(entry, rank, success, _gain(suite, edition, metric)))
-    return sorted(board, key=lambda line: -_value(line.success[edition.ranked_by]))
+    count = Counter(line.name for line in board)
+    named = [
+        replace(line, file=line.entry.file) if count[line.name] > 1 else line for line in board
+    ]
+    return sorted(named, key=lambda line: -_value(line.success[edition.ranked_by]))
 
 
 def _privileged(suite: SuiteRun) -> bool:

@@ -41,6 +41,7 @@ class Rescored:
     compared: int  # number of figures that were compared
     # whether the file is the one that pins the edition, of a few layouts, and no entry
     golden: bool = False
+    file: str = ""  # the file's name; empty if it was made by hand
 
 
 class Here:
@@ -136,7 +137,7 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
                 differences[name].append(f"{answers} of a rule that is here")
             compared += len(edition.figures(computed_run))
     suite = SuiteRun(folder / "computed", edition.name, edition.description, runs)
-    return Rescored(contents, edition, suite, differences, compared, golden=limit is not None)
+    return Rescored(contents, edition, suite, differences, compared, limit is not None, file.name)
 
 
 @contextmanager

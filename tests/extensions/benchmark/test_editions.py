@@ -8,6 +8,7 @@ import re
 import tempfile
 import zipfile
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile, copytree
 from zipfile import ZipFile
@@ -558,7 +559,8 @@ def test_a_board_ranks_files_and_says_who_made_them_and_what_was_computed_again(
     success = [line["success"]["6g"]["value"] for line in ranked]
     assert success == sorted(success, reverse=True)
     assert [line["rank"] for line in ranked if line["agents"] == "full-view · a rule"] == [None]
-    same = [line for line in ranked if line["agents"] == "proxy-faulty · a rule"]
+    same = [line for line in ranked if line["agents"].startswith("proxy-faulty · a rule · ")]
+    assert {"twin.zip", "forged.zip"} < {line["agents"].rpartition(" · ")[2] for line in same}
     assert [line["rank"] for line in same] == [1, 1, 1], "nobody is clearly better than itself"
     assert sorted(line["equal"] for line in same) == [False, True, True]
     assert len({json.dumps(line["success"]) for line in same}) == 1, (
@@ -651,6 +653,15 @@ def test_a_rank_is_one_more_than_the_entries_that_are_clearly_better(tmp_path: P
         success = line.success["6g"]
         assert success is not None
         assert success.value == pytest.approx(wins[name].mean())  # as many layouts of both kinds
+
+
+def test_entries_of_one_name_are_named_by_their_files_as_well(tmp_path: Path) -> None:
+    one, other = (
+        replace(entry_that_loses(tmp_path / name), file=f"{name}.zip") for name in ("a", "b")
+    )
+    assert [line.name for line in board.lines([one])] == ["made-up · a rule"]
+    names = {line.name for line in board.lines([one, other])}
+    assert names == {"made-up · a rule · a.zip", "made-up · a rule · b.zip"}
 
 
 def test_the_next_edition_tells_apart_what_the_first_does_not(tmp_path: Path) -> None:
