@@ -38,6 +38,7 @@ OTHER = Metric("other", "", Unit(), "lower", decisions=lambda d: d["entropy_nats
 FIRST = Metric("first", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], primary=True)
 NOTHING = Metric("nothing", "", Unit(), "lower")
 UNITLESS = Metric("unitless", "", None, "lower", decisions=lambda d: d["entropy_nats"])
+SWAPPED = Metric("swapped", "", Unit(1, "", 2), "lower", decisions=lambda d: d["entropy_nats"])
 SIDEWAYS = Metric("sideways", "", Unit(), "sideways", decisions=lambda d: d["entropy_nats"])
 MOON = Metric("moon", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], world="moon")
 
@@ -172,6 +173,7 @@ def test_another_metric_changes_no_corrected_p(
             "'mine' .* is the metric 'other' with 1 functions; give it the name of",
         ),
         ("first = by_hand:FIRST", "'first' .* with 1 functions, a primary one; .* is not primary"),
+        ("swapped = by_hand:SWAPPED", "'swapped' .* fails .TypeError"),
         ("unitless = by_hand:UNITLESS", "'unitless' .* has unit None; allowed: Unit; repair"),
         (
             "sideways = by_hand:SIDEWAYS",

@@ -486,15 +486,6 @@ def test_an_engine_that_is_not_here_is_one_line_that_names_the_run(
     assert error.startswith(f"harness: unknown engine of {run}: its model 'zork'; known: ")
 
 
-def test_a_model_that_was_typed_by_name_has_no_other_name(run: Path, harness: Harness) -> None:
-    stated = json.loads((run / "run.json").read_text())
-    stated["model"] |= {"name": "qwen3-4b", "weights": "proxy"}
-    (run / "run.json").write_text(json.dumps(stated))
-    code, out, error = harness("report", run)
-    assert (code, out, error.count("\n")) == (2, "", 1)
-    assert "its settings have model proxy, and beside them it is qwen3-4b" in error
-
-
 def test_a_device_that_timed_nothing_is_refused(run: Path, harness: Harness) -> None:
     stated = json.loads((run / "run.json").read_text())
     (run / "run.json").write_text(json.dumps(stated | {"device_profile": {"name": "orin"}}))

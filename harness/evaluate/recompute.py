@@ -18,9 +18,10 @@ from harness.backends.registry import open_backend, registration
 from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
 from harness.core.config import convert
-from harness.core.errors import Unanswered, UserError, printable
+from harness.core.errors import Unanswered, UserError, in_range, printable
 from harness.core.extensions import part_of
 from harness.core.figures import amount
+from harness.core.seeds import LAST_EPISODE
 from harness.dataset import select
 from harness.dataset.load import Dataset
 from harness.dataset.select import Choice
@@ -159,6 +160,7 @@ def _source(run: Run, dataset: Dataset | None) -> Source:
     from harness.evaluate.live_world import LiveSource  # a base install has no simulator
 
     most = int(world.selection.get("of", world.episodes))
+    in_range(f"{printable(run.path)}: episodes to select of", most, 1, LAST_EPISODE + 1)
     choice = _choice(run, world.selection, range(most), None)
     if choice:
         choice = replace(choice, numbers=choice.numbers[: world.episodes])
@@ -349,11 +351,16 @@ def _of_latency(run: Run) -> Iterator[str]:
         yield change
     if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
         yield "run.json has another latency than the paper, which it names as the source"
+    of_ego = latency.sample.get("ego")
+    if latency.source == latencies.MEASURED and of_ego and of_ego.median_s != latency.ego_s:
+        yield "run.json has another measured latency than the median of its sample"
     if latency.source in ("declared", latencies.MEASURED) and not _is_typed(run):
         yield f"run.json has times that are {latency.source}, and its settings do not have them"
     if latency.source in ("card", "paper"):
         others = {"a fusion call": latency.fusion_s}
-        if not run.manifest.helpers:
+        if run.manifest.model["engine"] == REPLAY:
+            others = {}  # those of the run that it replays, whose helpers may have their own models
+        elif not run.manifest.helpers:
             others["the helpers"] = latency.helper_s
         elif latency.helper_times_s() != _helpers_s(run, latency.helper_times_s()):
             yield "run.json has another latency of the helpers than their cards, or the paper, have"

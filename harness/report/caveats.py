@@ -10,6 +10,7 @@ from harness.backends.registry import reads_prompts
 from harness.coordination.part_settings import more_parts
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
+from harness.core.places import text
 from harness.core.plugins import Plugins
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
@@ -85,7 +86,7 @@ def unanswered(run: Run) -> Iterator[str]:
     They are the messages of the engine, which runs the model.
     """
     if (tallied := tally(run)).missing:
-        yield f"{tallied}: the model could not be asked, so that this is no result."
+        yield f"{text(str(tallied))}: the model could not be asked, so that this is no result."
 
 
 def few(run: Run) -> Iterator[str]:
@@ -172,7 +173,7 @@ def lost_messages(run: Run) -> Iterator[str]:
     not.
     """
     if (tallied := tally(run)).words and not tallied.missing:
-        yield f"{tallied}: each counts as a lost message."
+        yield f"{text(str(tallied))}: each counts as a lost message."
 
 
 def retried(run: Run) -> Iterator[str]:

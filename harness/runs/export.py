@@ -96,7 +96,7 @@ def _unanswered(run: Run) -> dict[tuple[str, int], str]:
         for row in decisions.scenes.get(answer.scene, ()):
             if answer.role != "merge" or decisions["fusion_failed"][row] == 1.0:
                 errors.setdefault(
-                    (run.conditions[conditions[row]], int(numbers[row])), answer.error or ""
+                    (run.conditions[conditions[row]], int(numbers[row])), text(answer.error or "")
                 )
     return errors
 

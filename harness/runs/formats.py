@@ -383,7 +383,7 @@ def _table(record: Mapping[str, Any], in_file: Any) -> Any:
     places = [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
     for name, there in _flat(beside).items():
         typed = flat.get(name, there)
-        is_place = name == "model" and _is_path(typed) and typed in places
+        is_place = name == "model" and typed is not None and typed in places
         may_be = name in (*TYPED, *by_model) and (is_place or _may_be(typed, there))
         if typed != there and not may_be:
             both = f"{printable(flat[name], 60)}, and beside them it is {printable(there, 60)}"
@@ -448,11 +448,6 @@ def _may_be(typed: Any, names: Any) -> bool:
     each_typed = typed.split(",", len(each_name) - 1)
     pairs = zip(each_typed, each_name, strict=False)
     return len(each_typed) == len(each_name) and all(_is_called(text, name) for text, name in pairs)
-
-
-def _is_path(typed: Any) -> bool:
-    """Return whether what a user typed is a path or a hub id, and no name of a card."""
-    return isinstance(typed, str) and len(PurePath(typed).parts) > 1
 
 
 def _is_called(text: str, name: str) -> bool:

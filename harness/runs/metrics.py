@@ -72,6 +72,7 @@ class Metrics(Plugins[Metric]):
                 "point, of letters, digits and _, and one function, of decisions or of episodes; "
                 "a package's metric is not primary"
             )
+        plugin.unit.text(0.5)  # which fails here, and not where a page is written
 
 
 METRICS = Metrics("swarmdrive.metrics", Metric, {metric.name: metric for metric in BUILT_IN})

@@ -123,7 +123,6 @@ def _answer(row, said, n):
     """All but what is counted by: who answered, in which role, and how it was read."""
     row.update(
         raw=said(),
-        finish_reason=said(),
         error=said(),
         status=said(),
         verdict=VERDICTS[said.turn % 3],

@@ -103,7 +103,7 @@ def test_every_payload_is_shown_as_the_text_it_is(attacked):
     answers = [
         a for d in details(text).values() for run in d["runs"] if run for a in run["answers"]
     ]
-    for field in ("raw", "detail", "error", "status", "finish_reason"):
+    for field in ("raw", "detail", "error", "status"):
         said = {a[field] for a in answers}
         # What an engine says of an error has the names of files without their folders.
         payloads = (

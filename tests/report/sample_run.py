@@ -19,6 +19,7 @@ from harness.evaluate.requests import requests
 from harness.evaluate.table import table
 from harness.evaluate.walk import walk
 from harness.runs import formats, writer
+from harness.runs.answer_times import times
 from harness.runs.grid import Grid
 from harness.runs.records import Manifest
 from harness.runs.summary import Figures, counted
@@ -46,7 +47,10 @@ def write_run(
         "model": {"name": model, "engine": "rule", "description": "brakes for what it sees"},
         "prompt": {"version": "v2", "sha256": "00" * 32, "released": True},
         "latency": PAPER, "identity": {"engine": "rule"},
-        "cached_answers": 0, "engine_errors": 0,
+        "answer_times": times(answers),
+        "cached_answers": sum(answer.cached for answer in answers),
+        "engine_errors": sum(answer.error is not None for answer in answers),
+        "retries": sum(answer.retries for answer in answers),
         "versions": {**dataset.manifest.versions, "figures": str(FIGURES)},
     }  # fmt: skip
     writer.write(
