@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from evaluating import same_decisions
+from former import DRIVE
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import to_builtins
@@ -107,7 +108,7 @@ def test_a_sample_is_of_the_layouts_that_eval_draws_and_its_run_is_read_as_any(
     draw = ["--sample", "2", "--sample-seed", "3", "--seeds", "0:1", "--condition", "6g"]
     layouts = json.loads((small_path / "manifest.json").read_text())
     of = ("--episodes", str(layouts["episodes"]), "--first-seed", str(layouts["seed"]))
-    code, out, err = harness("drive", *draw, *of, "--workers", "1", "--out", "run")
+    code, out, err = harness(*DRIVE, *draw, *of, "--workers", "1", "--out", "run")
     assert (code, err) == (0, "")
     assert f"n = 2 episodes × 1 channel seed; of layout seeds {layouts['seed']} to" in out
     assert harness("eval", "--dataset", small_path, *draw, "--out", "frozen")[0] == 0
