@@ -15,6 +15,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core.versions import FIGURES
 from harness.radio.profiles import CHANNELS
 from harness.runs import folder, formats, writer
+from harness.runs.answer_counts import counts
 from harness.runs.answer_times import times
 from harness.runs.decisions import Decisions, schema
 from harness.runs.grid import Grid
@@ -184,9 +185,7 @@ def _write(
     manifest = msgspec.structs.replace(
         manifest,
         answer_times=times(answers),
-        cached_answers=sum(answer.cached for answer in answers),
-        engine_errors=sum(answer.error is not None for answer in answers),
-        retries=sum(answer.retries for answer in answers),
+        **counts(answers),
     )
     writer.write(out, manifest, decisions, episodes, [writer.lines(answers)], summary)
     return out

@@ -31,7 +31,7 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
     `specs` are the evaluations on them. Each scenario may have one dataset, latency must not be
     measured, and no model may be a replay.
     """
-    from harness.evaluate.latency import MEASURED
+    from harness.runs.records import MEASURED
 
     families = [spec.scenario.name for spec in specs]
     if twice := {family for family in families if families.count(family) > 1}:

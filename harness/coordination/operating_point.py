@@ -2,7 +2,7 @@
 model.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import chain
@@ -298,10 +298,14 @@ class OperatingPoint:
             channel = channel if loss is None else AtLoss(channel, loss)
         elif radio.loss is not None and getattr(channel, "density_coupled", False):
             raise self._wrong("loss", "left out where density_coupled is true; keep one of the two")
-        for part in self.more:
-            if is_ours_part(part):
-                channel = part.carried(self, channel)
+        for part in self._shipped:
+            channel = part.carried(self, channel)
         return channel
+
+    @cached_property
+    def _shipped(self) -> Sequence[Part]:
+        """Return the extensions' parts that ship; some hooks are not for packages' parts."""
+        return [part for part in self.more if is_ours_part(part)]
 
     @cached_property
     def physical(self) -> Physical | None:
@@ -316,8 +320,7 @@ class OperatingPoint:
         """
         if self.physical is None:
             return ()
-        ours = [part for part in self.more if is_ours_part(part)]
-        return tuple(chain(*(part.antennas for part in ours)))
+        return tuple(chain(*(part.antennas for part in self._shipped)))
 
     @cached_property
     def network(self) -> Network | None:
@@ -571,11 +574,10 @@ class OperatingPoint:
                 of the same shape or `(..., 1)`; both in s from the start of the ego's request.
             left_s: seconds from the start of the ego's request until it waits no longer, `(...)`.
         """
-        for part in self.more:
-            if is_ours_part(part):
-                consulted = part.ask(self, links, draws, ready, left_s)
-                if consulted is not None:
-                    return consulted
+        for part in self._shipped:
+            consulted = part.ask(self, links, draws, ready, left_s)
+            if consulted is not None:
+                return consulted
         return None
 
     def again(
@@ -598,9 +600,8 @@ class OperatingPoint:
         Returns:
             Both `sent` and `heard`, with the further messages.
         """
-        for part in self.more:
-            if is_ours_part(part):
-                sent, heard = part.again(self, sent, heard, decide)
+        for part in self._shipped:
+            sent, heard = part.again(self, sent, heard, decide)
         return sent, heard
 
     def _wrong(self, key: str, allowed: str) -> UserError:

@@ -18,11 +18,10 @@ from harness.core.arrays import Floats
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable
 from harness.evaluate.agent import Agent
-from harness.runs.records import Answer, Latency
+from harness.runs.records import MEASURED, Answer, Latency
 from harness.runs.timers import options
 
 PAPER = Latency("paper", "cited: SwarmDrive paper, single local 145.0 ms", 0.145, 0.145, 0.145)
-MEASURED = "measured"
 NAMES = ("card", MEASURED, "paper")
 EXAMPLE = "ego=0.171,helper=0.164,fusion=0.2"
 

@@ -20,7 +20,7 @@ from harness.evaluate import latency as latencies
 from harness.evaluate.spec import Spec
 from harness.runs import folder, formats
 from harness.runs.formats import EXTENSIONS
-from harness.runs.records import Latency, Manifest, Score
+from harness.runs.records import MEASURED, Latency, Manifest, Score
 from harness.runs.settings import PLAIN, difference, of_words, words
 from harness.runs.stopping import STOPPING_RULES, InterimLooks
 
@@ -134,7 +134,7 @@ def as_finished(spec: Spec, run_start: RunStart, looks: InterimLooks | None = No
     """
     spec = spec.changed(tag=tuple(dict.fromkeys((*run_start.tags, *spec.settings.tag))))
     # A repeat must not measure: other times would make other rows.
-    if spec.settings.latency == latencies.MEASURED:
+    if spec.settings.latency == MEASURED:
         spec = spec.changed(latency=latencies.as_declared(run_start.latency))
     evaluated = spec.stopped(looks) if looks else spec
     record = {**evaluated.record(), "settings": msgspec.to_builtins(spec.settings)}
@@ -159,12 +159,14 @@ def unfinished(spec: Spec, out: Path, shard: str = "") -> RunStart | None:
         stored = {**_comparable(run_start.settings), "shard": run_start.shard}
         work.same(out, now, stored, partial(_options, spec, shlex.join(run_start.command)))
         work.same(out, rules(versions()), rules(run_start.versions))
-        stored_versions = run_start.versions
-        for name, version in package_versions().items():
-            if name in stored_versions:
-                package = f"version of package {name}"
-                work.same(out, {package: version}, {package: stored_versions[name]})
+        packages = package_versions()
+        began_with = {name: run_start.versions.get(name, packages[name]) for name in packages}
+        work.same(out, _of_packages(packages), _of_packages(began_with))
     return run_start
+
+
+def _of_packages(versions: Mapping[str, str]) -> dict[str, str]:
+    return {f"version of package {name}": version for name, version in versions.items()}
 
 
 def _options(spec: Spec, command: str) -> str:

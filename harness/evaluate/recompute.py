@@ -41,7 +41,7 @@ from harness.evaluate.spec import Source, Spec
 from harness.evaluate.texts import OF_TEXTS, others, same
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
-from harness.runs.records import Episode, FrozenScenes, Latency
+from harness.runs.records import MEASURED, Episode, FrozenScenes, Latency
 from harness.runs.stopping import looked_otherwise
 from harness.runs.unanswered import Tally
 from harness.world import scenarios
@@ -137,10 +137,7 @@ def differences(
         return [*alone, *_of_rule(lack.otherwise), lacks], []
     wrong = [
         *alone,
-        *_of_scenes(run, ours),
-        *_of_episodes(run, ours),
-        *_of_decisions(run, ours),
-        *_of_answers(run, ours),
+        *_of_tables(run, ours, ("path",)),
     ]
     if list(map(astuple, run.layouts)) != list(map(astuple, ours.layouts)) and run.layouts:
         wrong.append("difficulty.csv is not what the trees of the dataset say of its layouts")
@@ -205,10 +202,7 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
         else:
             wrong = [
                 *_of_manifest(run, spec.ego.card),
-                *_of_scenes(run, ours, ("path", "interim_looks")),
-                *_of_episodes(run, ours),
-                *_of_decisions(run, ours),
-                *_of_answers(run, ours),
+                *_of_tables(run, ours, ("path", "interim_looks")),
                 *_of_rule(otherwise),
             ]
     if spec.stopping_rule and looks:
@@ -274,7 +268,18 @@ def _of_manifest(run: Run, card: Card) -> Iterator[str]:
     yield from records_otherwise(run)
 
 
-def _of_scenes(run: Run, ours: Run, besides: Collection[str] = ("path",)) -> Iterator[str]:
+def _of_tables(run: Run, ours: Run, besides: Collection[str]) -> Iterator[str]:
+    """Yield what a run states of its scenes and in its tables otherwise than the one made here.
+
+    `besides` are fields of its scenes that are not compared.
+    """
+    yield from _of_scenes(run, ours, besides)
+    yield from _of_episodes(run, ours)
+    yield from _of_decisions(run, ours)
+    yield from _of_answers(run, ours)
+
+
+def _of_scenes(run: Run, ours: Run, besides: Collection[str]) -> Iterator[str]:
     """Yield what run.json states of its scenes otherwise than they are.
 
     `besides` are fields that are not compared.
@@ -293,7 +298,6 @@ def _of_agents(run: Run) -> Iterator[str]:
     for card in models:
         if card.engine == DRIVER and card.privileged != card_here(card).privileged:
             yield "run.json says of a driver that it sees other than it does"
-    for card in models:
         cost = (manifest.cost or {}).get(card.name)
         if cost and card.price:
             amount_here = card.price.of(cost.read_tokens, cost.written_tokens)
@@ -352,9 +356,9 @@ def _of_latency(run: Run) -> Iterator[str]:
     if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
         yield "run.json has another latency than the paper, which it names as the source"
     of_ego = latency.sample.get("ego")
-    if latency.source == latencies.MEASURED and of_ego and of_ego.median_s != latency.ego_s:
+    if latency.source == MEASURED and of_ego and of_ego.median_s != latency.ego_s:
         yield "run.json has another measured latency than the median of its sample"
-    if latency.source in ("declared", latencies.MEASURED) and not _is_typed(run):
+    if latency.source in ("declared", MEASURED) and not _is_typed(run):
         yield f"run.json has times that are {latency.source}, and its settings do not have them"
     if latency.source in ("card", "paper"):
         others = {"a fusion call": latency.fusion_s}

@@ -54,7 +54,7 @@ from harness.evaluate.spec import Spec
 from harness.evaluate.table import of_all_seeds, table
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import walk
-from harness.runs import answer_times, folder, run_parts, stopping, writer
+from harness.runs import answer_counts, answer_times, folder, run_parts, stopping, writer
 from harness.runs import sources as kept_sources
 from harness.runs.contradictions import sound
 from harness.runs.decisions import Decisions
@@ -62,7 +62,15 @@ from harness.runs.difficulty import Layout, adjusted_scores
 from harness.runs.formats import FORMAT, LOOKS
 from harness.runs.grid import Grid
 from harness.runs.metrics import metrics_of
-from harness.runs.records import Answer, AnswerFacts, ClosedLoop, Episode, Latency, Manifest
+from harness.runs.records import (
+    MEASURED,
+    Answer,
+    AnswerFacts,
+    ClosedLoop,
+    Episode,
+    Latency,
+    Manifest,
+)
 from harness.runs.settings import FILE, of_words, text_of
 from harness.runs.stopping import InterimLooks
 from harness.runs.summary import Figures, counted
@@ -122,7 +130,7 @@ def evaluate(
     metrics_of(spec.source.kind)  # of packages, which must load before anything is asked
     refuse_finished(out)
     run_start = unfinished(spec, out)
-    if not run_start and spec.settings.latency == latencies.MEASURED:
+    if not run_start and spec.settings.latency == MEASURED:
         timing.refuse_busy()
     if opens or isinstance(spec.source, FrozenSource):
         return _walk_here(spec, out, run_start, progress, cache, more, opens, given, workers)
@@ -335,7 +343,7 @@ def _check_measured(out: Path, place: Path, run_start: RunStart, resumes: bool) 
 
     Those of a run that begins are sealed.
     """
-    if run_start.latency.source != latencies.MEASURED:
+    if run_start.latency.source != MEASURED:
         return
     record = place / CONFIG
     if not resumes:
@@ -402,9 +410,9 @@ def _begin_driving(
     spec: Spec, out: Path, run_start: RunStart | None, workers: Workers, shard: str = ""
 ) -> tuple[RunStart, list[Sequence[int]]]:
     """Return the record that a closed-loop run begins with, and the chunks of its episodes."""
-    if spec.settings.latency == latencies.MEASURED and (shard or not isinstance(workers, int)):
+    if spec.settings.latency == MEASURED and (shard or not isinstance(workers, int)):
         raise UserError(
-            f"--latency {latencies.MEASURED} is of one machine, and this is driven on several; "
+            f"--latency {MEASURED} is of one machine, and this is driven on several; "
             "measure on one, and declare that: ego=SECONDS,helper=SECONDS,fusion=SECONDS"
         )
     identity, latency = _stated_in_worker(spec, run_start, workers)
@@ -643,9 +651,7 @@ def _gather(
                 "latency": msgspec.to_builtins(run_start.latency),
                 "answer_times": msgspec.to_builtins(answer_times.times(answers)),
                 "identity": run_start.identity,
-                "cached_answers": sum(answer.cached for answer in answers),
-                "engine_errors": sum(answer.error is not None for answer in answers),
-                "retries": sum(answer.retries for answer in answers),
+                **answer_counts.counts(answers),
                 "versions": run_start.versions,
             },
             Manifest,
@@ -700,7 +706,7 @@ def _latency(spec: Spec, run_start: RunStart | None, models: Sequence[Backend]) 
     if run_start is None:
         return declared or timing.measured(spec, together(spec.cards, models), _trial(spec))
     began = run_start.latency
-    is_measured = declared is None and began.source == latencies.MEASURED
+    is_measured = declared is None and began.source == MEASURED
     if not is_measured and (declared is None or not latencies.same_times(began, declared)):
         raise UserError(
             f"the run began with times of answers from {printable(began.source)} that its settings "
@@ -762,7 +768,7 @@ def finished_run(spec: Spec, out: Path) -> folder.Run:
 
     folder_in(out.parent, out.name)
     run = sound(out)
-    if spec.settings.latency == latencies.MEASURED:
+    if spec.settings.latency == MEASURED:
         begun_with = work.start_of(out, RunStart)
         if begun_with is None or begun_with.latency != run.manifest.latency:
             raise _not_measured_here(out)

@@ -25,13 +25,13 @@ from harness.dataset.load import Scene
 from harness.dataset.select import SELECTIONS, Choice
 from harness.evaluate.agent import Agent, example_actions
 from harness.evaluate.command_options import Guard
-from harness.evaluate.latency import MEASURED, NAMES, declared
+from harness.evaluate.latency import NAMES, declared
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs import formats, role_agents
 from harness.runs.folder import read
 from harness.runs.metric import World
-from harness.runs.records import ClosedLoop, FrozenScenes, Manifest
+from harness.runs.records import MEASURED, ClosedLoop, FrozenScenes, Manifest
 from harness.runs.settings import (
     DriveSettings,
     FrozenSettings,

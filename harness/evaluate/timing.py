@@ -10,11 +10,11 @@ from harness.backends.base import Backend
 from harness.core.errors import Unanswered, UserError, printable
 from harness.dataset.load import Scene
 from harness.evaluate.answers import answer_of
-from harness.evaluate.latency import EXAMPLE, MEASURED
+from harness.evaluate.latency import EXAMPLE
 from harness.evaluate.requests import fusion_request, requests
 from harness.evaluate.spec import Spec
 from harness.runs.answer_times import times
-from harness.runs.records import Latency
+from harness.runs.records import MEASURED, Latency
 from harness.runs.unanswered import Tally
 
 SCENES = 5  # how many scenes are timed
@@ -86,4 +86,4 @@ def measured(spec: Spec, backend: Backend, scenes: Sequence[Scene]) -> Latency:
         helper_times.append(of_agent.get("helper", sample["ego"]).median_s)
     basis = f"median of single requests (batch 1) before the run, at most {IDLE:g} processes a core"
     helper_s = helper_times[0] if helper_times else helper_s
-    return Latency("measured", basis, ego_s, helper_s, fusion_s, sample, tuple(helper_times))
+    return Latency(MEASURED, basis, ego_s, helper_s, fusion_s, sample, tuple(helper_times))

@@ -8,9 +8,9 @@ from msgspec import structs
 from harness.core.errors import UserError, printable
 from harness.runs import formats
 from harness.runs.folder import Run
+from harness.runs.records import MEASURED
 from harness.world.scenario import Scenario
 
-MEASURED = "measured"  # source of a latency that each run measures for itself
 # what conditions open: a run with other conditions opens others
 OPENED = ("radio", "network", "schedule", "file")
 

@@ -40,11 +40,13 @@ class Answers:
 
     Attributes:
         by_scene: the answers about each scene, by the scene's id.
+        errors: how many of them are an engine's error.
     """
 
     def __init__(self, lines: bytes, actions: int) -> None:
         """Check the lines of a run with so many actions. Raises ValueError for a broken one."""
         self._lines, self._count, self._actions = lines, 0, actions
+        self.errors = 0
         # of lines that stand together and are of one decision point
         self._spans: list[tuple[int, int]] = []
         of_scene: dict[str, list[int]] = {}  # places in `_spans`
@@ -81,6 +83,7 @@ class Answers:
                 keys.add(answer.key)
                 self._spans[-1] = self._spans[-1][0], stop
                 self._count += 1
+                self.errors += answer.error is not None
             start = stop
         self.by_scene: Mapping[str, list[Answer]] = _ByScene(self, of_scene)
 

@@ -9,6 +9,7 @@ without the entry.
 import re
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import cache
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -535,15 +536,23 @@ def _condition(table: Mapping[str, Any]) -> dict[str, Any]:
 
     2026-11-29: settings of extensions are left out where they do nothing.
     """
-    from harness.coordination.operating_point import OperatingPoint, as_here
+    from harness.coordination.operating_point import as_here
 
     renamed = {name: value for name, value in table.items() if name != "roadside_edge"}
     if table.get("roadside_edge") is True:
         renamed["edge"] = "relay"
     complete = _with(CONDITION, renamed)
+    return as_here({**_plain_condition(), **complete})
+
+
+@cache
+def _plain_condition() -> Mapping[str, Any]:
+    """Return the core's settings of a condition, by name, at their defaults."""
+    from harness.coordination.operating_point import OperatingPoint
+
     plain = OperatingPoint("any").record()
     del plain["name"]
-    return as_here({**plain, **complete})
+    return plain
 
 
 def checked(version: object, file: object) -> None:

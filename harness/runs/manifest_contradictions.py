@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from harness.core.errors import printable
+from harness.runs.answer_counts import counts
 from harness.runs.answer_times import times
 from harness.runs.folder import Run
 from harness.runs.records import Answer
@@ -16,23 +17,14 @@ def of_manifest(run: Run, answers: Iterable[Answer], *, current: bool) -> Iterat
     rules for figures, may lack records, and its times of answers are not compared.
     """
     answers = list(answers)
-    yield from _of_counts(run, answers)
+    for name, count in counts(answers).items():
+        in_manifest = getattr(run.manifest, name)
+        if in_manifest != count:
+            yield f"run.json has {name} {in_manifest}, and answers.jsonl has {count}"
     if current and run.manifest.answer_times != times(answers):
         yield "run.json has another answer_times than its answers took"
     yield from _of_cost(run)
     yield from _of_records(run, current)
-
-
-def _of_counts(run: Run, answers: list[Answer]) -> Iterator[str]:
-    counts = {
-        "cached_answers": sum(answer.cached for answer in answers),
-        "engine_errors": sum(answer.error is not None for answer in answers),
-        "retries": sum(answer.retries for answer in answers),
-    }
-    for name, count in counts.items():
-        in_manifest = getattr(run.manifest, name)
-        if in_manifest != count:
-            yield f"run.json has {name} {in_manifest}, and answers.jsonl has {count}"
 
 
 def _of_cost(run: Run) -> Iterator[str]:

@@ -53,7 +53,8 @@ def role_word(role: str) -> str:
 
 
 # What the seconds of a latency come from: a model's card, the user, a measurement, the paper.
-SOURCES = ("card", "declared", "measured", "paper")
+MEASURED = "measured"
+SOURCES = ("card", "declared", MEASURED, "paper")
 ASKED = "~"  # in the key of an answer, before the name of the question where it is another one
 REWRITTEN = "!"  # in a sender's key, before the attack and the defences that change its message
 MOST_LETTERS = 300  # of a name

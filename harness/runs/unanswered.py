@@ -88,7 +88,7 @@ def tally(run: Run) -> Tally:
 
     A role is who is asked: `ego`, `helper` or `merge` (the ego after it heard messages).
     """
-    return Tally(run.answers)
+    return Tally(run.answers if run.answers.errors else ())
 
 
 def lacking(run: Run) -> Iterator[Answer]:

@@ -19,6 +19,7 @@ from harness.evaluate.requests import requests
 from harness.evaluate.table import table
 from harness.evaluate.walk import walk
 from harness.runs import formats, writer
+from harness.runs.answer_counts import counts
 from harness.runs.answer_times import times
 from harness.runs.grid import Grid
 from harness.runs.records import Manifest
@@ -48,9 +49,7 @@ def write_run(
         "prompt": {"version": "v2", "sha256": "00" * 32, "released": True},
         "latency": PAPER, "identity": {"engine": "rule"},
         "answer_times": times(answers),
-        "cached_answers": sum(answer.cached for answer in answers),
-        "engine_errors": sum(answer.error is not None for answer in answers),
-        "retries": sum(answer.retries for answer in answers),
+        **counts(answers),
         "versions": {**dataset.manifest.versions, "figures": str(FIGURES)},
     }  # fmt: skip
     writer.write(

@@ -197,8 +197,8 @@ def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "
     Raises UserError for what can be told to be wrong before any work.
     """
     from harness.evaluate import resolve
-    from harness.evaluate.latency import MEASURED
     from harness.prompts.versions import unfit
+    from harness.runs.records import MEASURED
 
     if budget < 1:
         raise UserError(

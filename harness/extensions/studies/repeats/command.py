@@ -94,7 +94,7 @@ def _check(spec: "Spec", repeats: int) -> None:
 
     Its answers must be sampled, its latency must not be measured, and it must not stop early.
     """
-    from harness.evaluate.latency import MEASURED
+    from harness.runs.records import MEASURED
 
     in_range("--repeats", repeats, 2, MOST)
     if rule := spec.stopping_rule:
