@@ -85,7 +85,7 @@ def test_half_of_the_answers_unread_are_said_by_role(done: Evaluated) -> None:
 
 @pytest.mark.parametrize("engine", ["proxy", "driver"])
 def test_a_rule_reads_no_prompt_and_says_so(done: Evaluated, engine: str) -> None:
-    assert said_of(Run(done.out, with_engine(done, engine)), Kind.CAVEAT) == [NO_PROMPT]
+    assert said_of(Run(done.out, with_engine(done, engine)), Kind.LIMIT)[-1] == NO_PROMPT
 
 
 def test_several_rules_are_named_in_one_sentence(done: Evaluated) -> None:
@@ -135,7 +135,8 @@ def test_whatever_shows_a_run_says_the_same_of_it_in_the_same_order(
     Path("models").mkdir()
     Path("models/mute.toml").write_text(CARD)
     options = ("--dataset", small_path, "--seeds", "0", "--condition", "6g", "--ties", "first")
-    code, terminal, err = harness("eval", "--model", "mute", *options, "--out", "run")
+    typed = ("eval", "--model", "mute", *options, "--verbose", "--out", "run")
+    code, terminal, err = harness(*typed)
     assert (code, err) == (0, "")
     every = said_of(folder.read(Path("run")), *FIRST)
     assert len(every) > 4
@@ -221,6 +222,7 @@ def test_a_page_says_what_else_bounds_its_numbers(small: Dataset, tmp_path: Path
         "6g:messages=blind is a control: the ego hears helpers that are shown nothing.",
         "Under v2x, most decisions take longer than these frozen scenes assume: closed-loop "
         "success may differ. harness study fidelity compares the two.",
+        NO_PROMPT,
     ]
 
 

@@ -11,6 +11,7 @@ from shutil import copytree
 import pytest
 from evaluating import same_files
 
+from harness.core import resources
 from harness.core.resources import DATASET
 from harness.dataset import load
 from harness.runs.estimates import written
@@ -28,16 +29,23 @@ def test_it_prints_a_table_and_where_the_report_is(
     code, out, err = harness("eval", "--dataset", small_path, "--limit", "2", "--seeds", "0:2")
     folder = Path("reports/proxy-v2-small")
     assert (code, err) == (0, "")
-    assert max(map(len, out.splitlines())) <= 80
+    lines = out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert len(lines) <= 15
     for part in (
-        "success % [95 % CI]",
+        "proxy · prompt v2 (not read) · json · small",
+        "asked: ego 14 (100.0 % read), helper 33 (100.0 % read)",
+        "success, % [95 % CI]",
         "single-local",
         "v2x",
         "6g",
+        "local-view",
+        "uniform",
         "n = 2 episodes × 2 channel seeds",
+        "note: Only 2 episodes: the interval of a rate may reach 69 points",
     ):
         assert part in out
-    assert out.splitlines()[-1] == f"wrote {folder / 'report.html'}"
+    assert lines[-2] == f"wrote {folder / 'report.html'}"
     assert {p.name for p in folder.iterdir()} >= {
         "run.json",
         "answers.jsonl",
@@ -46,14 +54,80 @@ def test_it_prints_a_table_and_where_the_report_is(
         "summary.csv",
         "report.html",
     }
+    verbose = ("--dataset", small_path, "--limit", "2", "--seeds", "0:2", "--verbose")
+    code, out, _ = harness("eval", *verbose, "--out", "again")
+    assert code == 0
     assert "gain, points" in out, (
         "and of balanced success there is none: both layouts have a danger"
     )
 
 
+@pytest.mark.parametrize(
+    ("typed", "of_run", "next_command"),
+    [
+        (("--limit", "2"), "proxy", "harness eval one --model local-view"),
+        (("--condition", "6g"), "proxy", "harness eval one --model local-view"),
+        (("--condition", "6g"), "local-view", "harness eval one --model proxy"),
+    ],
+)
+def test_it_ends_with_the_command_that_fits(
+    typed: tuple[str, ...], of_run: str, next_command: str, harness: Callable[..., Said],
+    small_path: Path,
+) -> None:  # fmt: skip
+    command = ("eval", "--dataset", small_path, "--limit", "2", "--seeds", "0:2")
+    code, out, _ = harness(*command, *typed, "--model", of_run, "--out", "one")
+    assert code == 0
+    assert out.splitlines()[-1] == f"next: {next_command}"
+    assert "6g over single-local" not in out, "both layouts end alike under every condition"
+    following = harness(*shlex.split(next_command)[1:])
+    assert following[0] == 0, following[2]
+
+
+@pytest.mark.slow
+def test_a_gain_that_is_not_clear_ends_with_a_plan(harness: Callable[..., Said]) -> None:
+    code, out, _ = harness("eval", "--limit", "8", "--out", "pilot")
+    lines = out.splitlines()
+    assert (code, len(lines)) == (0, 15)
+    [verdict] = [line for line in lines if line.startswith("6g over single-local: ")]
+    assert verdict.endswith(", not clear")
+    assert lines[-1] == "next: harness plan pilot"
+    assert harness("plan", "pilot")[0] == 0
+
+
+def test_a_second_run_of_the_same_scenes_is_compared_with_the_first(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
+    command = ("eval", "--dataset", small_path, "--limit", "2", "--condition", "6g")
+    assert harness(*command, "--out", "one")[0] == 0
+    _, out, _ = harness(*command, "--model", "local-view", "--out", "other")
+    assert out.splitlines()[-1] == "next: harness compare one other"
+    code, out, err = harness("compare", "one", "other")
+    lines = out.splitlines()
+    assert (code, err, len(lines) <= 15) == (0, "", True)
+    assert [line.split()[0] for line in lines[-1:]] == ["next:"]
+    assert "balanced success, %" in out or "success, %" in out
+    _, out, _ = harness(*command, "--seeds", "7", "--out", "third")
+    assert "next: harness compare" not in out, "nothing has its channel seeds"
+
+
+def test_answers_that_cannot_be_read_ask_for_another_prompt(
+    harness: Callable[..., Said], small_path: Path
+) -> None:
+    command = ("eval", "--dataset", small_path, "--limit", "2", "--model", "proxy-broken")
+    Path(resources.MARKER).touch()
+    Path("models").mkdir()
+    card = resources.find("models", "proxy.toml").read_text()
+    Path("models/proxy-broken.toml").write_text(f"{card}\n[failures]\ntruncation = 1.0\n")
+    code, out, _ = harness(*command, "--out", "one")
+    assert code == 0
+    assert "None of the ego's 34 answers could be read" in out
+    assert out.splitlines()[-1] == "next: harness prompt check v2 --model proxy-broken"
+
+
 @pytest.mark.slow
 def test_the_gain_is_of_what_leads(harness: Callable[..., Said], small_path: Path) -> None:
-    code, out, _ = harness("eval", "--dataset", small_path, "--seeds", "0", "--out", "run")
+    command = ("eval", "--dataset", small_path, "--seeds", "0", "--verbose")
+    code, out, _ = harness(*command, "--out", "run")
     assert code == 0
     lines = out.splitlines()
     assert max(map(len, lines)) <= 80
@@ -66,9 +140,7 @@ def test_the_gain_is_of_what_leads(harness: Callable[..., Said], small_path: Pat
     assert plain is not None
     assert gain.value != plain.value
     assert written(gain) in row
-    _, out, _ = harness(
-        "eval", "--dataset", small_path, "--seeds", "0", "--condition", "6g", "--out", "6g"
-    )
+    _, out, _ = harness(*command, "--condition", "6g", "--out", "6g")
     assert "balanced success" in out
     assert "gain" not in out, "there is no condition to gain over"
 

@@ -6,9 +6,12 @@ from pathlib import Path
 import typer
 
 from harness.cli import options
+from harness.cli.next_command import after_comparison
 from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import refuse_data
+
+LISTED = 10  # episodes, decisions and requests of each kind that are listed
 
 
 def command(
@@ -26,8 +29,10 @@ def command(
         "on every "
         "condition. Repeatable. Exit code 1 if a gate fails.",
     ),
-    show: int = typer.Option(
-        10, help="Number of episodes, decisions and requests to list of each kind."
+    show: int | None = typer.Option(
+        None,
+        help="Number of episodes, decisions and requests to list of each kind; implies --verbose. "
+        f"Default: {LISTED}.",
     ),
     html: Path | None = typer.Option(
         None, help="Also write the comparison as a page to this file."
@@ -44,6 +49,7 @@ def command(
         False, "--markdown", help="Print Markdown, such as for a comment on a pull request."
     ),
     as_json: options.Json = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Show what changed from run A to B, by episode and seed. Exit code 1 if a gate fails."""
     from harness.report.compare import text
@@ -55,7 +61,9 @@ def command(
 
     if as_markdown and as_json:
         raise UserError("--markdown and --json: give one of them")
-    in_range("--show", show, 0, 100_000)
+    verbose = verbose or every or show is not None
+    most = LISTED if show is None else show
+    in_range("--show", most, 0, 100_000)
     for option, file in (("--html", html), ("--junit", junit)):
         if file and file.is_dir():
             raise UserError(f"{option} {printable(file)} is a folder; name a file in it")
@@ -83,13 +91,16 @@ def command(
 
         lacking = difference.prompts
         refuse_less(html, {"prompts": lacking} if isinstance(lacking, str) else {}, "--html")
-        save([page.render(difference, verdicts, show, page.beside(html))], html, "--html")
+        save([page.render(difference, verdicts, most, page.beside(html))], html, "--html")
     if junit:
         save([text.junit(difference, verdicts)], junit, "--junit")
     if as_json:
-        echo_json(text.mapping(difference, verdicts, show))
+        echo_json(text.mapping(difference, verdicts, most))
+    elif as_markdown:
+        typer.echo(text.markdown(difference, verdicts, most, every))
+    elif verbose:
+        typer.echo(text.terminal(difference, verdicts, most, every))
     else:
-        typer.echo(
-            (text.markdown if as_markdown else text.terminal)(difference, verdicts, show, every)
-        )
+        typer.echo(text.brief(difference, verdicts))
+        after_comparison(difference)
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)

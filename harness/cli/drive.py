@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import typer
 
-from harness.cli import options
+from harness.cli import brief, options
+from harness.cli.next_command import after_run
 from harness.cli.progress import bar
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show
 from harness.cli.terminal import echo_json
@@ -78,6 +79,7 @@ def command(
     full: options.OldFullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Drive episodes in closed loop, in highway-env.
 
@@ -86,6 +88,7 @@ def command(
     from harness.backends.cache import default_file
     from harness.evaluate import command_options, resolve
     from harness.evaluate.run import evaluate_shard
+    from harness.runs.folder import read
     from harness.world.scenarios import DEFAULT
 
     world: Any = settings.world
@@ -142,7 +145,7 @@ def command(
             then=draw,
             follows=follows,
         )
-    tell(done, as_json, quiet)
+    tell(done, as_json, quiet, verbose)
     if silent:
         return
     if videos:
@@ -152,6 +155,7 @@ def command(
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
     typer.echo(f"wrote {printable(page)}")
+    after_run(read(where))
 
 
 def deciding(scenario: str, agents: str) -> str:
@@ -184,10 +188,10 @@ def deciding(scenario: str, agents: str) -> str:
     return f"{scenario}{',' if ':' in scenario else ':'}{SHARE}={share}"
 
 
-def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
-    """Print a driven run's results as a table, or as JSON if `as_json`; nothing if `quiet`.
+def tell(done: "Evaluated", as_json: bool, quiet: bool, verbose: bool = False) -> None:
+    """Print a driven run's results in few lines, or as JSON if `as_json`; nothing if `quiet`.
 
-    `done` is the run, as it was just evaluated in the simulator.
+    `done` is the run, as it was just evaluated in the simulator; `verbose` prints all tables.
     """
     from harness.runs.folder import read
 
@@ -197,14 +201,20 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool) -> None:
         return
     world = cast("ClosedLoop", done.manifest.world)
     drawn_from = world.selection.get("of")
+    n = (
+        f"{crossed(world.episodes, len(done.manifest.seeds))}; {'of ' if drawn_from else ''}"
+        f"{seeds_text(world.first_seed, drawn_from or world.episodes)}"
+    )
+    scenes = f"closed loop · {world.title}"
+    if not verbose:
+        brief.show(read(done.out), scenes, n)
+        return
     notes = (
-        f"n = {crossed(world.episodes, len(done.manifest.seeds))}; "
-        f"{'of ' if drawn_from else ''}"
-        f"{seeds_text(world.first_seed, drawn_from or world.episodes)};\n"
+        f"n = {n};\n"
         "95 % intervals over episodes; missed: decisions longer than the decision window;\n"
         "gap: smallest distance to a vehicle; clear: time until the ego had cleared, if\n"
         "it did; both are means over episodes",
     )
     several = any(score.metric == "arrived_rate" for score in done.scores)
     columns = tuple(TIME_OUT if several and each == LATE else each for each in COLUMNS)
-    show(done, f"closed loop · {world.title}", columns, notes)
+    show(done, scenes, columns, notes)

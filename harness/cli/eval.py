@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from harness.cli import options, suite
+from harness.cli import brief, options, suite
+from harness.cli.next_command import after_run
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show, walked
 from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
@@ -51,6 +52,7 @@ def command(
     full: options.OldFullPage = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Evaluate a model with a prompt on frozen scenes.
 
@@ -96,33 +98,39 @@ def command(
             evaluate, cache=cache, quiet=silent, workers=who, full=full, follows=follows
         )
         if named_suite:
-            suite.evaluate(named_suite, specs, datasets, out, evaluated, quiet, as_json)
+            suite.evaluate(named_suite, specs, datasets, out, evaluated, quiet, as_json, verbose)
             return
         done, page = evaluated(specs[0], out or default_out(specs[0]))
     if as_json:
         echo_json(as_mapping(read(done.out)))
     if not silent:
         selected = sources[0].choice is not None
-        _show(done, walked(datasets[0], done), len(specs[0].seeds), selected)
+        _show(done, walked(datasets[0], done), len(specs[0].seeds), selected, verbose)
         typer.echo(f"wrote {printable(page)}")
+        after_run(read(done.out))
 
 
-def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool) -> None:
-    """Print a run's table beside the references that need no model.
+def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool, verbose: bool) -> None:
+    """Print a run's result beside the references that need no model, in few lines or all.
 
     `selected` is whether its episodes are some of the dataset's.
     """
     from harness.report.references import BESIDE, in_trees, label, meaning
+    from harness.runs.folder import read
 
+    episodes = dataset.manifest.episodes if selected else len(dataset.episodes)
+    layout_seeds = seeds_text(dataset.manifest.seed, episodes)
+    n = f"{crossed(len(dataset.episodes), seeds)}; {'of ' * selected}{layout_seeds}"
     every_reference = in_trees(dataset)
+    if not verbose:
+        brief.show(read(done.out), dataset.name, n, every_reference)
+        return
     references = {name: every_reference[name] for name in BESIDE if name in every_reference}
     gain = GAINS[headline.headline_of(done)]
     has_gain = any(score.metric == gain.metric for score in done.scores)
     columns = (SUCCESS, gain, *COLUMNS) if has_gain else (SUCCESS, *COLUMNS)
-    episodes = dataset.manifest.episodes if selected else len(dataset.episodes)
-    layout_seeds = seeds_text(dataset.manifest.seed, episodes)
     notes = [
-        f"n = {crossed(len(dataset.episodes), seeds)}; {'of ' * selected}{layout_seeds};",
+        f"n = {n};",
         "95 % intervals over episodes; msgs: per episode"
         + "; gain: over single-local, paired" * has_gain,
         *(meaning(name) for name in references),

@@ -184,6 +184,14 @@ Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
 _QUIET = "Print only errors, and the JSON of --json."
 Quiet = Annotated[bool, Option("--quiet", help=_QUIET)]
 QuietOutput = Annotated[bool, Option("--quiet", help=_QUIET, rich_help_panel=stated.OUTPUT)]
+Verbose = Annotated[
+    bool,
+    Option(
+        "--verbose",
+        help="Print every table and note, which the page has as well.",
+        rich_help_panel=stated.OUTPUT,
+    ),
+]
 
 
 def takes(

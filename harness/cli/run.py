@@ -53,11 +53,11 @@ class Column:
         return written(score) if self.interval else entry(score.metric).unit.text(score.value)
 
 
-BALANCED = (
-    Column("balanced success % [95 % CI]", "balanced_success_rate", interval=True),
+HALVES = (
     Column("with a danger", "success_dangerous_rate", interval=True),
     Column("without", "success_harmless_rate", interval=True),
 )
+BALANCED = (Column("balanced success % [95 % CI]", headline.BALANCED, interval=True), *HALVES)
 
 
 # Rows of success by who can tell of the danger; the first stands for layouts without one.
@@ -295,26 +295,32 @@ def show(
         rows[name] = {each.metric: figures.get((name, each.metric)) for each in every_column}
     rows |= beside or {}
     if headline.headline_of(done) == headline.BALANCED:
-        _scores_table(BALANCED, rows)
+        scores_table(BALANCED, rows)
         halves = [rows[names[0]][column.metric] for column in BALANCED[1:]]
         episodes = " and ".join(str(half.n) for half in halves if half)
         text.print(f"balanced: mean of both, of {episodes} episodes\n")
-    _scores_table(columns, rows)
+    scores_table(columns, rows)
     by_witnesses(figures, names)
     below = [finding.sentence for finding in findings(run, Kind.FIGURE, *LAST)]
     for note in (*notes, *below):
         text.print(note)
 
 
-def _scores_table(
-    columns: Sequence[Column], rows: "Mapping[str, Mapping[str, Score | None]]"
+def scores_table(
+    columns: Sequence[Column],
+    rows: "Mapping[str, Mapping[str, Score | None]]",
+    head: str = "condition",
 ) -> None:
-    """Print scores by metric, a row a condition or reference."""
+    """Print scores as a table, a row for each condition or reference.
+
+    A condition is a set of settings, by its name, that a run scores; a reference needs no model.
+    `rows` has the scores of each by metric, and `head` stands above the names of the rows.
+    """
     lines = []
     for name, scores in rows.items():
         cells = [column.cell(scores.get(column.metric)) for column in columns]
         lines.append((name, *cells))
-    table(("condition", *(column.head for column in columns)), lines)
+    table((head, *(column.head for column in columns)), lines)
 
 
 def by_witnesses(figures: "Mapping[tuple[str, str], Score]", conditions: Sequence[str]) -> None:

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import typer
 
+from harness.cli import brief
+from harness.cli.next_command import after_suite
 from harness.cli.run import RunGroup, as_mapping, free_folder
-from harness.cli.terminal import console, echo_json, table
+from harness.cli.terminal import console, echo_json, echo_text, table
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount, interval_of
 from harness.core.formats import SUITE, WORK
@@ -61,6 +63,7 @@ def evaluate(
     evaluated: Callable[..., Any],
     quiet: bool,
     as_json: bool,
+    verbose: bool = False,
 ) -> Path:
     """Evaluate on every dataset of a suite with one backend; write and print the means.
 
@@ -75,6 +78,7 @@ def evaluate(
             folder, and what opens a backend.
         quiet: whether to show no progress.
         as_json: whether to print JSON instead of tables.
+        verbose: whether to print all tables, and not only what the suite comes to.
     """
     from harness.backends.registry import open_backend
     from harness.evaluate.run import finished_run
@@ -102,8 +106,9 @@ def evaluate(
     if as_json:
         echo_json(_mapping(done, lines))
     elif not quiet:
-        _show(done, lines)
+        (_show if verbose else _show_briefly)(done, lines)
         typer.echo(f"wrote {printable(page)}")
+        after_suite(done.variant.model, done.name)
     return folder
 
 
@@ -157,6 +162,33 @@ def _show(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     )
     for finding in findings(done, *LAST):
         text.print(finding.sentence)
+
+
+def _show_briefly(done: "SuiteRun", lines: "Sequence[Line]") -> None:
+    """Print success of each family and of their mean, by condition, with the mean's gain."""
+    from harness.runs.headline import IN_WORDS, headline_of
+    from harness.runs.metrics import entry
+
+    metric, beside = headline_of(done), done.conditions[:MOST_INTERVALS]
+    brief.echo_title(done.manifest, done.variant, f"suite {printable(done.name)}")
+    rows = []
+    for line in lines:
+        cells = [_cell(line.cells[condition].success) for condition in beside]
+        rows.append((line.name, *cells))
+    halves = zip(entry(metric).halves, ("  with a danger", "  without"), strict=False)
+    for half, name in halves:
+        rows.append((name, *(_cell(done.score(condition, half)) for condition in beside)))
+    table((f"{IN_WORDS[metric]}, %", *beside), rows)
+    references = []
+    for name in brief.BESIDE:
+        if name in lines[-1].drivers:
+            references.append(f"{name} {interval_of(lines[-1].drivers[name])}")
+    echo_text(f"without a model: {', '.join(references)}")
+    brief.echo_gain(done)
+    layouts = sum(len(run.grid.episodes) for run in done.runs.values())
+    seeds = amount(len(done.manifest.seeds), "channel seed")
+    echo_text(f"n = {layouts} episodes × {seeds}; all tables and notes: --verbose")
+    brief.echo_void(done)
 
 
 def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[Line]") -> None:

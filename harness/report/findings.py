@@ -71,7 +71,6 @@ def _merged(source: Source[Run], runs: Runs) -> list[str]:
 OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
     Kind.VOID: [each(caveats.unanswered), each(caveats.unread)],
     Kind.CAVEAT: [
-        caveats.no_prompt,
         each(caveats.of_extensions),
         each(caveats.moved_system),
         each(caveats.by_letter),
@@ -95,6 +94,7 @@ OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
         each(caveats.lost_at_once),
         each(caveats.lagging),
         each(caveats.unmeasured),
+        caveats.no_prompt,
     ],
     Kind.FIGURE: [each(words.adjusted_lines), each(in_a_line)],
 }

@@ -71,9 +71,8 @@ def headline(run: Run | SuiteRun) -> str:
             return f"{text}."
         unwarned = " without a warning" if doubted(*_runs(run)) else ""
         return f"{text}, and no other condition{unwarned} does better."
-    pairs, p = plays(_runs(run), metric).pairs(best, base), p_values(run, base)
-    corrected = dict(zip(p, holm(list(p.values())), strict=True))
-    clear = judged(mean_difference(pairs), corrected[best])
+    pairs = plays(_runs(run), metric).pairs(best, base)
+    clear = judged(*gain(run, best, base))
     if metric == SUCCESS:
         text = f"Under {best}, {model} clears {value} of the episodes{families}; under {base}, "
         return f"{text}{_value_text(run, base, metric)}: {clear}."
@@ -84,6 +83,19 @@ def headline(run: Run | SuiteRun) -> str:
         f"against {base}, and in {shares[1]} of those without, {changes[1]}{families}; the mean of "
         f"both is {value}, {clear}."
     )
+
+
+def gain(run: Run | SuiteRun, best: str, base: str) -> tuple[Estimate, float]:
+    """Return what success gains in one condition over another, and its p-value.
+
+    `best` and `base` name the conditions (sets of settings). Success is balanced if the run has
+    that. The p-value is corrected by Holm's method for all of the run's conditions, of which the
+    best was chosen.
+    """
+    p = p_values(run, base)
+    corrected = dict(zip(p, holm(list(p.values())), strict=True))
+    pairs = plays(_runs(run), headline_of(run)).pairs(best, base)
+    return mean_difference(pairs), corrected[best]
 
 
 def shown_change(change: Estimate) -> str:

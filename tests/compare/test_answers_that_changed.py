@@ -32,7 +32,7 @@ def test_texts_that_changed_are_counted_where_no_verdict_did(
     said = (
         f"{len(mine)} of {len(every)} to the same questions changed, none of them in their verdict"
     )
-    out = " ".join(harness("compare", *runs)[1].split())
+    out = " ".join(harness("compare", "--verbose", *runs)[1].split())
     assert f"answers: {said} first: {mine[0].id}, helper A strict: " in out
     assert f"all, side by side: --html FILE --show {len(mine)}" in out
     assert said in harness("compare", *runs, "--markdown")[1]
@@ -43,7 +43,10 @@ def test_texts_that_changed_are_counted_where_no_verdict_did(
         "request": mine[0].id, "role": "helper", "verdict_a": "strict", "verdict_b": "strict",
         "raw_a": mine[0].raw, "raw_b": f"{mine[0].raw} ",
     }  # fmt: skip
-    assert harness("compare", *runs, "--html", "page.html", "--show", str(len(mine)))[0] == 0
+    assert (
+        harness("compare", "--verbose", *runs, "--html", "page.html", "--show", str(len(mine)))[0]
+        == 0
+    )
     page = unescape(Path("page.html").read_text())
     assert said in page
     for answer in mine:

@@ -178,7 +178,9 @@ def test_options_that_cannot_be_are_one_line(runs: tuple[Path, Path], harness: H
 def test_the_table_fits_and_says_it_all(worse: tuple[Path, Path], harness: Harness) -> None:
     configure(worse[1], answer="constrained")
     change(worse[1], answer=lambda row: row["viewer"] == "v1" and row.update(verdict="failed"))
-    code, out, err = harness("compare", *worse, "--show", "2", "--fail-if", "6g:late_rate > 0.1")
+    code, out, err = harness(
+        "compare", "--verbose", *worse, "--show", "2", "--fail-if", "6g:late_rate > 0.1"
+    )
     assert (code, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
     said = " ".join(out.split())
@@ -211,7 +213,9 @@ def test_six_metrics_come_first_and_all_print_the_rest(
     change(worse[1], decision=differ)
     metrics = json.loads(harness("compare", *worse, "--json")[1])["conditions"][1]["metrics"]
     for form in ((), ("--markdown",)):
-        few, every = (harness("compare", *worse, *form, *more)[1] for more in ((), ("--all",)))
+        few, every = (
+            harness("compare", "--verbose", *worse, *form, *more)[1] for more in ((), ("--all",))
+        )
         rows = [
             [name for name in metrics if re.search(rf"[ ?] {name} ", text)] for text in (few, every)
         ]
@@ -232,7 +236,7 @@ def test_radios_networks_and_what_extensions_opened_are_told_where_both_runs_hav
     radio = stated["channels"]["6g"]
     faster = {**radio, "parameters": {**radio["parameters"], "latency_s": 0.001}}
     configure(runs[1], channels={**stated["channels"], "6g": faster}, schedules={"mine": "0" * 64})
-    out = " ".join(harness("compare", *runs)[1].split())
+    out = " ".join(harness("compare", "--verbose", *runs)[1].split())
     assert "differ in channels" in out
     assert "channels.6g.latency_s: 0.005 → 0.001" in out
     assert "mine" not in out
@@ -246,7 +250,7 @@ def test_prefill_and_decode_of_each_run_are_said(
             row |= {"seconds": 0.12, "first_token_s": 0.03}
 
     change(runs[1], answer=timed)
-    out = harness("compare", *runs, "--html", tmp_path / "page.html")[1]
+    out = harness("compare", "--verbose", *runs, "--html", tmp_path / "page.html")[1]
     said = "B: ego: 25 % of the median answer is prefill (batch 1, measured where it ran)"
     for text in (out, (tmp_path / "page.html").read_text()):
         assert said in text
@@ -325,14 +329,14 @@ def test_better_and_worse_are_marked_in_words_and_signs_where_they_are_beyond_ch
 ) -> None:
     change(runs[0], decision=lambda row: row.update(latency_ms=100.0, deadline_missed=False))
     change(runs[1], decision=lambda row: row.update(latency_ms=150.0 + row["episode"] % 2 * 0.01))
-    out = harness("compare", *runs, "--html", "page.html")[1]
+    out = harness("compare", "--verbose", *runs, "--html", "page.html")[1]
     [*marked] = (line for line in out.splitlines() if line.startswith(("✓", "✗")))
     assert any(line.startswith("✗ latency_proxy_ms") for line in marked)
     assert not any("success_rate" in line for line in marked), "it is the same in both"
     page = unescape(Path("page.html").read_text())
     assert "<strong>+50.0</strong> ✗ worse" in page
     assert page.count('class="forest worse"') == len(marked)
-    back = harness("compare", *reversed(runs))[1]
+    back = harness("compare", "--verbose", *reversed(runs))[1]
     turned = [line.split()[1] for line in back.splitlines() if line.startswith("✓")]
     assert turned == [line.split()[1] for line in marked]
 
@@ -424,7 +428,7 @@ def hostile(worse: tuple[Path, Path]) -> tuple[Path, Path]:
 
 def test_nothing_a_run_says_becomes_markup(hostile: tuple[Path, Path], harness: Harness) -> None:
     gate = ("--fail-if", "6g:success_rate < 0")
-    code, out, _ = harness("compare", *hostile, *gate, "--html", "page.html")
+    code, out, _ = harness("compare", "--verbose", *hostile, *gate, "--html", "page.html")
     assert code == 1
     assert max(map(len, out.splitlines())) <= 80
     assert out.replace("\n", "").isprintable()

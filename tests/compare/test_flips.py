@@ -113,7 +113,7 @@ def test_the_text_that_changed_stands_beside_the_flips(
     reprompted(runs[1], "v3")
     for run in runs:
         (run / "report.html").touch()
-    code, out, err = harness("compare", *runs, "--html", "page.html")
+    code, out, err = harness("compare", "--verbose", *runs, "--html", "page.html")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     said = " ".join(out.split())
@@ -152,7 +152,7 @@ def test_a_prompt_that_is_not_here_as_it_was_is_one_line(
     version: str, sha256: str, shown: str, runs: tuple[Path, Path], harness: Harness
 ) -> None:
     reprompted(runs[1], version, sha256)
-    code, out, _ = harness("compare", *runs, "--html", "page.html")
+    code, out, _ = harness("compare", "--verbose", *runs, "--html", "page.html")
     assert code == 0
     assert f"what differs between the prompts is not known: {shown}" in " ".join(out.split())
     assert "@@" not in out
@@ -173,7 +173,7 @@ def test_helpers_with_a_prompt_of_their_own_have_their_own_difference(
     texts = json.loads(harness("compare", *runs, "--json")[1])["prompts"]["texts"]
     assert not texts["ego.j2"]["hunks"]
     assert texts["helper.j2"]["added"] > 50
-    said = " ".join(harness("compare", *runs)[1].split())
+    said = " ".join(harness("compare", "--verbose", *runs)[1].split())
     assert "ego's prompt v2 → v2, helper's v2 → v4: ego.j2 the same, helper.j2 " in said
     assert "more changes: `harness prompt compare v2 v4`" in said
     assert "max_answer_tokens.helper: 128 → 160" in said
@@ -182,7 +182,7 @@ def test_helpers_with_a_prompt_of_their_own_have_their_own_difference(
 
 def test_the_same_prompt_has_no_difference(runs: tuple[Path, Path], harness: Harness) -> None:
     assert json.loads(harness("compare", *runs, "--json")[1])["prompts"] is None
-    out = harness("compare", *runs, "--html", "page.html")[1]
+    out = harness("compare", "--verbose", *runs, "--html", "page.html")[1]
     assert "prompt v2 →" not in out
     assert "decisions: 0 flipped of the" in out
     assert "What changed in the prompt" not in Path("page.html").read_text()

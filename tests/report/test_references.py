@@ -181,8 +181,9 @@ def test_names_of_near_lines_stand_together() -> None:
 @pytest.mark.slow
 def test_the_command_shows_both_beside_the_model(small_path: Path, harness: Any) -> None:
     code, out, _ = harness(
-        "eval", "--dataset", small_path, "--seeds", "0:1", "--condition", "single-local"
-    )
+        "eval", "--dataset", small_path, "--seeds", "0:1", "--condition", "single-local",
+        "--verbose",
+    )  # fmt: skip
     assert code == 0
     rows = {line.split("  ")[0]: line for line in out.splitlines()}
     assert "[" in rows["constant IDLE"]

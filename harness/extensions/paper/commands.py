@@ -26,6 +26,7 @@ def paper(
     ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Compare the calibrated proxy with the paper's numbers.
 
@@ -46,7 +47,7 @@ def paper(
         "grid points", sum(len(panel.settings) for panel in settings), as_json or quiet
     ) as progress:
         study = run_paper(settings, draws, progress)
-    finish(study, out, as_json, quiet)
+    finish(study, out, as_json, quiet, verbose)
 
 
 def closed_loop(
@@ -71,6 +72,7 @@ def closed_loop(
     ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Run the paper's panels with a model in closed loop.
 
@@ -102,4 +104,4 @@ def closed_loop(
     refuse_taken(where, "closed-loop")
     with bar("layouts", episodes, as_json or quiet) as progress:
         study = run_closed_loop(spec, where, who, progress, default_file())
-    finish(study, where, as_json, quiet)
+    finish(study, where, as_json, quiet, verbose)

@@ -87,6 +87,7 @@ def compare(
     ),
     as_json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Compare schedules (whom to ask, and when) on stored answers.
 
@@ -117,4 +118,4 @@ def compare(
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_in(runs[0], "schedules")
         compared = run_schedules(replayed, tuned, condition, names, draws, budget, where, progress)
-    finish(schedule_study(compared, [*replayed, *tuned], draws), where, as_json, quiet)
+    finish(schedule_study(compared, [*replayed, *tuned], draws), where, as_json, quiet, verbose)

@@ -24,7 +24,7 @@ from harness.report.compare.difference import (
 )
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side, where
-from harness.runs.headline import SUCCESS
+from harness.runs.headline import IN_WORDS, SUCCESS
 
 WIDTH = 80
 # of an answer that changed
@@ -45,6 +45,49 @@ def terminal(
     for text in _lines(comparison, verdicts, most, whole):
         lines += wrap(printable(text, WHOLE), WIDTH, subsequent_indent="    ")
     return "\n".join(lines)
+
+
+def brief(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
+    """Return what a comparison comes to, and its gates' verdicts, as text of `WIDTH` columns.
+
+    It has success by condition, what changed in episodes and answers, and the first note;
+    `terminal` has all. A gate is a test that a comparison may fail.
+    """
+    lines = []
+    for text in _brief_lines(comparison, verdicts):
+        lines += wrap(printable(text, WHOLE), WIDTH, subsequent_indent="    ")
+    return "\n".join(lines)
+
+
+def _brief_lines(comparison: Comparison, verdicts: Sequence[Verdict]) -> Iterator[str]:
+    pair = comparison.pair
+    yield from (f"{name}: {side}" for name, side in words.sides(pair, whole=True))
+    yield f"paired: {words.paired(pair)}; {words.differing(comparison)}"
+    changes = words.headlines(comparison)
+    metrics = dict.fromkeys(f"{IN_WORDS[d.metric]}, %" for _, d in changes)
+    numbers = f"{'A':>6}{'B':>6}{'B - A':>7} {'[95 % interval]':>17}{'p':>8}"
+    yield f"{' or '.join(metrics):<22}{numbers}{'gained':>8}{'lost':>5}"
+    for condition, difference in changes:
+        row = words.line(difference)
+        label = f"{words.SIGNS[row.verdict]} {printable(condition.condition, 19)}".strip()
+        gained, lost = words.counts(condition)
+        numbers = f"{row.a:>6}{row.b:>6}{row.change:>7} {row.interval:>17}{row.p:>8}"
+        yield f"{label:<22}{numbers}{gained:>8}{lost:>5}"
+    yield (
+        f"p: Holm's, of {words.primaries(comparison)} differences; gained, lost: of "
+        f"{len(pair.episodes) * len(pair.seeds)} episodes × seeds"
+    )
+    for condition in comparison.conditions[-1:]:
+        ways = dict(words.both_ways(condition, pair, 3))
+        if episodes := ways.get("lost"):
+            yield f"lost under {printable(condition.condition)}: {episodes}"
+    yield f"answers: {words.answers_held(comparison.held)}"
+    first, *others = [*words.caveats(pair), ""]
+    if first:
+        sentence, _, _ = first.partition(". ")
+        yield f"note: {sentence.rstrip('.')} ({len(others) - 1} more: --verbose)"
+    for verdict in verdicts:
+        yield words.judged(verdict)
 
 
 def _lines(

@@ -137,6 +137,20 @@ def rest(c: InCondition) -> list[Difference]:
     return [d for d in c.differences if d not in (*primary, *striking)]
 
 
+def headlines(comparison: Comparison) -> list[tuple[InCondition, Difference]]:
+    """Return each condition with its change of success, balanced if both runs have that.
+
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages; one without such a change is left out.
+    """
+    changes = []
+    for condition in comparison.conditions:
+        differences = {d.metric: d for d in condition.differences}
+        if d := differences.get(headline_metric(set(differences))):
+            changes.append((condition, d))
+    return changes
+
+
 def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
     """Return for each condition a sentence on the change of success, and its verdict.
 
@@ -145,12 +159,7 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
     messages.
     """
     outcomes = []
-    for condition in comparison.conditions:
-        differences = {d.metric: d for d in condition.differences}
-        metric = headline_metric(set(differences))
-        d = differences.get(metric)
-        if d is None:
-            continue
+    for condition, d in headlines(comparison):
         row = line(d)
         if math.isnan(d.change.low):
             verdict, interval = "not clear, since there is no interval", ""
@@ -158,7 +167,7 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
             bounds = within(d.change.low, d.change.high)
             verdict, interval = row.verdict or f"not clear, but within {bounds}", f" {row.interval}"
         p = "" if d.p_corrected is None else f", Holm's p {row.p}"
-        change = f"{IN_WORDS[metric]} {row.change} points{interval}: {verdict}{p}"
+        change = f"{IN_WORDS[d.metric]} {row.change} points{interval}: {verdict}{p}"
         outcomes.append((f"{condition.condition}: {change}", row.verdict))
     return outcomes
 
@@ -238,14 +247,24 @@ def differing(comparison: Comparison) -> str:
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
 
+def counts(c: InCondition) -> tuple[int, int]:
+    """Return how many episodes × seeds changed to success in a condition, and how many to failure.
+
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages.
+    """
+    gained = sum(len(flip.seeds) for flip in c.gained)
+    lost = sum(len(flip.seeds) for flip in c.lost)
+    return gained, lost
+
+
 def success(c: InCondition, pair: Pair) -> str:
     """Return a sentence on how many episodes × seeds changed to success, how many to failure.
 
     `c` is what differs in one condition, and `pair` has the runs. A condition is a named set of
     settings of the radio, of asking helpers and of fusing their messages.
     """
-    gained = sum(len(flip.seeds) for flip in c.gained)
-    lost = sum(len(flip.seeds) for flip in c.lost)
+    gained, lost = counts(c)
     unit = "episodes × seeds" if len(pair.seeds) > 1 else "episodes"
     return f"success: {gained} gained, {lost} lost of {len(pair.episodes) * len(pair.seeds)} {unit}"
 
@@ -266,6 +285,12 @@ def adjusted(c: InCondition) -> Iterator[str]:
                 f"{name} adjusted for difficulty: B - A {interval_of(better, POINTS, '+')} points, "
                 f"{gained}"
             )
+
+
+def primaries(comparison: Comparison) -> int:
+    """Return how many differences are corrected for multiple testing, those of primary metrics."""
+    tested = [d for c in comparison.conditions for d in c.differences]
+    return sum(d.p_corrected is not None for d in tested)
 
 
 def many(comparison: Comparison) -> str:

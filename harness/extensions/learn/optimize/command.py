@@ -75,6 +75,7 @@ def command(
     tokenizer: options.Tokenizer = None,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Search the wording of a prompt, and certify the winner.
 
@@ -171,7 +172,7 @@ def command(
             else engines.alternatives
         )
         study = search(plan, engine, where, place, open_backend, progress, cache)
-    finish(study, where, as_json, quiet)
+    finish(study, where, as_json, quiet, verbose)
     if not silent and Path("prompts", out).is_dir():
         typer.echo(f"wrote prompts/{printable(out)}, sha256 {prompts.load(out).sha256}; a draft")
     work.tidy(where)

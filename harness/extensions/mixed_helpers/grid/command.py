@@ -37,6 +37,7 @@ def command(
     no_cache: options.NoCache = False,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Evaluate every combination of ego and helper agents.
 
@@ -82,7 +83,7 @@ def command(
     with bar(f"{cells} combinations", quiet=as_json or quiet, grows=True) as progress:
         cache = None if no_cache else default_file()
         grid = run_cells(spec, egos, helpers, folder, progress, cache)
-    finish(grid_study(grid, spec, folder), folder, as_json, quiet)
+    finish(grid_study(grid, spec, folder), folder, as_json, quiet, verbose)
 
 
 def _of_helpers(settings: Settings) -> Settings:

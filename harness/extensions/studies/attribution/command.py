@@ -27,6 +27,7 @@ def command(
     model: options.RunModel = None,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Show which objects and messages moved the answers.
 
@@ -49,5 +50,5 @@ def command(
     if as_json:
         echo_answer(study)
     elif not quiet:
-        show(study)
+        show(study, verbose)
         typer.echo(f"wrote {printable(file)}")

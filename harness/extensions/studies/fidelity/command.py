@@ -13,6 +13,7 @@ def command(
     runs: options.Runs,
     out: Path = typer.Option(Path("reports/fidelity"), help="Folder to write."),
     as_json: options.Json = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Compare frozen with closed-loop success, paired by episode.
 
@@ -25,4 +26,4 @@ def command(
     with bar("comparing frozen with closed loop", quiet=as_json):
         study = fidelity_study(fidelity(runs), runs)
         refuse_other(out, study.kind, {"sources": study.manifest["sources"]})
-    finish(study, out, as_json)
+    finish(study, out, as_json, verbose=verbose)

@@ -39,6 +39,7 @@ def command(
     tokenizer: options.Tokenizer = None,
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Evaluate several times, with other draws of answers.
 
@@ -86,7 +87,7 @@ def command(
         bar(text, quiet=quiet or as_json, grows=True) as progress,
     ):
         done = run_repeats(spec, repeats, folder, progress, cache)
-    finish(repeats_study(done), folder, as_json, quiet)
+    finish(repeats_study(done), folder, as_json, quiet, verbose)
 
 
 def _check(spec: "Spec", repeats: int) -> None:

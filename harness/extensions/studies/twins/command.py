@@ -54,6 +54,7 @@ def command(
     no_cache: options.NoCache = False,
     as_json: options.Json = False,
     quiet: options.Quiet = False,
+    verbose: options.Verbose = False,
 ) -> None:
     """Test whether answers to a question and its twin agree.
 
@@ -116,6 +117,6 @@ def command(
         rows = scoring.rows(pairs, [TWINS[name] for name in questions.twins])
         verdicts = [scoring.judge(each, rows) for each in gates]
         write_pairs(pairs, where)
-        finish(twins_study(questions, rows, verdicts, unanswered), where, as_json, quiet)
+        finish(twins_study(questions, rows, verdicts, unanswered), where, as_json, quiet, verbose)
     work.tidy(where)
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)

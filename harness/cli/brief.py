@@ -1,0 +1,122 @@
+"""A finished run in some fifteen lines, as `harness eval` and `harness drive` print it.
+
+`--verbose` prints the tables of its page instead (`harness.cli.run.show`).
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from harness.cli.run import HALVES, Column, scores_table
+from harness.cli.terminal import echo_text
+from harness.core.errors import printable
+from harness.core.figures import PERCENT
+from harness.runs import headline
+
+if TYPE_CHECKING:
+    from harness.runs.folder import Run
+    from harness.runs.records import Manifest, Score, Variant
+    from harness.runs.suite import SuiteRun
+
+HEAD = "success, % [95 % CI]"
+SUCCESS = Column("all", headline.SUCCESS, interval=True)
+BALANCED = (Column("balanced", headline.BALANCED, interval=True), *HALVES)
+# references that need no model: what plans with the ego's own sensors, and two that are blind
+BESIDE = ("local-view", "open-loop", "uniform")
+
+
+def show(
+    run: "Run", scenes: str, n: str, references: "Mapping[str, Mapping[str, Score]] | None" = None
+) -> None:
+    """Print who was asked, success by condition beside references, and one note.
+
+    A condition is a set of settings, by its name, that the run scores.
+
+    Args:
+        run: the finished run.
+        scenes: a phrase on its scenes.
+        n: a phrase on its episodes and seeds.
+        references: scores by metric of references that need no model, by name; None for none.
+    """
+    echo_title(run.manifest, run.manifest.variant, scenes)
+    echo_text(f"asked: {questions(run)}")
+    is_balanced = headline.headline_of(run) == headline.BALANCED
+    columns: Sequence[Column] = BALANCED if is_balanced else (SUCCESS,)
+    rows: dict[str, Mapping[str, Score | None]] = {}
+    for name in run.conditions:
+        rows[name] = {column.metric: run.score(name, column.metric) for column in columns}
+    for name in BESIDE:
+        if references and name in references:
+            rows[name] = references[name]
+    scores_table(columns, rows, HEAD)
+    echo_gain(run)
+    echo_text(f"n = {n}")
+    if not echo_void(run):
+        echo_note(run)
+
+
+def echo_title(manifest: "Manifest", variant: "Variant", scenes: str) -> None:
+    """Print who answered, how, and in which scenes.
+
+    `manifest` is a run's record, or a suite's first, and `variant` its names of model and prompts;
+    `scenes` is a phrase.
+    """
+    from harness.backends.registry import reads_prompts
+
+    prompt = f"prompt {printable(variant.prompt)}"
+    if not reads_prompts(str(manifest.model.get("engine"))):
+        prompt += " (not read)"
+    helpers = f" · helpers: {printable(variant.helpers)}" if manifest.helpers else ""
+    model = printable(variant.model, 40)
+    echo_text(f"{model} · {prompt} · {variant.answer} · {scenes}{helpers}")
+
+
+def questions(run: "Run") -> str:
+    """Return how many questions each role was asked, and how many answers could be read, as text.
+
+    A role is `ego`, `helper` or `merge` (the ego after it heard messages).
+    """
+    from harness.runs.records import role_word
+
+    counts = []
+    for role, count in run.answered.count.items():
+        failed = sum(run.answered.failed.get(role, {}).values())
+        counts.append(f"{role_word(role)} {count} ({PERCENT.text(1 - failed / count)} read)")
+    return ", ".join(counts)
+
+
+def echo_gain(run: "Run | SuiteRun") -> None:
+    """Print what success gains in the best condition of a run or suite over its baseline.
+
+    A condition is a set of settings, by its name; a suite has a run on each of several scenarios.
+    Nothing is printed where there is no baseline.
+    """
+    from harness.report.words import compared, gain, judged
+
+    best, base = compared(run)
+    if base:
+        change, _, _ = judged(*gain(run, best, base)).partition(", but")
+        echo_text(f"{printable(best)} over {printable(base)}: {change}")
+
+
+def echo_void(run: "Run | SuiteRun") -> bool:
+    """Print why a run or suite is no result, if it is none; return whether it is.
+
+    A suite has a run on each of several scenarios.
+    """
+    from harness.report.findings import Kind, findings
+
+    void = findings(run, Kind.VOID)
+    for finding in void:
+        echo_text(finding.sentence)
+    return bool(void)
+
+
+def echo_note(run: "Run") -> None:
+    """Print the first note that a run's page has on it, and how many more there are."""
+    from harness.report.findings import FIRST, LAST, Kind, findings
+
+    notes = [finding for finding in findings(run, *FIRST) if finding.kind != Kind.VOID]
+    more = len(notes) + len(findings(run, Kind.FIGURE, *LAST)) - 1
+    for note in notes[:1]:
+        first, _, _ = note.sentence.partition(". ")
+        echo_text(f"note: {first.rstrip('.')} ({more} more notes: --verbose)")
