@@ -38,6 +38,7 @@ OTHER = Metric("other", "", Unit(), "lower", decisions=lambda d: d["entropy_nats
 FIRST = Metric("first", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], primary=True)
 NOTHING = Metric("nothing", "", Unit(), "lower")
 UNITLESS = Metric("unitless", "", None, "lower", decisions=lambda d: d["entropy_nats"])
+ENDLESS = Metric("endless", "", Unit("x", 1, float("inf")), "lower", decisions=lambda d: d["acted"])
 SWAPPED = Metric("swapped", "", Unit(1, "", 2), "lower", decisions=lambda d: d["entropy_nats"])
 SIDEWAYS = Metric("sideways", "", Unit(), "sideways", decisions=lambda d: d["entropy_nats"])
 MOON = Metric("moon", "", Unit(), "lower", decisions=lambda d: d["entropy_nats"], world="moon")
@@ -173,7 +174,8 @@ def test_another_metric_changes_no_corrected_p(
             "'mine' .* is the metric 'other' with 1 functions; give it the name of",
         ),
         ("first = by_hand:FIRST", "'first' .* with 1 functions, a primary one; .* is not primary"),
-        ("swapped = by_hand:SWAPPED", "'swapped' .* fails .TypeError"),
+        ("swapped = by_hand:SWAPPED", "'swapped' .*: its unit is Unit.name=1, decimals=''"),
+        ("endless = by_hand:ENDLESS", "factor=inf.; give a Unit with a name that terminals show"),
         ("unitless = by_hand:UNITLESS", "'unitless' .* has unit None; allowed: Unit; repair"),
         (
             "sideways = by_hand:SIDEWAYS",

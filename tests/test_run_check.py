@@ -14,7 +14,7 @@ from evaluating import run as evaluated
 from run_on_disk import Row, change, configure, damage
 
 from harness.coordination.named_points import POINTS
-from harness.core import extras
+from harness.core import extras, resources
 from harness.core.errors import UserError
 from harness.core.extensions import extensions
 from harness.runs.contradictions import refuse
@@ -517,6 +517,48 @@ def test_helpers_with_models_of_their_own_have_the_times_that_are_named(
     code, out, _ = harness("run", "check", "run")
     assert code == 1
     assert "another latency of the helpers than their cards" in " ".join(out.split())
+
+
+SLOW = """engine = "proxy"
+description = "a rule that takes its time"
+[latency]
+source = "card"
+basis = "declared"
+inference_s = 1.9
+"""
+
+
+@pytest.mark.slow
+def test_times_of_a_replay_are_held_to_what_it_replays_or_said_to_be_its_own(
+    two_path: Path, harness: Harness
+) -> None:
+    """Times of helpers that have a model of their own, two of two, and of a helper's card."""
+    Path(resources.MARKER).touch()
+    Path("models").mkdir()
+    Path("models/slow.toml").write_text(SLOW)
+    usual = ("--dataset", two_path, "--seeds", "0", "--quiet", "--out")
+    runs = {
+        "alone": ("proxy",), "slow": ("proxy", "--helper-model", "slow"),
+        "two": ("proxy", "--helper-model", "slow,proxy"), "of-alone": ("replay:alone",),
+        "of-slow": ("replay:slow",), "of-two": ("replay:two",),
+        "helps": ("proxy", "--helper-model", "replay:slow"),
+    }  # fmt: skip
+    for name, models in runs.items():
+        assert harness("eval", "--model", *models, *usual, name)[0] == 0, name
+        code, out, error = harness("run", "check", name)
+        assert (code, error) == (0, ""), name
+        alone = "Its helpers' latency of " in out
+        assert alone == (name in ("of-slow", "of-two", "helps")), name
+    latency(Path("of-alone"), helper_s=0.001)
+    code, out, _ = harness("run", "check", "of-alone")
+    assert code == 1
+    assert "another latency of the helpers than of the ego" in " ".join(out.split())
+    Path("models/slow.toml").write_text(SLOW.replace("1.9", "0.1"))
+    out = " ".join(harness("run", "check", "slow")[1].split())
+    assert "the card slow that is here states 0.1 s." in out
+    Path("models/slow.toml").unlink()
+    out = " ".join(harness("run", "check", "slow")[1].split())
+    assert "Its latency of 1.9 s is that of a card in run.json, which is not here." in out
 
 
 def test_more_errors_than_a_result_can_have_are_a_difference(run: Path, harness: Harness) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -52,6 +53,15 @@ def test_what_would_end_the_program_is_bad_input_and_says_where(
     assert str(error.value).startswith(f"rule mine ends the program ({words}")
     assert f" at {__file__}:" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_signals_do_is_put_back() -> None:
+    """A package that ignores them as it loads would take Ctrl-C from the command."""
+    usual = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    with strangers():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == usual
 
 
 def test_what_does_not_come_back_is_named_once(
@@ -154,7 +164,9 @@ def test_a_rule_that_ends_the_program_is_bad_input_of_the_run(
     ending: BaseException, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(RULES._loaded, "mine", Pool(lambda p, weights: leave(ending)))
-    monkeypatch.setattr(type(RULES), "__iter__", lambda self: iter(self._loaded))
+    usual = type(RULES).__iter__
+    listed = lambda self: iter(self._loaded) if self is RULES else usual(self)  # noqa: E731
+    monkeypatch.setattr(type(RULES), "__iter__", listed)
     typed = (
         "eval",
         "--dataset",
@@ -188,7 +200,9 @@ def test_a_rule_that_fails_is_one_line_and_the_answers_stay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(RULES._loaded, "mine", Pool(pool))
-    monkeypatch.setattr(type(RULES), "__iter__", lambda self: iter(self._loaded))
+    usual = type(RULES).__iter__
+    listed = lambda self: iter(self._loaded) if self is RULES else usual(self)  # noqa: E731
+    monkeypatch.setattr(type(RULES), "__iter__", listed)
     typed = (
         "eval",
         "--dataset",

@@ -112,11 +112,20 @@ def echo_void(run: "Run | SuiteRun") -> bool:
 
 
 def echo_note(run: "Run") -> None:
-    """Print the first note that a run's page has on it, and how many more there are."""
-    from harness.report.findings import FIRST, LAST, Kind, findings
+    """Print the warnings on who decided in a run, else the first note on its numbers.
 
-    notes = [finding for finding in findings(run, *FIRST) if finding.kind != Kind.VOID]
-    more = len(notes) + len(findings(run, Kind.FIGURE, *LAST)) - 1
-    for note in notes[:1]:
-        first, _, _ = note.sentence.partition(". ")
-        echo_text(f"note: {first.rstrip('.')} ({more} more notes: --verbose)")
+    How many more notes its page has is said.
+    """
+    from harness.report.findings import LAST, Kind, findings
+
+    warnings, limits = findings(run, Kind.CAVEAT), findings(run, Kind.LIMIT)
+    for warning in warnings:
+        echo_text(warning.sentence)
+    if not limits:
+        return
+    more = len(limits) + len(findings(run, Kind.FIGURE, *LAST))
+    if warnings:
+        echo_text(f"{more} more notes: --verbose")
+    else:
+        first, _, _ = limits[0].sentence.partition(". ")
+        echo_text(f"note: {first.rstrip('.')} ({more - 1} more notes: --verbose)")

@@ -22,6 +22,7 @@ from harness.core.process import Stop
 
 PATIENCE_S = 20.0  # after which a line says what a command waits for
 LOOK_S = 1.0  # between two looks at what runs
+_STOPS = (signal.SIGINT, signal.SIGTERM)  # by which a user ends a command
 _calls: dict[object, tuple[str, float, float]] = {}  # what runs now, since when, for how long
 _slow_calls: set[str] = set()
 _watchers: set[int] = set()  # processes with a thread that watches
@@ -60,9 +61,9 @@ def strangers(what: str = "a package") -> Iterator[None]:
     """Enter a context for code that may be another package's; `what` names it in messages.
 
     If it tries to end the program (except by a typed Ctrl-C), this raises UserError. A changed
-    working folder is put back, and a line on stderr says so.
+    working folder is put back, and a line on stderr says so; what signals do is put back, too.
     """
-    here = _folder()
+    here, handlers = _folder(), {each: signal.getsignal(each) for each in _STOPS}
     try:
         yield
     except BaseException as error:
@@ -70,6 +71,10 @@ def strangers(what: str = "a package") -> Iterator[None]:
             raise
         raise ended(what, error) from error
     finally:
+        if threading.current_thread() is threading.main_thread():
+            for each, handler in handlers.items():
+                if handler is not None and signal.getsignal(each) is not handler:
+                    signal.signal(each, handler)
         if here and _folder() != here:
             os.chdir(here)
             line = f"{what} changed the working folder; it is {printable(here)} again"

@@ -320,6 +320,15 @@ def asked_card(run: Run) -> Card:
     Of answers that are replayed it is that of the first run. Raises UserError if the run states
     none.
     """
+    model, _ = _model_asked(run)
+    return model
+
+
+def _model_asked(run: Run) -> tuple[Card, Mapping[str, Any]]:
+    """Return the card and the identity of the model that was asked, of replayed answers the first.
+
+    Raises UserError if the run states none.
+    """
     model: Any = run.manifest.model
     identity: Any = run.manifest.identity
     where = printable(run.path)
@@ -328,21 +337,41 @@ def asked_card(run: Run) -> Card:
         if not (isinstance(model, Mapping) and isinstance(identity, Mapping)):
             raise UserError(f"{where}: run.json states no model of what it replays; make it again")
         convert(model, Card, f"{where}: the model that it replays")
-    return convert(model, Card, f"{where}: its model")
+    return convert(model, Card, f"{where}: its model"), identity
 
 
 def of_card(run: Run) -> Iterator[str]:
-    """Yield a sentence if a run's latency is said to be its card's, and the card here differs.
+    """Yield what is not known of the cards that a run's latency is said to be from.
 
-    A card is the file that describes a model.
+    A card is the file that describes a model. One that is here may state another time; the time of
+    one that is not here, or of a model whose answers are replayed, the run alone states.
     """
-    latency, name = run.manifest.latency, asked_card(run).name
-    if latency.source != "card" or name not in cards.names():
+    latency, manifest = run.manifest.latency, run.manifest
+    if latency.source == "card":
+        models = [asked_card(run), *(model_of(run, helper) for helper in manifest.helpers)]
+        for name, card in {card.name: card for card in models}.items():
+            yield from _of_card_here(name, card)
+    replays = [manifest.model, *(helper["model"] for helper in manifest.helpers)]
+    _, identity = _model_asked(run)
+    several = manifest.model["engine"] == REPLAY and bool(identity.get("helpers"))
+    by_run = any(model["engine"] == REPLAY for model in replays[1:])
+    if latency.source in ("card", "paper") and (several or by_run):
+        times = dict.fromkeys(f"{seconds:g} s" for seconds in latency.helper_times_s())
+        yield f"Its helpers' latency of {' and '.join(times)} is stated by run.json alone."
+
+
+def _of_card_here(name: str, card: Card) -> Iterator[str]:
+    """Yield a sentence if the card of this name that is here states another time, or none is."""
+    seconds = card.latency.inference_s
+    if card.engine == REPLAY or seconds is None:
+        return
+    if name not in cards.names():
+        yield f"Its latency of {seconds:g} s is that of a card in run.json, which is not here."
         return
     here_s = cards.load(name).latency.inference_s
-    if here_s != latency.ego_s:
+    if here_s != seconds:
         yield (
-            f"Its latency of {latency.ego_s:g} s is that of a card in run.json; the card "
+            f"Its latency of {seconds:g} s is that of a card in run.json; the card "
             f"{printable(name)} that is here states "
             f"{'none' if here_s is None else f'{here_s:g} s'}."
         )
@@ -355,21 +384,35 @@ def _of_latency(run: Run) -> Iterator[str]:
         yield change
     if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
         yield "run.json has another latency than the paper, which it names as the source"
-    of_ego = latency.sample.get("ego")
-    if latency.source == MEASURED and of_ego and of_ego.median_s != latency.ego_s:
+    if latency.source == MEASURED and not _is_measured(latency):
         yield "run.json has another measured latency than the median of its sample"
     if latency.source in ("declared", MEASURED) and not _is_typed(run):
         yield f"run.json has times that are {latency.source}, and its settings do not have them"
     if latency.source in ("card", "paper"):
         others = {"a fusion call": latency.fusion_s}
-        if run.manifest.model["engine"] == REPLAY:
-            others = {}  # those of the run that it replays, whose helpers may have their own models
+        _, identity = _model_asked(run)
+        # Those of the run that it replays may have models of their own, whose cards are not here.
+        if run.manifest.model["engine"] == REPLAY and identity.get("helpers"):
+            pass
         elif not run.manifest.helpers:
             others["the helpers"] = latency.helper_s
         elif latency.helper_times_s() != _helpers_s(run, latency.helper_times_s()):
             yield "run.json has another latency of the helpers than their cards, or the paper, have"
         for whose in (whose for whose, seconds in others.items() if seconds != latency.ego_s):
             yield f"run.json has another latency of {whose} than of the ego, whose source it names"
+
+
+def _is_measured(latency: Latency) -> bool:
+    """Return whether measured times are the medians of the sample; one of several models' may be.
+
+    A role that was not timed has the time of the ego. A latency without a sample is an older run's.
+    """
+    sample = latency.sample
+    if "ego" not in sample:
+        return True
+    helper_s, fusion_s = (sample.get(role, sample["ego"]).median_s for role in ("helper", "merge"))
+    by_role = (latency.ego_s, latency.fusion_s) == (sample["ego"].median_s, fusion_s)
+    return by_role and (bool(latency.helpers_s) or latency.helper_s == helper_s)
 
 
 def _is_typed(run: Run) -> bool:

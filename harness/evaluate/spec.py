@@ -179,7 +179,8 @@ class Spec:
             role_agents.of_helpers().check(self)
         if (latency := self.settings.latency) not in (None, *NAMES):
             times = len(declared(latency).helpers_s)
-            if times and times != len(self.helpers):
+            replays = any(agent.can.own_latency for agent in self.agents)  # answers of several
+            if times and times != len(self.helpers) and not replays:
                 raise UserError(
                     f"--latency {printable(latency)}: {times} times for {len(self.helpers)} helper "
                     "models; give one, or one each"

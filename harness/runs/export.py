@@ -104,10 +104,11 @@ def _unanswered(run: Run) -> dict[tuple[str, int], str]:
 def junit_of_none(run: Path, error: str) -> str:
     """Return JUnit's XML with one error for a run that stopped because its model did not answer.
 
-    `run` is the run's folder, which names the test, and `error` the error's message.
+    `run` is the run's folder, which names the test, and `error` the error's message, in which
+    file names stand in place of paths.
     """
     name = run.absolute().name
-    return test_suite(f"harness {name}", [Case(name, "the model answers", error=error)])
+    return test_suite(f"harness {name}", [Case(name, "the model answers", error=text(error))])
 
 
 def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -> Path:

@@ -7,7 +7,7 @@ without the entry.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import PurePath
@@ -380,11 +380,13 @@ def _table(record: Mapping[str, Any], in_file: Any) -> Any:
         flat = {**dict.fromkeys(map(_extensions_key, role_agents.settings())), **flat}
     of_extensions = extensions.beside().items()
     by_model = [_extensions_key(name) for name, setting in of_extensions if setting.models]
-    card = record.get("model")
-    places = [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
+    of_ego = _places([record])
+    of_helpers = _places(record.get("helpers"))
     for name, there in _flat(beside).items():
         typed = flat.get(name, there)
-        is_place = name == "model" and typed is not None and typed in places
+        is_place = name == "model" and typed in of_ego
+        if name in by_model and isinstance(typed, str) and isinstance(there, str):
+            is_place = {*typed.split(",")} <= {*of_helpers, *there.split(",")}
         may_be = name in (*TYPED, *by_model) and (is_place or _may_be(typed, there))
         if typed != there and not may_be:
             both = f"{printable(flat[name], 60)}, and beside them it is {printable(there, 60)}"
@@ -432,6 +434,18 @@ def _place(name: str) -> str:
     table, _, key = name.partition(".")
     beside = extensions.beside()
     return beside[key].path(key) if table == EXTENSIONS and key in beside else name
+
+
+def _places(agents: Any) -> list[str]:
+    """Return the weights and adapters of the models of some agents of a record, as typed."""
+    places = []
+    for agent in agents if isinstance(agents, Sequence) else ():
+        card = agent.get("model") if isinstance(agent, Mapping) else None
+        both = (
+            [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
+        )
+        places += [place for place in both if isinstance(place, str)]
+    return places
 
 
 def _may_be(typed: Any, names: Any) -> bool:

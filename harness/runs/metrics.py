@@ -6,6 +6,7 @@ A package adds a metric by an entry point in the group `swarmdrive.metrics`.
 from collections.abc import Iterator, Mapping
 from functools import cached_property, lru_cache
 from itertools import takewhile
+from math import inf
 from typing import ClassVar, get_args
 
 from harness.core.errors import UserError, printable
@@ -72,7 +73,14 @@ class Metrics(Plugins[Metric]):
                 "point, of letters, digits and _, and one function, of decisions or of episodes; "
                 "a package's metric is not primary"
             )
-        plugin.unit.text(0.5)  # which fails here, and not where a page is written
+        unit = plugin.unit
+        is_plain = type(unit) is Unit and isinstance(unit.name, str) and unit.name.isprintable()
+        if not is_plain or not (0 < unit.factor < inf and unit.decimals in range(10)):
+            raise UserError(
+                f"plug-in {printable(name)!r} ({self.group}): its unit is {printable(unit, 80)}; "
+                "give a Unit with a name that terminals show, a factor above 0 and 0 to 9 decimals"
+            )
+        unit.text(0.5)  # which fails here, and not where a page is written
 
 
 METRICS = Metrics("swarmdrive.metrics", Metric, {metric.name: metric for metric in BUILT_IN})

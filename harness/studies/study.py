@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from harness.core import extras
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, printable, sayable
 from harness.core.extensions import studies
 from harness.core.figures import PERCENT
 from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
@@ -167,8 +167,10 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
 def refuse_taken(out: Path, kind: str) -> None:
     """Raise UserError if a folder holds a finished run, or a finished study of another kind.
 
-    `kind` is the kind of study that is to be written to `out`, such as `sweep`.
+    `kind` is the kind of study that is to be written to `out`, such as `sweep`. A name that no
+    terminal can show is refused, too.
     """
+    sayable("--out", out.name)
     for name in ("run", "suite", *studies()):
         if name != kind and (out / f"{name}.json").exists():
             raise UserError(

@@ -9,7 +9,7 @@ from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from harness.core.errors import Unanswered, UserError, printable, unknown
+from harness.core.errors import Unanswered, UserError, printable, sayable, unknown
 from harness.core.figures import amount
 from harness.core.files import sha256_file
 from harness.evaluate.frozen_world import FrozenSource
@@ -41,7 +41,7 @@ class Rescored:
     compared: int  # number of figures that were compared
     # whether the file is the one that pins the edition, of a few layouts, and no entry
     golden: bool = False
-    file: str = ""  # the file's name; empty if it was made by hand
+    file: str = ""  # the file's name and its folder's; empty if it was made by hand
 
 
 class Here:
@@ -108,6 +108,7 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
     lacks the answer to a question, or has one to another question; or if this installation computes
     the figures that the edition pins otherwise.
     """
+    sayable("file", file.name)
     contents, stated_folder = contents_of(file), folder / "stated"
     with _about(file, stated_folder):
         edition = editions.named(contents.edition)
@@ -137,7 +138,8 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
                 differences[name].append(f"{answers} of a rule that is here")
             compared += len(edition.figures(computed_run))
     suite = SuiteRun(folder / "computed", edition.name, edition.description, runs)
-    return Rescored(contents, edition, suite, differences, compared, limit is not None, file.name)
+    name = "/".join(file.parts[-2:])
+    return Rescored(contents, edition, suite, differences, compared, limit is not None, name)
 
 
 @contextmanager

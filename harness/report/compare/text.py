@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from harness.core import places
 from harness.core.errors import printable
 from harness.core.figures import number_or_none
 from harness.core.junit import Case
@@ -82,10 +83,12 @@ def _brief_lines(comparison: Comparison, verdicts: Sequence[Verdict]) -> Iterato
         if episodes := ways.get("lost"):
             yield f"lost under {printable(condition.condition)}: {episodes}"
     yield f"answers: {words.answers_held(comparison.held)}"
-    first, *others = [*words.caveats(pair), ""]
-    if first:
-        sentence, _, _ = first.partition(". ")
-        yield f"note: {sentence.rstrip('.')} ({len(others) - 1} more: --verbose)"
+    warnings = words.warnings(pair)
+    yield from warnings
+    notes = [note for note in words.caveats(pair) if note not in warnings]
+    if notes:
+        first, _, _ = notes[0].partition(". ")
+        yield f"note: {first.rstrip('.')} ({len(notes) - 1} more: --verbose)"
     for verdict in verdicts:
         yield words.judged(verdict)
 
@@ -233,10 +236,11 @@ def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
 def junit_of_none(gates: Sequence[str], reason: str) -> str:
     """Return gates as test cases with an error, in JUnit's XML.
 
-    It is for a comparison that is impossible because a model did not answer; `reason` says why.
-    `gates` are their texts.
+    It is for a comparison that is impossible because a model did not answer; `reason` says why,
+    with file names in place of paths. `gates` are their texts.
     """
-    cases = [Case("harness compare", gate, error=reason) for gate in gates]
+    given = places.text(reason)
+    cases = [Case("harness compare", gate, error=given) for gate in gates]
     return test_suite("harness compare", cases)
 
 

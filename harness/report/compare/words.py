@@ -212,6 +212,12 @@ def caveats(pair: Pair) -> list[str]:
     return [*(finding.sentence for finding in warnings), *_by_stopping_rule(pair)]
 
 
+def warnings(pair: Pair) -> list[str]:
+    """Return why a run is no result, and who decided; of one run it begins with `A` or `B`."""
+    findings_on_both = of_runs({"A": pair.a.run, "B": pair.b.run}, Kind.VOID, Kind.CAVEAT)
+    return [finding.sentence for finding in findings_on_both]
+
+
 def _by_stopping_rule(pair: Pair) -> Iterator[str]:
     """Yield each difference of success with an interval that holds at every look,
     if a run was looked at.
