@@ -1,6 +1,6 @@
 """SwarmDrive Harness: evaluates prompts, parsing and coordination in cooperative driving.
 
-From Python as from the command line: docs/python.md.
+From Python as from the command line: docs/files.md.
 """
 
 from importlib import import_module

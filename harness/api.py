@@ -1,5 +1,5 @@
 """Evaluate, load and compare runs from Python;
-results show themselves in a notebook (docs/python.md).
+results show themselves in a notebook (docs/files.md).
 """
 
 from collections.abc import Mapping, Sequence
