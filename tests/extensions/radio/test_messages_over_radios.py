@@ -52,11 +52,16 @@ def test_the_command_shows_bytes_members_and_time_on_air(
     assert re.search(r"^envelope\.signature\.r +256$", out, re.MULTILINE)
 
 
-def test_the_page_on_radios_shows_what_the_command_prints(
+def test_the_page_on_radios_states_what_the_command_counts(
     harness: Callable[..., tuple[int, str, str]],
 ):
-    page = (DOCS / "radio.md").read_text()
-    assert harness("radio", "messages", "--channel", "its-g5")[1] in page
+    page = " ".join((DOCS / "radio.md").read_text().split())
+    rows = json.loads(harness("radio", "messages", "--channel", "its-g5", "--json")[1])["messages"]
+    cpm, intent = (row for row in rows if row["message"] in ("CPM", "etsi-intent"))
+    cpm_bytes, intent_bytes = (row["packet_bits"] / 8 for row in (cpm, intent))
+    times = f"{cpm['airtime_s'] * 1000:.2f} and {intent['airtime_s'] * 1000:.2f} ms on air"
+    assert f"takes {cpm_bytes:.0f} bytes and one of an intent {intent_bytes:.0f}, {times}" in page
+    assert f"{cpm['envelope_bits'] / 8:.0f} of these are the envelope" in page
 
 
 @pytest.mark.parametrize(
