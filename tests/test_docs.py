@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 
 @pytest.mark.parametrize("member", [*Status, *Repair], ids=str)
 def test_every_status_and_repair_is_documented_with_its_meaning(member: Status | Repair) -> None:
-    assert f"| `{member.value}` | {member.meaning} |" in (ROOT / "docs/answers.md").read_text()
+    assert f"- `{member.value}`: {member.meaning}\n" in (ROOT / "docs/answers.md").read_text()
 
 
 @pytest.mark.parametrize("mode", get_args(AnswerMode))

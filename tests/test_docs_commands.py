@@ -186,7 +186,8 @@ ONCE = {
 
 # Pages that `make test` follows, each with how the lines begin that it leaves out.
 FOLLOWED = {
-    "docs/answers.md": (),
+    "docs/answers.md": ("harness init", "cd ", "harness dataset", "harness eval", "harness model",
+        "harness study"),
     "docs/comparing.md": ("harness eval", "harness compare", "harness run history", 
         "harness plan reports/"),
     "docs/radio.md": ("harness eval", "harness radio check"),
