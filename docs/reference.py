@@ -1,5 +1,5 @@
-"""Writes docs/commands.md out of the program: `python docs/reference.py`.
-A test holds the page to it.
+"""Writes docs/commands.md and docs/names.md out of the program: `python docs/reference.py`.
+A test holds the pages to it.
 
 Examples are not written here: each is a command of another page, which the tests run.
 """
@@ -14,9 +14,13 @@ from typer.main import get_command
 
 from harness.cli import app
 from harness.cli.commands import panels
+from harness.parsing.parse import Repair, Status
+from harness.runs.metrics import METRICS
+from harness.runs.records import roles
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "commands.md"
+NAMES_PAGE = DOCS / "names.md"
 HEAD = """\
 # Commands
 
@@ -28,6 +32,16 @@ SHARED = """\
 
 Options with one meaning in several commands. Each command below names those that it has, in brackets with its
 default where defaults differ.
+"""  # noqa: E501
+NAMES_HEAD = """\
+# Names: statuses, repairs and metrics
+
+Written by `python docs/reference.py` out of the program. [Answers](answers.md) says how a text gets its status, [Comparing two
+runs](comparing.md) how metrics are compared.
+"""  # noqa: E501
+METRICS_HEAD = """\
+Names are those of `summary.csv`. Metrics of answers have one for each role: {}. *Only* names the kind of run that has a
+metric: frozen (`harness eval`) or closed-loop (`harness drive`).
 """  # noqa: E501
 # meaning and default
 HELP = r"(.*?)(?: \[?(?:[Dd]efault: )?((?<=efault: ).*?|(?<=\[)required)[.\]]?)?"
@@ -147,6 +161,36 @@ def reference() -> str:
     return "\n".join([HEAD, overview(found), shared_section(common), *sections])
 
 
+def names() -> str:
+    """The page of what statuses, repairs and metrics are called, and mean."""
+    suffixes = [f"_{role}" for role in roles()]
+    others = tuple(suffix for suffix in suffixes if suffix != "_ego")
+    statuses = [(f"`{status}`", _plain(status.meaning)) for status in Status]
+    repairs = [(f"`{repair}`", _plain(repair.meaning)) for repair in Repair]
+    metrics = [
+        (f"`{name}`", _plain(metric.meaning), metric.better, metric.world or "")
+        for name, metric in METRICS.of_harness.items()
+        if not name.endswith(others)
+    ]
+    metrics_head = METRICS_HEAD.format(", ".join(f"`{suffix}`" for suffix in suffixes))
+    sections = [
+        ("## Statuses\n", _table([("status", "meaning"), *statuses])),
+        ("## Repairs\n", _table([("repair", "meaning"), *repairs])),
+        (
+            f"## Metrics\n\n{metrics_head}",
+            _table([("metric", "meaning", "better", "only"), *metrics]),
+        ),
+    ]
+    return "\n".join([NAMES_HEAD, *("\n".join(section) for section in sections)])
+
+
+def _table(rows: list[tuple[str, ...]]) -> str:
+    """Rows as a table of Markdown, of which the first is its head."""
+    rule = ("---",) * len(rows[0])
+    lines = [" | ".join(row) for row in (rows[0], rule, *rows[1:])]
+    return "".join(f"| {line} |\n" for line in lines)
+
+
 def _item(name: str, meaning: str, default: str) -> str:
     stated = (
         f" Default: {default}." if default not in ("", "required") else " Required." * bool(default)
@@ -160,3 +204,4 @@ def _plain(text: str) -> str:
 
 if __name__ == "__main__":
     PAGE.write_text(reference())
+    NAMES_PAGE.write_text(names())

@@ -13,15 +13,8 @@ from harness.coordination.named_points import POINTS
 from harness.coordination.part_settings import typed_settings
 from harness.coordination.rules import EGO_PROMPT, POOLS
 from harness.coordination.schedules import SCHEDULES
-from harness.parsing.parse import Repair, Status
-from harness.runs.metrics import METRICS
 
 ROOT = Path(__file__).parent.parent
-
-
-@pytest.mark.parametrize("member", [*Status, *Repair], ids=str)
-def test_every_status_and_repair_is_documented_with_its_meaning(member: Status | Repair) -> None:
-    assert f"- `{member.value}`: {member.meaning}\n" in (ROOT / "docs/answers.md").read_text()
 
 
 @pytest.mark.parametrize("mode", get_args(AnswerMode))
@@ -59,11 +52,6 @@ def test_every_consensus_is_documented(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in SCHEDULES if SCHEDULES.is_ours(name)])
 def test_every_schedule_is_documented(name: str) -> None:
     assert f"| `{name}` |" in (ROOT / "docs/scheduling.md").read_text()
-
-
-@pytest.mark.parametrize("metric", [name for name, m in METRICS.items() if m.compared])
-def test_every_metric_that_runs_are_compared_by_is_documented(metric: str) -> None:
-    assert f"`{metric}`" in (ROOT / "docs/comparing.md").read_text()
 
 
 def test_the_overview_for_language_models_leads_to_pages_that_exist_under_their_titles() -> None:

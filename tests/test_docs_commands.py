@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from reference import PAGE, all_typed, blocks, commands, pages, reference, typed
+from reference import NAMES_PAGE, PAGE, all_typed, blocks, commands, names, pages, reference, typed
 from tiers import some
 from typer import TyperException
 from typer.main import get_command
@@ -524,6 +524,10 @@ def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> Non
     assert PAGE.read_text() == reference(), "run `python docs/reference.py`"
     elsewhere = {line for page in pages() if page != PAGE for line in lines_of(page)}
     assert set(lines_of(PAGE)) <= elsewhere
+
+
+def test_the_page_of_names_is_the_programs() -> None:
+    assert NAMES_PAGE.read_text() == names(), "run `python docs/reference.py`"
 
 
 def test_console_is_the_one_form_of_a_shell_block() -> None:
