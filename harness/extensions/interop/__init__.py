@@ -20,7 +20,10 @@ EXTENSION = Extension(
             "trackio": f"{_HERE}:TRACKIO",
             "wandb": f"{_HERE}:WANDB",
         },
-        "exports": {"inspect": f"{_HERE}.exports:INSPECT"},
+        "exports": {
+            "every-eval": f"{_HERE}.exports:EVERY_EVAL",
+            "inspect": f"{_HERE}.exports:INSPECT",
+        },
         "hooks": {
             "mlflow": f"{_HERE}.trackers.mlflow:TRACKER",
             "trackio": f"{_HERE}.trackers.trackio:TRACKER",

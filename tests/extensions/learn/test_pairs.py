@@ -362,7 +362,7 @@ def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "--junit, --inspect, --sft, --dpo: give exactly one of them"),
+        ((), "--junit, --every-eval, --inspect, --sft, --dpo: give exactly one of them"),
         (
             ("--junit", "a.xml", "--report-seeds-too"),
             "--report-seeds-too only goes with --sft and --dpo; give one, or leave it out",
@@ -385,7 +385,7 @@ def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path:
         ),
         (
             ("--csv", "--dataset", "there"),
-            "--dataset only goes with --inspect, --sft and --dpo; leave it out",
+            "--dataset only goes with --every-eval, --inspect, --sft and --dpo; leave it out",
         ),
     ],
 )
