@@ -17,16 +17,14 @@ from msgspec.structs import replace
 from harness.core.errors import UserError, printable
 from harness.core.files import (
     BROKEN,
-    LARGEST,
     NO_ROOM,
     Refused,
     bytes_of,
-    opened,
     refuse_bomb,
     replacing,
     write_whole,
 )
-from harness.core.zips import BROKEN_ZIP
+from harness.core.zips import BROKEN_ZIP, bounded_archive, piece, refuse_larger
 from harness.runs.folder import Run
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
@@ -45,7 +43,6 @@ MOST_UNPACKED = 1 << 30  # bytes of all files together
 MOST_RUNS = 100
 MOST_LETTERS = 200  # of who made it
 LARGEST_LIST = 1 << 20  # bytes of the archive's list of files
-END, END_64 = b"PK\5\6", b"PK\6\7"  # how the two records begin that stand after this list
 CHUNK = 1 << 20
 
 
@@ -131,7 +128,7 @@ def contents_of(file: Path) -> Contents:
     and which runs there are. Raises UserError if the file is not one of results.
     """
     with _archive(file) as archive:
-        return msgspec.json.decode(_piece(archive, CONTENTS, CHUNK), type=Contents)
+        return msgspec.json.decode(piece(archive, CONTENTS, CHUNK), type=Contents)
 
 
 def unpack(file: Path, contents: Contents, folder: Path) -> None:
@@ -147,18 +144,17 @@ def unpack(file: Path, contents: Contents, folder: Path) -> None:
         if sorted(archive.namelist()) != sorted([CONTENTS, *wanted]):
             raise ValueError("it has other files than it should, or one twice")
         for name, most in wanted.items():
-            _refuse_larger(name, archive.getinfo(name).file_size, most)
+            refuse_larger(name, archive.getinfo(name).file_size, most)
         refuse_bomb(archive, file.stat().st_size, MOST_UNPACKED)
         for name, most in wanted.items():
-            write_whole(folder / name, _piece(archive, name, most))
+            write_whole(folder / name, piece(archive, name, most))
 
 
 @contextmanager
 def _archive(file: Path) -> Iterator[ZipFile]:
     """Open a file of results. Raises UserError if it, or what is read of it, is none."""
     try:
-        _refuse_long_list(file)
-        with opened(file, "record") as whole, ZipFile(whole) as archive:
+        with bounded_archive(file, "record", LARGEST_LIST) as archive:
             yield archive
     except (*BROKEN, *BROKEN_ZIP) as error:
         if getattr(error, "errno", None) in NO_ROOM and not isinstance(error, Refused):
@@ -172,32 +168,3 @@ def _archive(file: Path) -> Iterator[ZipFile]:
 
 def _plain(name: str) -> bool:
     return own_name(name) and name.isprintable() and "\\" not in name and 0 < len(name) <= 100
-
-
-def _refuse_long_list(file: Path) -> None:
-    """Raise ValueError for a list of files that would fill memory before one of them is looked
-    at.
-    """
-    with opened(file, "record") as whole:
-        end = whole.seek(0, 2)
-        whole.seek(max(0, end - 42))
-        tail = whole.read()
-    if len(tail) < 22 or tail[-22:-18] != END or tail[:4] == END_64:
-        raise ValueError(
-            f"it does not end as a zip file of at most {LARGEST['record'] >> 20} MB does"
-        )
-    if int.from_bytes(tail[-10:-6], "little") > LARGEST_LIST:
-        raise ValueError("its list of files is too long")
-
-
-def _piece(archive: ZipFile, name: str, most: int) -> bytes:
-    """Return a file's content; never more than `most` bytes are unpacked."""
-    with archive.open(name) as packed:
-        data = packed.read(most + 1)
-    _refuse_larger(name, len(data), most)
-    return data
-
-
-def _refuse_larger(name: str, size: int, most: int) -> None:
-    if size > most:
-        raise ValueError(f"{name} is larger than {most >> 20} MB")
