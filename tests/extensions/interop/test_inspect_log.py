@@ -110,7 +110,7 @@ def test_a_kept_prompt_is_in_the_log_once_the_version_is_gone(
     tmp_path: Path, harness: Harness
 ) -> None:
     Path("swarmdrive.toml").touch()
-    shutil.copytree(Path(__file__).parent.parent / "prompts" / "v6", "prompts/mine")
+    shutil.copytree(Path(__file__).parents[3] / "prompts" / "v6", "prompts/mine")
     typed = (
         "eval",
         "--model",
