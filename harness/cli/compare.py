@@ -1,7 +1,9 @@
 """`harness compare`: two finished runs against each other."""
 
+from collections.abc import Sequence
 from os.path import realpath
 from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
 import typer
 
@@ -11,13 +13,18 @@ from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import refuse_data
 
+if TYPE_CHECKING:
+    from harness.report.compare.logs import ComparedLogs
+
 LISTED = 10  # episodes, decisions and requests of each kind that are listed
 
 
 def command(
-    a: Path = typer.Argument(help="Folder of the run to compare with.", metavar="A"),
+    a: Path = typer.Argument(
+        help="Folder of the run to compare with, or a log of another program.", metavar="A"
+    ),
     b: Path = typer.Argument(
-        help="Folder of the run to judge: differences are B - A.", metavar="B"
+        help="Folder of the run to judge, or a log like A: differences are B - A.", metavar="B"
     ),
     fail_if: list[str] | None = typer.Option(
         None,
@@ -52,7 +59,7 @@ def command(
     verbose: options.Verbose = False,
 ) -> None:
     """Show what changed from run A to B, by episode and seed. Exit code 1 if a gate fails."""
-    from harness.report.compare import text
+    from harness.report.compare import logs, text
     from harness.report.compare.difference import compare as compared
     from harness.report.compare.gate import gate, judge
     from harness.report.compare.pair import pair
@@ -73,6 +80,11 @@ def command(
         raise UserError(f"--html and --junit name one file, {printable(html)}; name two")
     if junit and not fail_if:
         raise UserError("--junit writes gates; give one or more with --fail-if")
+    if reader := logs.reader_of(a, b):
+        if html:
+            raise UserError("--html shows runs, and A and B are logs; leave it out")
+        comparison = reader.compare(a, b)
+        _show_logs(comparison, fail_if or (), most, junit, as_markdown, as_json)
     gates = [gate(typed) for typed in fail_if or ()]
     if reasons := [
         f"{words} ({printable(run)})" for run in (a, b) if gates and (words := why(run))
@@ -103,4 +115,40 @@ def command(
     else:
         typer.echo(text.brief(difference, verdicts))
         after_comparison(difference)
+    raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
+
+
+def _show_logs(
+    comparison: "ComparedLogs",
+    fail_if: Sequence[str],
+    show: int,
+    junit: Path | None,
+    as_markdown: bool,
+    as_json: bool,
+) -> NoReturn:
+    """Print the comparison of two logs of another program, and end the command."""
+    from harness.core.junit import Case
+    from harness.core.junit import junit as test_suite
+    from harness.report.compare import logs, text, words
+    from harness.report.compare.gate import gate, judge_changes
+    from harness.report.page import save
+
+    gates = [gate(typed, logs.METRICS, logs.PLACE, logs.EXAMPLE) for typed in fail_if]
+    if gates and comparison.unsure:
+        lacks = f"{comparison.unsure}, so that --fail-if has nothing sure to judge"
+        if junit:
+            save([text.junit_of_none([each.text for each in gates], lacks)], junit, "--junit")
+        raise UserError(f"{lacks}; finish the logs, or leave --fail-if out")
+    verdicts = [judge_changes(each, comparison.changes) for each in gates]
+    if junit:
+        cases = []
+        for verdict in verdicts:
+            failure = words.judged(verdict) if verdict.failed else None
+            cases.append(Case(comparison.title, verdict.gate, failure))
+        save([test_suite("harness compare", cases)], junit, "--junit")
+    if as_json:
+        echo_json(comparison.mapping(verdicts, show))
+    else:
+        render = comparison.markdown if as_markdown else comparison.terminal
+        typer.echo(render(verdicts, show))
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)

@@ -1,4 +1,4 @@
-"""Runs in programs of others: trackers that follow them, and a log."""
+"""Runs in programs of others: trackers that follow them, records, and logs, also of others."""
 
 from harness.core.extensions import Extension
 
@@ -29,6 +29,7 @@ EXTENSION = Extension(
             "trackio": f"{_HERE}.trackers.trackio:TRACKER",
             "wandb": f"{_HERE}.trackers.wandb:TRACKER",
         },
+        "logs": {"inspect": f"{_HERE}.logs:INSPECT"},
         "options": {"tracker": f"{_HERE}.option:TRACKER"},
         "python": {"Hook": f"{_HERE}.hooks:Hook"},
     },

@@ -3,10 +3,11 @@
 import math
 import operator
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.statistics import Estimate
 from harness.report.compare.difference import Comparison
 from harness.runs.metrics import METRICS
 
@@ -110,24 +111,38 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
     Raises:
         UserError: the gate's condition is not compared, or the difference is unknown there.
     """
-    names = comparison.pair.conditions
-    if gate.condition is not None and gate.condition not in names:
-        raise unknown(f"condition of --fail-if {printable(gate.text)!r}", gate.condition, names)
-    failed = []
+    changes: dict[str, Estimate | None] = {}
     for condition in comparison.conditions:
-        if gate.condition in (None, condition.condition):
-            changes = [d.change for d in condition.differences if d.metric == gate.metric]
-            value = float(getattr(changes[0], gate.end)) if changes else math.nan
-            if math.isnan(value) and changes and changes[0].n > 1:
-                value = changes[0].value  # all episodes changed alike, so that there is no interval
+        of_metric = [d.change for d in condition.differences if d.metric == gate.metric]
+        changes[condition.condition] = of_metric[0] if of_metric else None
+    return judge_changes(gate, changes)
+
+
+def judge_changes(gate: Gate, changes: Mapping[str, Estimate | None]) -> Verdict:
+    """Return in which conditions a gate, a test of a difference, fails.
+
+    `changes` has the difference of the gate's metric by condition, None where it is not known. Of
+    logs of other programs, the conditions are scorers.
+
+    Raises:
+        UserError: the gate's condition is not compared, or the difference is unknown there.
+    """
+    if gate.condition is not None and gate.condition not in changes:
+        raise unknown(f"condition of --fail-if {printable(gate.text)!r}", gate.condition, changes)
+    failed = []
+    for name, change in changes.items():
+        if gate.condition in (None, name):
+            value = float(getattr(change, gate.end)) if change else math.nan
+            if math.isnan(value) and change and change.n > 1:
+                value = change.value  # all episodes changed alike, so that there is no interval
             if math.isnan(value):
                 # A gate that passes because nothing is known would guard nothing.
                 raise UserError(
-                    f"--fail-if {printable(gate.text)!r}: {printable(condition.condition)} has no "
+                    f"--fail-if {printable(gate.text)!r}: {printable(name)} has no "
                     "such number in these runs; name a condition or a metric that has, or compare "
                     "more episodes"
                 )
             # Means over seeds carry rounding errors, which decide no gate.
             if OPERATORS[gate.op](round(value, 9), gate.number):
-                failed.append((condition.condition, value))
+                failed.append((name, value))
     return Verdict(gate.text, tuple(failed))
