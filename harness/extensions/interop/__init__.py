@@ -29,7 +29,7 @@ EXTENSION = Extension(
             "trackio": f"{_HERE}.trackers.trackio:TRACKER",
             "wandb": f"{_HERE}.trackers.wandb:TRACKER",
         },
-        "logs": {"inspect": f"{_HERE}.logs:INSPECT"},
+        "logs": {"inspect": f"{_HERE}.logs:INSPECT", "lm-eval": f"{_HERE}.logs:LM_EVAL"},
         "options": {"tracker": f"{_HERE}.option:TRACKER"},
         "python": {"Hook": f"{_HERE}.hooks:Hook"},
     },

@@ -4,8 +4,6 @@ A log is a ZIP archive of JSON files, one for each sample and epoch. Nothing of 
 needed, and nothing in a log is run. https://inspect.aisi.org.uk/eval-logs.html
 """
 
-import json
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,12 +16,9 @@ from harness.core.errors import UserError, one_line, printable
 from harness.core.files import BROKEN, LARGEST, digest, refuse_bomb
 from harness.core.zips import BROKEN_ZIP, bounded_archive, piece
 from harness.extensions.interop.sample_pairs import Key, SampleLog
+from harness.extensions.interop.sample_values import MOST_SCORERS, decoded, number
 
 LONGEST_LIST = 16 << 20  # bytes of the archive's list of files, of which it has 65,535 at most
-MOST_SCORERS = 100
-# The number that Inspect takes the text of a score for: of a letter, and of a word in any letters.
-LETTERS = {"C": 1.0, "P": 0.5, "I": 0.0, "N": 0.0}
-WORDS = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
 T = TypeVar("T")
 
 
@@ -115,13 +110,7 @@ def _log(file: Path, archive: ZipFile) -> SampleLog:
 
 
 def _decoded(archive: ZipFile, name: str, kind: type[T]) -> T:
-    data = piece(archive, name, LARGEST["record"])
-    try:
-        return msgspec.json.decode(data, type=kind)
-    except msgspec.DecodeError:  # a score that is not known is written NaN, which is no JSON
-        loaded = json.loads(data)
-        msgspec.json.encode(loaded)  # which fails here for a text that nothing can write again
-        return msgspec.convert(loaded, kind)
+    return decoded(piece(archive, name, LARGEST["record"]), kind)
 
 
 def _without_ids(question: Any) -> Any:
@@ -140,19 +129,6 @@ def _numbers(scores: Mapping[str, Score]) -> Iterator[tuple[str, float]]:
     for scorer, score in scores.items():
         if isinstance(score.value, dict):
             for name, value in score.value.items():
-                yield f"{scorer}/{name}", _number(value)
+                yield f"{scorer}/{name}", number(value)
         else:
-            yield scorer, _number(score.value)
-
-
-def _number(value: Any) -> float:
-    """Return a score as Inspect counts it; NaN for what is no number."""
-    if isinstance(value, str):
-        value = LETTERS.get(value, WORDS.get(value.lower(), value))
-    if not isinstance(value, str | int | float):
-        return math.nan
-    try:
-        number = float(value)
-    except (ValueError, OverflowError):
-        return math.nan
-    return number if math.isfinite(number) else math.nan
+            yield scorer, number(score.value)

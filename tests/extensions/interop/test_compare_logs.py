@@ -1,7 +1,8 @@
-"""`harness compare A.eval B.eval`: two logs of Inspect AI, paired by sample and epoch.
+"""`harness compare A B`: two logs of Inspect AI, or of lm-eval, paired by sample and epoch.
 
 `logs/` has two that Inspect AI 0.3.285 wrote: six sums in two epochs, and a seventh in B. Their
-events and tracebacks were taken out.
+events and tracebacks were taken out. `logs/right` and `logs/worse` each have what lm-eval 0.4.13
+wrote of six sums under two filters.
 """
 
 import json
@@ -16,6 +17,8 @@ from run_on_disk import made_up
 
 LOGS = Path(__file__).parent / "logs"
 A, B = LOGS / "sums-a.eval", LOGS / "sums-b.eval"
+RIGHT = LOGS / "right/samples_sums_2026-11-30T07-59-29.314080.jsonl"
+WORSE = LOGS / "worse/samples_sums_2026-11-30T07-59-52.617443.jsonl"
 Said = tuple[int, str, str]
 Harness = Callable[..., Said]
 Sample = dict[str, Any]
@@ -231,3 +234,54 @@ def test_the_package_reads_the_logs_alike(harness: Harness) -> None:
         shown = json.loads(out)[side]
         assert (len(whole.samples), len(errors)) == (shown["answers"], shown["errors"]["count"])
         assert (whole.eval.task, whole.eval.model) == (shown["task"], shown["model"])
+
+
+def test_answers_of_lm_eval_are_paired_by_document(harness: Harness) -> None:
+    """`exact_match`: three of six are wrong in B, one of which the filter `digits` repairs.
+
+    The standard error: the variance of the changes is .3; squared weights 1 / 36 for each; two that
+    differ are added, of 1 / 36 each.
+    """
+    code, out, err = harness("compare", RIGHT, WORSE, "--json", "--fail-if", "score < -0.4")
+    assert (code, err) == (1, "")
+    whole, scorers = json.loads(out), scorers_of(out)
+    plain, digits = scorers["exact_match"], scorers["exact_match,digits"]
+    high = -0.5 + 1.959964 * math.sqrt(0.3 / 6 + 2 / 36)
+    assert [plain[name] for name in ("a", "b", "difference", "low", "high")] == pytest.approx(
+        [1.0, 0.5, -0.5, -1.0, high], abs=1e-6
+    )
+    assert [each["sample"] for each in plain["changed"]["listed"]] == [1, 2, 4]
+    assert [each["sample"] for each in digits["changed"]["listed"]] == [1, 4]
+    assert (whole["a"]["task"], whole["a"]["model"]) == ("sums", "right")
+    assert whole["gates"][0]["failed_in"] == [{"scorer": "exact_match", "value": -0.5}]
+
+
+@pytest.mark.parametrize(
+    ("lines", "reason"),
+    [
+        ("", "it has no answers"),
+        ("no JSON", "Expecting value"),
+        ("[" * 100_000, "recursion"),
+        ('{"doc_id": 0}', "missing required field `metrics`"),
+        ('{"doc_id": 0, "metrics": ["m"], "m": 1}\n' * 2, "document 0 is there twice for m"),
+        (
+            '{"doc_id": 0, "metrics": []}\n{"doc_id": 0, "metrics": [], "doc": 1}',
+            "document 0 is there with two inputs",
+        ),
+        (json.dumps({"doc_id": 0, "metrics": [f"m{n}" for n in range(101)]}), "more than 100"),
+    ],
+)
+def test_a_file_that_is_not_of_lm_eval_is_one_line(
+    lines: str, reason: str, harness: Harness
+) -> None:
+    Path("b.jsonl").write_text(lines)
+    code, out, err = harness("compare", RIGHT, "b.jsonl")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "b.jsonl is no file of answers of lm-eval (" in err
+    assert reason in err
+
+
+def test_logs_of_two_programs_are_no_pair(harness: Harness) -> None:
+    code, out, err = harness("compare", A, RIGHT)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "give two of a kind" in err
