@@ -10,6 +10,7 @@ MOST_SCORERS = 100  # of a log
 # The number that Inspect takes the text of a score for: of a letter, and of a word in any letters.
 LETTERS = {"C": 1.0, "P": 0.5, "I": 0.0, "N": 0.0}
 WORDS = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
+MOST = 1e100  # whose square is still a number
 T = TypeVar("T")
 
 
@@ -27,7 +28,7 @@ def decoded(data: bytes, kind: type[T]) -> T:
 
 
 def number(value: Any) -> float:
-    """Return a score as Inspect counts it; NaN for what is no number."""
+    """Return a score as Inspect counts it; NaN for what is no number, or beyond `MOST`."""
     if isinstance(value, str):
         value = LETTERS.get(value, WORDS.get(value.lower(), value))
     if not isinstance(value, str | int | float):
@@ -36,4 +37,4 @@ def number(value: Any) -> float:
         score = float(value)
     except (ValueError, OverflowError):
         return math.nan
-    return score if math.isfinite(score) else math.nan
+    return score if abs(score) <= MOST else math.nan

@@ -113,11 +113,11 @@ def test_what_a_log_says_is_shown_as_text(harness: Harness) -> None:
 
 
 def test_scores_are_numbers_as_inspect_counts_them(harness: Harness) -> None:
-    values = ["C", "P", "I", "N", True, "no", "0.25", 0.75, "c", [1], float("nan"), 10**400]
+    values = ["C", "P", "I", "N", True, "no", "0.25", 0.75, "c", [1], float("nan"), 10**400, 1e200]
     samples = [sample(n, value) for n, value in enumerate(values)]
     out = harness("compare", log("a.eval", samples), log("b.eval", samples), "--json")[1]
     match = scorers_of(out)["match"]
-    assert (match["n"], match["n_excluded"], match["a"]) == (8, 4, 3.5 / 8)
+    assert (match["n"], match["n_excluded"], match["a"]) == (8, 5, 3.5 / 8)
 
 
 def test_messages_are_compared_without_their_ids(harness: Harness) -> None:
