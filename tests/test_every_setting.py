@@ -7,10 +7,12 @@ import shlex
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 import msgspec
 import pytest
+from another_program import Line, answered, write
 from evaluating import A_TENTH, same_decisions, spec_of
 from misbehaving import Asked, completion, serving
 from msgspec import structs
@@ -62,6 +64,8 @@ RUNS = {
     "--server {server}",
     "device": "eval --model mine --dataset {two} --limit 1 --condition 6g --server {server} "
     "--device-profile agx-orin --device-model qwen3-4b",
+    "file": "eval --model theirs --prompt v1 --dataset {two} --limit 1 --condition single-local "
+    "--answers answers.jsonl",
     "driven": "drive --scenario {scenario} --condition single-local "
     "--episodes 1 --first-seed 7 --seeds 3,7",
     "driven selected": "drive --scenario {scenario} --condition single-local "
@@ -164,6 +168,13 @@ def test_a_run_states_each_setting_and_repeats_it(
             *(["--workers", "1"] if "drive" in typed else []),
             "--out",
         )
+        if "--answers" in typed:
+            beside = ["--answers", "answers.jsonl"]
+            write(Path("answers.jsonl"), lines := list[Line]())
+            while harness(*typed, *silent, "run")[0] == 3:
+                lines += answered(Path("run"))
+                write(Path("answers.jsonl"), lines)
+            rmtree("run")
         if "other" in typed:
             assert harness(*typed[:-2], "--model", "cruise", *silent, "other")[0] == 0
         code, _, error = harness(*typed, *silent, "run")

@@ -27,6 +27,7 @@ from harness.core.files import bytes_of, text_of
 
 TAUGHT = "training.json"  # stands beside weights that were taught here
 SERVED = ("http", "https", "openai")  # what a served model begins with, before a colon
+ANSWERS_FILE = "answers-file"  # the engine of answers that another program wrote
 PROJECTOR = "mmproj-"  # prefix of a projector's GGUF file
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 _TEMPLATE_FILES = ("chat_template.jinja", "tokenizer_config.json")
@@ -120,6 +121,15 @@ def resolve(text: str, engine: str | None = None) -> Card:
     return card
 
 
+def of_answers(name: str, file: str) -> Card:
+    """Return the model card of answers that another program wrote to the file `file`.
+
+    `name` is what the user calls the model that answered. It opens no model of that name. Raises
+    UserError if terminals cannot show it.
+    """
+    return _new_card(name, ANSWERS_FILE, file, "Answers of another program")
+
+
 def argument(card: Card) -> str:
     """Return the text after `--model` that names the model of this card.
 
@@ -131,6 +141,8 @@ def argument(card: Card) -> str:
         return f"{card.server.urls[0]}#{card.weights}"
     if card.engine == "replay":
         return f"replay:{card.weights}"
+    if card.engine == ANSWERS_FILE:
+        return card.name
     return card.adapter or card.weights or card.name
 
 

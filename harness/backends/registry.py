@@ -35,7 +35,8 @@ class Capabilities:
     none. `renders` says that prompts can be shown as its model reads them, `has_weights` that it
     loads some, `asks_helpers` that helpers are asked as well as the ego, and `closed_loop` that it
     answers for new scenes. With `own_latency` its answers were timed earlier; a `reference` is a
-    driver that reports compare models with; `samples` says that it heeds a temperature.
+    driver that reports compare models with; `samples` says that it heeds a temperature, `from_file`
+    that another program wrote its answers, so that nothing is asked or timed here.
     """
 
     # whether it is a model that reads prompts, whose answers are timed and which can fuse messages
@@ -53,6 +54,8 @@ class Capabilities:
     reference: bool = False  # whether it is a driver that a report compares models with
     # whether it heeds a request's `temperature` and `sample` (never if it is `bare`)
     samples: bool = False
+    # whether its answers come from a file of another program: nothing is asked or timed here
+    from_file: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,10 @@ BUILT_IN: Mapping[str, Registration] = {
     "replay": Registration(
         "harness.backends.replay:open",
         Capabilities(renders=False, closed_loop=False, own_latency=True),
+    ),
+    "answers-file": Registration(
+        "harness.backends.answers_file:open",
+        Capabilities(answer_modes=("json",), renders=False, closed_loop=False, from_file=True),
     ),
     "transformers": Registration(
         "harness.backends.transformers.engine:open",
@@ -192,6 +199,21 @@ def reads_prompts(engine: str) -> bool:
     """Return whether an engine's models read prompts, unlike rules; true for one not installed."""
     entry = ENGINES.get(engine)
     return entry is None or entry.capabilities.language_model
+
+
+def is_from_file(model: Mapping[str, Any], identity: Mapping[str, Any]) -> bool:
+    """Return whether a run's answers came from a file of another program, so that none was asked.
+
+    `model` and `identity` are what the run states of its model. That of a run which replays another
+    has that of the other.
+    """
+    while isinstance(earlier := identity.get("of"), Mapping):
+        records: list[Any] = [earlier.get("model"), earlier.get("identity")]
+        if not all(isinstance(record, Mapping) for record in records):
+            return False
+        model, identity = records
+    entry = ENGINES.get(str(model.get("engine")))
+    return entry is not None and entry.capabilities.from_file
 
 
 def open_backend(

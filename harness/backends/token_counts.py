@@ -8,6 +8,7 @@ from harness.backends.base import Request
 if TYPE_CHECKING:
     from harness.backends.registry import Capabilities
 
+MOST_TOKENS = 10**7  # more than any context; what is counted beyond is no count
 MOST_CHARACTERS = 16  # of a token, on average over a text: whoever counts fewer has not counted
 
 

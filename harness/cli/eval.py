@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import typer
 
@@ -12,12 +12,13 @@ from harness.cli.next_command import after_run
 from harness.cli.run import Column, as_mapping, default_out, evaluate, show, walked
 from harness.cli.terminal import echo_cost, echo_json, echo_prompt_tokens
 from harness.core.errors import UserError, printable
-from harness.core.figures import crossed
+from harness.core.figures import amount, crossed
 from harness.core.seeds import seeds_text
 from harness.runs import headline
 from harness.runs.settings import FrozenSettings, Settings
 
 if TYPE_CHECKING:
+    from harness.backends.answers_file import Question
     from harness.core.parallel import Workers
     from harness.dataset.load import Dataset
     from harness.evaluate.lifecycle import Evaluated
@@ -63,7 +64,7 @@ def command(
     from harness.evaluate import command_options, resolve
     from harness.runs.folder import read
 
-    world: Any = settings.world
+    world, silent = cast("Any", settings.world), as_json or quiet
     named_suite = suites.named(world.dataset)
     sources = [resolve.frozen(settings, name) for name in suites.datasets(world.dataset)]
     datasets = [source.dataset for source in sources]
@@ -77,15 +78,23 @@ def command(
             f"{rule.options} out"
         )
     if dry_run:
+        from harness.evaluate import questions
         from harness.evaluate.dry_run import count
 
-        pairs = zip(specs, datasets, strict=True)
+        pairs = list(zip(specs, datasets, strict=True))
         counts = [count(spec, dataset, tokenizer) for spec, dataset in pairs]
         if as_json:
             echo_json(counts if named_suite else counts[0])
         elif not quiet:
             for spec, counted in zip(specs, counts, strict=True):
                 show_counted(spec, counted)
+        if out:
+            by_id: dict[str, Question] = {}
+            for pair in pairs:
+                by_id |= questions.first(*pair)
+            file = questions.write(by_id.values(), out)
+            if not silent:
+                typer.echo(f"wrote {amount(len(by_id), 'question')} to {printable(file)}")
         return
     follows = command_options.follows(of_command)
     at_servers = any(agent.card.server for spec in specs for agent in spec.agents)
@@ -93,7 +102,7 @@ def command(
     if workers is not None:
         _refuse_language_models(specs, who, workers)
     with command_options.guarded(of_command, specs, who) as specs:
-        silent, cache = as_json or quiet, None if no_cache else default_file()
+        cache = None if no_cache else default_file()
         evaluated = partial(
             evaluate, cache=cache, quiet=silent, workers=who, full=full, follows=follows
         )

@@ -167,7 +167,8 @@ DryRun = Annotated[
     bool,
     Option(
         "--dry-run",
-        help="Only render the prompts and count requests and tokens; write nothing.",
+        help="Only render the prompts and count requests and tokens. With --out of `harness eval`, "
+        "write the questions to questions.jsonl there for another program; else write nothing.",
         rich_help_panel=stated.OUTPUT,
     ),
 ]

@@ -49,10 +49,10 @@ def check(suite: "Suite", specs: "Sequence[Spec]") -> None:
         )
     for agent in first.agents:
         if not agent.can.closed_loop:
-            name = printable(agent.card.name)
-            raise UserError(
-                f"--model {name}: a replay has the answers of one run; replay its dataset"
-            )
+            reason = "a replay has the answers of one run; replay its dataset"
+            if agent.can.from_file:
+                reason = "a file has the answers on one dataset; give --dataset"
+            raise UserError(f"--model {printable(agent.card.name)}: {reason}")
 
 
 def evaluate(

@@ -8,6 +8,8 @@ from harness.core.errors import UserError, printable
 WORK = ".work"  # folder of unfinished work
 # in it, the settings that the work began with; without it there is nothing to resume
 CONFIG = "config.json"
+# in an output folder, questions for another program, whose answers are to be judged
+QUESTIONS = "questions.jsonl"
 SOURCES = "sources"  # folder in a run's folder, of the files that it was made of
 SUITE = "suite.json"  # marks a folder that holds a suite's runs
 # What a run, a suite or a dataset is read from.

@@ -23,7 +23,7 @@ from harness.core.errors import (
     sayable,
 )
 from harness.core.files import alone, forget_halves, text_of, write_whole
-from harness.core.formats import CONFIG, WORK
+from harness.core.formats import CONFIG, QUESTIONS, WORK
 
 LOCK = "lock"
 UNANSWERED = "unanswered.txt"  # why the work stopped, if the model could not be asked
@@ -66,7 +66,9 @@ def start_of(out: Path, kind: type[Kind]) -> Kind | None:
     try:
         if file.is_file() and not idle(out):
             return msgspec.json.decode(text_of(file, "record"), type=kind)
-        occupied = out.is_dir() and any(path.name != WORK for path in out.iterdir())
+        occupied = out.is_dir() and any(
+            path.name not in (WORK, QUESTIONS) for path in out.iterdir()
+        )
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{printable(file)} is damaged ({printable(error)}); delete --out {folder} and start "
@@ -104,6 +106,13 @@ def idle(out: Path) -> bool:
 
 def _nothing_done(work: Path) -> bool:
     return {path.name for path in work.iterdir()} <= {CONFIG, f"seal-{CONFIG}", LOCK, UNANSWERED}
+
+
+def waits(out: Path) -> bool:
+    """Return whether a folder holds nothing but questions for another program to answer."""
+    with suppress(OSError):
+        return [path.name for path in out.iterdir()] == [QUESTIONS]
+    return False
 
 
 def same(

@@ -2,10 +2,11 @@
 
 from collections import Counter
 from collections.abc import Container, Iterator, Sequence
-from itertools import chain, combinations, product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
+from harness.backends.base import Request
 from harness.backends.tokens import counter, summarize_counts
 from harness.coordination.operating_point import Rewrites
 from harness.coordination.parts import PLAIN
@@ -28,14 +29,7 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
     tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}
     requests_by_role, scenes = Counter[str](), dataset.scenes(dataset.courses())
-    intents = [point for point in spec.points if point.asks and point.content.asks_helpers]
-    plain = spec.asks_all or any(point.question == PLAIN for point in intents)
-    plain_requests = requests(spec, scenes, places=None if plain else [EGO] * len(scenes))
-    asking = spec.points if spec.asks_all else intents
-    others = {point.question for point in asking if point.question != PLAIN}
-    for request in chain(
-        plain_requests, *(requests(spec, scenes, question) for question in others)
-    ):
+    for request in planned(spec, scenes):
         requests_by_role[request.role] += 1
         card, tokens = spec.agents[request.agent].card, None
         if tokens_of:
@@ -62,6 +56,19 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
         "prompt_tokens": stats or None,
     }
     return {**counts, "cost": costs} if costs else counts
+
+
+def planned(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
+    """Yield the requests that an evaluation makes in some scenes at most, without fusion calls.
+
+    A fusion call is a second question to the ego's model, with the messages that it heard.
+    """
+    intents = [point for point in spec.points if point.asks and point.content.asks_helpers]
+    plain = spec.asks_all or any(point.question == PLAIN for point in intents)
+    yield from requests(spec, scenes, places=None if plain else [EGO] * len(scenes))
+    asking = spec.points if spec.asks_all else intents
+    for question in {point.question for point in asking if point.question != PLAIN}:
+        yield from requests(spec, scenes, question)
 
 
 def lacking(

@@ -194,7 +194,8 @@ def resumable(spec: Spec, out: Path) -> bool:
     run that was stopped before its first answer.
     """
     try:
-        return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)
+        is_here = work.idle(out) or work.waits(out) or unfinished(spec, out) is not None
+        return is_here and not work.held(out)
     except UserError:
         return False
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
 from harness.backends.base import BARE
+from harness.backends.card import Card
 from harness.coordination.counterparts import counterparts
 from harness.coordination.named_points import POINTS, named_point
 from harness.coordination.operating_point import OperatingPoint
-from harness.core.errors import UserError, in_range
+from harness.core.errors import UserError, in_range, printable
 from harness.core.files import text_of
 from harness.core.resources import folder
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose
@@ -118,7 +119,7 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     the ego's answers for helpers, too. Raises UserError for models, prompts or answer modes that do
     not exist or do not fit.
     """
-    card = cards.resolve(settings.model, settings.engine)
+    card = _card(settings)
     prompt = versions.load(settings.prompt or scenario.prompt)
     # Agent checks the modes.
     how = (
@@ -137,6 +138,18 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
             "leave it out, or give --answer readout"
         )
     return ego, helpers
+
+
+def _card(settings: Settings) -> Card:
+    """Return the card of the model that answers for the ego, or of a file of answers."""
+    if settings.answers is None:
+        return cards.resolve(settings.model, settings.engine)
+    option = f"--answers {printable(settings.answers)}"
+    if settings.engine is not None:
+        raise UserError(f"{option}: no engine answers here; leave --engine out")
+    if settings.model == Settings().model:
+        raise UserError(f"{option}: name what answered, such as --model my-model")
+    return cards.of_answers(settings.model, settings.answers)
 
 
 def points(

@@ -32,7 +32,7 @@ from harness.core.shards import Shard
 from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.dataset.select import recorded
-from harness.evaluate import costs, servers, timing
+from harness.evaluate import costs, questions, servers, timing
 from harness.evaluate import latency as latencies
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
@@ -122,7 +122,7 @@ def evaluate(
     available; nothing is written then. Raises UserError if what a stopped run kept contradicts
     itself. Raises Unanswered if a question of the ego or a fusion call,
     or too many of the helpers', got no answer; the folder keeps all answers, and the same call asks
-    the others again.
+    the others again. Where a file answers, the folder gets the questions that it lacks.
     """
     if (out / "run.json").exists() and (out / WORK).is_dir():
         run = finished_run(spec, out)
@@ -130,6 +130,8 @@ def evaluate(
     metrics_of(spec.source.kind)  # of packages, which must load before anything is asked
     refuse_finished(out)
     run_start = unfinished(spec, out)
+    if spec.ego.can.from_file and not opens:
+        questions.settle(spec, out)
     if not run_start and spec.settings.latency == MEASURED:
         timing.refuse_busy()
     if opens or isinstance(spec.source, FrozenSource):

@@ -255,6 +255,8 @@ class Spec:
                 f"--prompt {version} {reason}; give {self.scenario.prompt}, or one of your own"
             )
         self._check_examples(agent.prompt)
+        if agent.can.from_file:
+            self._check_of_file(agent)
         if self.source.kind == "closed-loop" and agent.image == "another":
             raise UserError(
                 "--image another: pictures of other scenes are a dataset's; give blank or none"
@@ -272,12 +274,27 @@ class Spec:
             raise UserError(
                 f"{option}: a replay has the times of its run; use paper, or leave it out"
             )
+        elif latency == MEASURED and agent.can.from_file:
+            raise UserError(f"{option}: no answer of a file is timed here; use paper, or seconds")
         elif latency == MEASURED and not agent.can.language_model:
             raise UserError(f"{option}: {name} is no language model; use card or paper")
         elif latency == "card" and agent.card.latency.inference_s is None:
             raise UserError(
                 f"{option}: the card of {name} declares no inference time; "
                 "use paper or measured, or add inference_s to the card"
+            )
+
+    def _check_of_file(self, agent: Agent) -> None:
+        """Raise UserError if the questions of a run cannot be written for another program."""
+        option = f"--answers {printable(agent.card.weights)}"
+        if self.helpers:
+            raise UserError(
+                f"{option}: the file answers for helpers, too; leave --helper-model out"
+            )
+        if agent.prompt.image and agent.image != "none":
+            raise UserError(
+                f"{option}: prompt {agent.prompt.version} shows a picture, and questions are "
+                "written as text; give another prompt, or --image none"
             )
 
     def _check_examples(self, prompt: Prompt) -> None:
@@ -505,6 +522,7 @@ class Spec:
         first = self.seeds[0]
         return {
             "model": argument(self.ego.card),
+            "answers": self.ego.card.weights if self.ego.can.from_file else None,
             "engine": None,
             "prompt": self.ego.prompt.version,
             "world": self.source.settings(),

@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
-from harness.backends.registry import reads_prompts
+from harness.backends.registry import is_from_file, reads_prompts
 from harness.coordination.part_settings import more_parts
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
@@ -330,6 +330,17 @@ def moved_system(run: Run) -> Iterator[str]:
         yield (
             f"{printable(name, 30)} reads the system text at the beginning of the first user turn: "
             "its chat template has no place for a system message."
+        )
+
+
+def from_file(run: Run) -> Iterator[str]:
+    """Yield a sentence on a run whose answers came from a file that another program wrote."""
+    model = run.manifest.model
+    if is_from_file(model, run.manifest.identity):
+        yield (
+            f"The answers of {printable(model['name'], 30)} came from a file that another program "
+            "wrote: no model was asked here. Its name, and tokens and seconds of answers, are as "
+            "stated: nobody here counted or timed them."
         )
 
 

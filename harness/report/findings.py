@@ -71,6 +71,7 @@ def _merged(source: Source[Run], runs: Runs) -> list[str]:
 OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
     Kind.VOID: [each(caveats.unanswered), each(caveats.unread)],
     Kind.CAVEAT: [
+        each(caveats.from_file),
         each(caveats.of_extensions),
         each(caveats.moved_system),
         each(caveats.by_letter),

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 
+from harness.backends.registry import is_from_file
 from harness.core.errors import UserError, printable
 from harness.core.figures import Unit
 from harness.core.plugins import Plugins
@@ -103,11 +104,13 @@ def answer_times(run: Shown) -> Iterator[str]:
     A role is who answered: `ego`, `helper` or `merge` (the ego after it heard messages). These
     times are not those that latency is computed from.
     """
+    from_file = is_from_file(run.manifest.model, run.manifest.identity)
+    source = ", as their file states" if from_file else ""
     for role, took in run.manifest.answer_times.items():
         median_ms = f"{1000 * took.median_s:.1f} ms"
         spread_ms = f"5-95 %: {1000 * took.p5_s:.1f} to {1000 * took.p95_s:.1f}"
         times = f"{median_ms} ({spread_ms}, n = {took.n})"
-        yield f"{printable(role_word(role))} answers took {times}; not used as latency"
+        yield f"{printable(role_word(role))} answers took {times}{source}; not used as latency"
 
 
 def cost(run: Shown) -> Iterator[str]:

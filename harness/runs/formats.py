@@ -82,6 +82,7 @@ SETTINGS: Mapping[str, Added] = {
         "2026-11-26", "first", "drawing between the likeliest actions; the first was taken"
     ),
     "extensions": Added("2026-11-29", {}, "settings of extensions; there were none"),
+    "answers": Added("2026-11-30", None, "answers of a file; models were asked"),
 }
 # Of the ego's agent, in run.json itself, and of each of `helpers`.
 AGENT: Mapping[str, Added] = {

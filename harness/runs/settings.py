@@ -37,6 +37,7 @@ OF_EXTENSION = "Extension "  # and its name: the heading of the options that it 
 # What of a setting is the same when a stopped run resumes: itself, what it opens (a run states
 # that), or nothing.
 ITSELF, OPENED, NOTHING = "itself", "opened", "nothing"
+ONLY_TYPED = ("server", "answers")  # settings that no file gives, since a stranger may have made it
 
 
 def option(
@@ -169,6 +170,17 @@ class Settings(Struct, frozen=True, kw_only=True):
             same=OPENED,
         ),
     ] = "json"
+    answers: Annotated[
+        str | None,
+        option(
+            "File of answers that another program wrote, a JSON line each; --model is then the "
+            "name of what answered. Questions that it lacks are written to questions.jsonl in "
+            "--out: answer them, add them to the file, and type the same command again.",
+            ANSWERS,
+            "frozen",
+            same=OPENED,
+        ),
+    ] = None
     thinking: Annotated[bool, option("Ask the model to think before it answers.", same=OPENED)] = (
         False
     )
@@ -549,11 +561,12 @@ def _only_typed(settings: Settings) -> dict[str, list[str]]:
     named: dict[str, list[str]] = {}
     for each in options(type(settings.world)):
         value = each.of(settings)
-        if each.models:
+        is_label = each.name == "model" and bool(settings.answers)
+        if each.models and not is_label:
             models = filter(None, map(str.strip, (value or "").split(",")))
             allowed = all(model.startswith("replay:") or _is_card(model) for model in models)
         else:
-            allowed = each.name != "server" or not value
+            allowed = each.name not in ONLY_TYPED or not value
         if not allowed:
             named[each.name] = each.words(value)
     return named
@@ -595,11 +608,12 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
         for model in value.split(","):
             if lost := card_to_copy(model.strip()):
                 raise UserError(f"{where}: {lost}")
-        what = (
-            f"{printable(value)} is a server, and a file asks none"
-            if flag == "--server"
-            else f"{printable(value)} is none of your cards, and a file opens no other model"
-        )
+        reasons = {
+            "--server": "is a server, and a file asks none",
+            "--answers": "is a file of answers, and a file opens no other",
+        }
+        reason = reasons.get(flag, "is none of your cards, and a file opens no other model")
+        what = f"{printable(value)} {reason}"
         raise UserError(
             f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`"
         )

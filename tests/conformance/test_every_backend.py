@@ -15,6 +15,7 @@ from evaluating import run, scenes_of, spec_of
 from misbehaving import Asked, completion, read_out, serving
 
 from harness.backends import cards
+from harness.backends.answers_file import AnswersFile, Question
 from harness.backends.base import AnswerMode, Backend, Completion, Request
 from harness.backends.gguf_export import export
 from harness.backends.openai.constraint import broken
@@ -47,7 +48,7 @@ def model_free() -> list[str]:
 
 WITH_WEIGHTS = [engine for engine in BUILT_IN if capabilities(engine).has_weights]
 ENGINES = [
-    *((name, "json") for name in (*model_free(), "replay")),
+    *((name, "json") for name in (*model_free(), "replay", "answers-file")),
     *((engine, answer) for engine in ("openai", *WITH_WEIGHTS) for answer in get_args(AnswerMode)),
     *((engine, "decision") for engine in ("systemone", "decisions", "sparrow")),
 ]
@@ -97,12 +98,25 @@ def case(
         if find_spec("llama_cpp") is None:
             pytest.skip("needs the llama-cpp extra")
         model = str(tiny / "tiny.gguf")
+    if model == "answers-file":
+        yield of_a_file(list(requests(spec_of(data), scenes_of(data)[:5]))[:5], folder / "a.jsonl")
+        return
     spec = spec_of(data, model, answer=answer)
     asked = list(requests(spec, data.scenes(data.forest.ids[:1])))  # where every walk begins
     if answer == "json":  # the others take what they take
         asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
     device = "cpu" if spec.ego.card.engine in WITH_WEIGHTS else None
     yield Case(open_backend(spec.ego.card, device=device, batch_size=3), tuple(asked[:5]))
+
+
+def of_a_file(asked: list[Request], file: Path) -> Case:
+    """Requests that a file of answers has, each with some words."""
+    lines = {}
+    for n, request in enumerate(asked):
+        name = Question.of(request).id
+        lines[name] = json.dumps({"id": name, "text": f"words {n}", "tokens": 2, "seconds": 0.1})
+    file.write_text("\n".join(lines.values()))
+    return Case(AnswersFile(file), tuple(asked))
 
 
 def test_every_engine_that_a_card_may_name_is_tried_here() -> None:

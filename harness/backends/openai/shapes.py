@@ -16,7 +16,7 @@ from harness.backends.openai.constraint import broken, constraint
 from harness.backends.openai.endings import ending
 from harness.backends.openai.said import NoText, in_texts, refusal, thought
 from harness.backends.servers import MOST_LOGPROBS, Kind, Server
-from harness.backends.token_counts import least_tokens
+from harness.backends.token_counts import MOST_TOKENS, least_tokens
 from harness.core.errors import UserError
 from harness.core.image import Image
 from harness.prompts.readout import answer_json, letters, spelt
@@ -24,7 +24,6 @@ from harness.prompts.readout import answer_json, letters, spelt
 _REMEDY = (
     "use --answer json, or a server that keeps to it; the kind in its card says how it is asked"
 )
-MOST_TOKENS = 10**7  # more than any context; what a server counts beyond is no count
 # Temperature 0 is not enough: by default some servers penalise repetition (llama_cpp.server by 1.1,
 # vLLM by the checkpoint's generation_config.json), and JSON repeats itself.
 _PENALTY: Mapping[Kind, str] = {
