@@ -28,6 +28,7 @@ TAKEN = {
     "junit",
     "out",
     "run",
+    "schema",
     "values",
 }
 # of formats and their options, where no extension adds one
@@ -119,6 +120,11 @@ def command(
     junit: Path | None = typer.Option(
         None, help="Write a JUnit XML file: one test case per episode and condition."
     ),
+    schema: Path | None = typer.Option(
+        None,
+        help="Write JSON Schemas of run.json, of a line of answers.jsonl and of a message on the "
+        "air to this folder.",
+    ),
     added: Mapping[str, Path | None] = NONE,
     values: Mapping[str, Any] = NONE,
     dataset: options.RunsDataset = None,
@@ -129,7 +135,7 @@ def command(
     from harness.runs.contradictions import refuse
     from harness.runs.folder import read
 
-    files = {"--junit": junit, **added}
+    files = {"--junit": junit, "--schema": schema, **added}
     formats_by_option = {"--csv": as_csv, "--jsonl": as_jsonl, **files}
     [option, *surplus] = [name for name, given in formats_by_option.items() if given] or [""]
     if surplus or not option:
@@ -173,6 +179,8 @@ def command(
             ]
         elif as_jsonl:
             written = [export.decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
+        elif schema:
+            written = export.schemas_json(source.actions, schema)
         elif junit:
             written = [export.junit(source, junit)]
         elif file := added.get(option):

@@ -223,20 +223,21 @@ def record_schema(scenario: Scenario) -> dict[str, Any]:
 
     Only the names of paths and sectors of `scenario` fit it.
     """
-    return _published(record_type(scenario), "decision point")
+    return published(record_type(scenario), "decision point")
 
 
 def tree_schema() -> dict[str, Any]:
     """Return the JSON Schema of `tree.json`: a layout's decision tree."""
-    return _published(Tree, "decision tree of a layout")
+    return published(Tree, "decision tree of a layout")
 
 
 def manifest_schema() -> dict[str, Any]:
     """Return the JSON Schema of `manifest.json`: how a dataset was built."""
-    return _published(Manifest, "dataset manifest")
+    return published(Manifest, "dataset manifest")
 
 
-def _published(kind: type[Closed], title: str) -> dict[str, Any]:
+def published(kind: type[msgspec.Struct], title: str) -> dict[str, Any]:
+    """Return the JSON Schema of a record, with its title; descriptions are the docstrings."""
     dialect = "https://json-schema.org/draft/2020-12/schema"
     schema = {"$schema": dialect, "title": title, **msgspec.json.schema(kind)}
     unwrapped: dict[str, Any] = _unwrapped(schema)

@@ -18,6 +18,7 @@ from harness.core.places import text
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run
 from harness.runs.records import TURNS, Answer, Episode
+from harness.runs.schemas import schemas
 from harness.runs.unanswered import lacking
 
 AT_ONCE = 10_000  # decisions in a piece
@@ -57,6 +58,19 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
         for piece in decisions.table.to_batches(AT_ONCE):
             file.write(encoder.encode_lines(piece.to_pylist()))
     return path
+
+
+def schemas_json(actions: Sequence[str], folder: Path) -> list[Path]:
+    """Write the JSON Schemas of a run's files and of messages, and return the files' paths.
+
+    `actions` are the names of the run's meta-actions, and `folder` is where the files go.
+    """
+    files = []
+    for name, schema in schemas(actions).items():
+        text = msgspec.json.format(msgspec.json.encode(schema), indent=1)
+        write_whole(folder / name, text + b"\n")
+        files.append(folder / name)
+    return files
 
 
 def junit(run: Run, path: Path) -> Path:

@@ -14,6 +14,7 @@ import adapter
 import comparing
 import playing
 import pytest
+from fitting import unfit
 from former import DATASET, DRIVE, NAME
 
 DATA = Path(__file__).parent / "data"
@@ -158,6 +159,7 @@ def test_a_run_says_what_it_said(name: str, finished: Finished) -> None:
     for stem in ("episodes", "summary"):
         table = sorted(comparing.read_file(run / f"{stem}.csv"), key=adapter.place)
         comparing.held(DATA / name / f"{stem}.csv", table, more=True)
+    assert list(unfit(run)) == []
 
 
 @pytest.mark.parametrize(
