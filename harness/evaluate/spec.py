@@ -289,7 +289,7 @@ class Spec:
         option = f"--answers {printable(agent.card.weights)}"
         if self.helpers:
             raise UserError(
-                f"{option}: the file answers for helpers, too; leave --helper-model out"
+                f"{option}: the file answers for helpers, too; give them no models of their own"
             )
         if agent.prompt.image and agent.image != "none":
             raise UserError(
