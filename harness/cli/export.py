@@ -14,7 +14,7 @@ from harness.cli.progress import bar
 from harness.core import extras, work
 from harness.core.errors import UserError, printable
 from harness.core.strangers import worded
-from harness.runs.exports import EXPORTS, Export, Option, options_of
+from harness.runs.exports import EXPORTS, ROWS, Export, Option, options_of
 
 # Words of the command's own options.
 TAKEN = {
@@ -108,8 +108,9 @@ def command(
     as_csv: bool = typer.Option(
         False,
         "--csv",
-        help="Write decisions.csv and answers.csv, one row per decision and answer. A text that a "
-        "spreadsheet would take for a formula gets an apostrophe before it.",
+        help="Write decisions.csv and answers.csv, one row per decision and answer, and NAME.csv "
+        "of what extensions keep with the run, such as notes. A text that a spreadsheet would "
+        "take for a formula gets an apostrophe before it.",
     ),
     as_jsonl: bool = typer.Option(
         False, "--jsonl", help="Write decisions.jsonl, one object per decision."
@@ -171,12 +172,17 @@ def command(
         refuse_data(option, target)
     try:
         if as_csv:
-            # both are read before anything is written
+            # all are read before anything is written
             decisions, answers = source.decisions, source.answers
+            more = {name: table.of(source) for name, table in ROWS.usable().items()}
             written = [
                 export.decisions_csv(decisions, folder / "decisions.csv"),
                 export.answers_csv(answers, source.actions, folder / "answers.csv"),
             ]
+            for name, rows in more.items():
+                if rows:
+                    columns, place = ROWS[name].columns, folder / f"{name}.csv"
+                    written.append(export.rows_csv(columns, rows, place))
         elif as_jsonl:
             written = [export.decisions_jsonl(source.decisions, folder / "decisions.jsonl")]
         elif schema:

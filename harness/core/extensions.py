@@ -43,8 +43,8 @@ KINDS = frozenset(
 # The kinds that it takes from extensions that ship alone.
 SHIPPED_KINDS = frozenset(
     {
-        *("agents", "channel_models", "drives", "encodings", "families", "logs", "options"),
-        *("panels", "readers", "selections", "sources", "stopping_rules", "timers"),
+        *("agents", "channel_models", "csv_rows", "drives", "encodings", "families", "logs"),
+        *("options", "panels", "readers", "selections", "sources", "stopping_rules", "timers"),
     }
 )
 WORDS = re.compile(r"\w[\w-]*( \w[\w-]*)*")

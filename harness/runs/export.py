@@ -152,6 +152,16 @@ def answers_csv(answers: Iterable[Answer], actions: Sequence[str], path: Path) -
     return path
 
 
+def rows_csv(columns: Sequence[str], rows: Iterable[Sequence[object]], path: Path) -> Path:
+    """Write rows of cells as CSV below the names of their columns, and return the file's path.
+
+    A text that a spreadsheet would take for a formula gets an apostrophe before it.
+    """
+    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        file.writelines(_line(cells) for cells in (columns, *rows))
+    return path
+
+
 def _json(value: object) -> str | None:
     return None if value is None else msgspec.json.encode(value).decode()
 

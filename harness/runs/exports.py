@@ -2,15 +2,19 @@
 
 An extension adds one by `adds={"exports": {"name": "module:OBJECT"}}`; `--name FILE` writes it. Its
 attribute `options`, if it has one, is a table of further options by name.
+
+One that ships adds a file to `--csv` by `adds={"csv_rows": {"name": "module:ROWS"}}`: `name.csv`,
+where the run has any such rows.
 """
 
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from harness.core.plugins import Plugins, of_type, tuple_of
+from harness.core.plugins import Plugins, Shipped, of_type, tuple_of
 from harness.runs.folder import Run
 
 
@@ -76,6 +80,25 @@ class Exports(Plugins[Export]):
 
 
 EXPORTS = Exports("swarmdrive.exports", Export, {})
+
+
+class Rows(ABC):
+    """Give the rows of a further file of `harness run export --csv`; a base class.
+
+    `columns` are the names in its first line.
+    """
+
+    columns: ClassVar[tuple[str, ...]]  # the names in the first line
+
+    @abstractmethod
+    def of(self, run: Run) -> list[Sequence[object]]:
+        """Return the rows that a run has, a cell for each column; if it has none, no file is made.
+
+        Raises UserError if what they are read from is broken.
+        """
+
+
+ROWS = Shipped[Rows]("swarmdrive.csv_rows", Rows, {})
 
 
 def options_of(format: Export) -> Mapping[str, Option]:

@@ -11,5 +11,8 @@ EXTENSION = Extension(
     commands={"view": f"{_HERE}.commands:view", "run history": f"{_HERE}.commands:history"},
     panels={"view": "Look at results"},
     spellings={"history": "run history"},
-    adds={"remarks": {"notes": f"{_HERE}.remarks:REMARKS"}},
+    adds={
+        "csv_rows": {"notes": f"{_HERE}.csv_rows:NOTES"},
+        "remarks": {"notes": f"{_HERE}.remarks:REMARKS"},
+    },
 )

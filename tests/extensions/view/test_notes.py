@@ -1,8 +1,10 @@
 """Notes on decision points: they stay with the run, and nobody else writes them."""
 
 import asyncio
+import csv
 import json
 import os
+import shutil
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from viewing import SECRET, TOKEN, said
 from harness.extensions.view import app
 from harness.extensions.view.access import cookie
 from harness.extensions.view.app import View
-from harness.extensions.view.notes import LONGEST, MOST, notes
+from harness.extensions.view.notes import LONGEST, MOST, notes, write
 from harness.report.page import render
 from harness.report.runs import gather
 from harness.runs.folder import read
@@ -203,3 +205,29 @@ def test_a_note_that_never_comes_is_not_waited_for(
     monkeypatch.setattr(app, "SENT_S", 0.05)
     with pytest.raises(HTTPException, match=r"a note did not come within 0.05 s"):
         asyncio.run(View(reports).note(posted(receive)))
+
+
+def test_notes_leave_as_csv_where_a_run_has_any(
+    harness: Callable[..., tuple[int, str, str]], two_run: Path, tmp_path: Path
+) -> None:
+    run, here = tmp_path / "run", tmp_path / "here"
+    shutil.copytree(two_run, run)
+    assert harness("run", "export", run, "--csv", "--out", here)[0] == 0
+    assert sorted(path.name for path in here.iterdir()) == ["answers.csv", "decisions.csv"]
+    first, second = read(run).decisions.labels("scene")[:2]
+    texts = {first: "=1+1, it brakes", second: "two\nlines"}
+    for scene, text in texts.items():
+        write(run, scene, text, "")
+    code, said, _ = harness("run", "export", run, "--csv", "--out", here)
+    assert (code, "notes.csv" in said) == (0, True)
+    with (here / "notes.csv").open(newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["scene", "text", "date"]
+    assert {scene: text for scene, text, _ in rows} == {
+        first: "'=1+1, it brakes",
+        second: "two\nlines",
+    }
+    (run / "notes.json").write_text("{")
+    code, _, error = harness("run", "export", run, "--csv", "--out", tmp_path / "none")
+    assert (code, error.count("\n"), (tmp_path / "none").exists()) == (2, 1, False)
+    assert "notes.json is broken" in error
