@@ -219,6 +219,21 @@ def test_a_question_is_its_content(two: Dataset, tmp_path: Path) -> None:
     assert isinstance(first, Question)
 
 
+def test_rounds_go_on_in_the_folder_of_their_own_and_no_file_is_taken_for_one(
+    harness: Harness, two_path: Path
+) -> None:
+    scenes = ("--dataset", two_path, "--limit", "1", "--condition", "single-local")
+    typed = ("eval", *scenes, "--prompt", "v1", "--model", "theirs", "--answers", "a.jsonl")
+    Path("a.jsonl").touch()
+    for _ in range(2):
+        code, _, err = harness(*typed)
+        assert (code, "no answer to 1 question, " in err) == (3, True)
+    [own] = Path("reports").iterdir()
+    assert [path.name for path in own.iterdir()] == [QUESTIONS]
+    code, _, err = harness(*typed, "--dry-run", "--quiet", "--out", "a.jsonl")
+    assert (code, err) == (2, "harness: --out a.jsonl is no folder; give another name\n")
+
+
 OPTIONS = {
     (): "name what answered, such as --model my-model",
     ("--model", "m", "--engine", "openai"): "no engine answers here; leave --engine out",

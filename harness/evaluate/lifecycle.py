@@ -191,11 +191,12 @@ def resumable(spec: Spec, out: Path) -> bool:
     """Return whether this command can go on with the work in a folder, where no process works.
 
     `spec` is the command's evaluation. The work in `out` is that of this run, stopped, or of any
-    run that was stopped before its first answer.
+    run that was stopped before its first answer, or questions for another program wait there.
     """
     try:
-        is_here = work.idle(out) or work.waits(out) or unfinished(spec, out) is not None
-        return is_here and not work.held(out)
+        if work.waits(out):
+            return True
+        return (work.idle(out) or unfinished(spec, out) is not None) and not work.held(out)
     except UserError:
         return False
 

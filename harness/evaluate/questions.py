@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, cast
 from harness.backends.answers_file import AnswersFile, Question
 from harness.backends.base import Request
 from harness.backends.registry import open_backend
-from harness.core.errors import Unanswered, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.figures import amount
 from harness.core.files import replacing
 from harness.core.formats import QUESTIONS
@@ -75,7 +75,12 @@ def settle(spec: Spec, out: Path) -> None:
 
 
 def write(questions: Iterable[Question], out: Path) -> Path:
-    """Write questions to `questions.jsonl` in a folder, a JSON line each, and return the file."""
+    """Write questions to `questions.jsonl` in a folder, a JSON line each, and return the file.
+
+    Raises UserError if `out` is a file.
+    """
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {printable(out)} is no folder; give another name")
     file = out / QUESTIONS
     with replacing(file) as part, part.open("wb") as lines:
         lines.writelines(question.line() for question in questions)
