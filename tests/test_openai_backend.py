@@ -8,11 +8,13 @@ import re
 import socket
 import sys
 import threading
+import time
 import tomllib
 from base64 import b64decode
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from email.utils import formatdate
 from functools import partial
 from pathlib import Path
 from time import sleep
@@ -228,19 +230,24 @@ def test_each_kind_of_server_is_asked_for_a_constrained_answer_in_its_own_words(
 # -- retries ---------------------------------------------------------------------------------------
 
 
-def test_what_breaks_down_for_a_moment_is_asked_again_and_the_time_is_charged() -> None:
-    """Two failures, each with a wait of 0.1 s that the server asked for."""
+@pytest.mark.parametrize("as_date", [False, True])
+def test_what_breaks_down_for_a_moment_is_asked_again_and_the_time_is_charged(
+    as_date: bool,
+) -> None:
+    """Two failures, each with a wait that the server asked for, as seconds or as a date."""
+    wait_s = 1.5 if as_date else 0.1  # a date has whole seconds: up to one is cut off
 
     def play(asked: Asked) -> None:
         if asked.number < 2:
-            asked.reply({"error": "busy"}, (503, 429)[asked.number], retry_after="0.1")
+            until = formatdate(time.time() + wait_s, usegmt=True) if as_date else f"{wait_s}"
+            asked.reply({"error": "busy"}, (503, 429)[asked.number], retry_after=until)
         else:
             asked.reply(completion(GOOD))
 
     done = ask_one(play)
     assert (done.text, done.retries, done.error) == (GOOD, 2, None)
     assert done.seconds is not None
-    assert done.seconds >= 0.2
+    assert 2 * (wait_s - as_date) <= done.seconds < 2 * wait_s + 1
 
 
 def test_a_wait_that_would_never_end_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:

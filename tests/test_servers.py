@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from heapq import heappop, heappush
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,12 @@ from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
 from harness.backends.openai import pool as openai_pool
 from harness.backends.openai.http import Client
+from harness.backends.openai.pace import Pace
 from harness.backends.openai.wire import CHAT
 from harness.backends.servers import Kind
 from harness.backends.servers import Server as Where
 from harness.core import resources
+from harness.core.at_once import AtOnce
 from harness.core.errors import UserError
 from harness.core.work import tidy
 from harness.dataset.load import Dataset
@@ -78,7 +81,9 @@ def names(server: Server) -> list[str]:
     return [asked.body["messages"][0]["content"] for asked in server.asked]
 
 
-def opened(*servers: Server, batch_size: int = 4, **options: Any) -> openai_backend.OpenAIBackend:
+def opened(
+    *servers: Server, batch_size: AtOnce = 4, **options: Any
+) -> openai_backend.OpenAIBackend:
     return openai_backend.open(
         card(*(there.url for there in servers), **options), batch_size=batch_size
     )
@@ -207,6 +212,79 @@ def test_a_server_that_is_gone_moves_no_decision_but_its_own(
     gone = data.draw(st.sampled_from(urls))
     left = [url for url in urls if url != gone]
     assert ranked(left) == ranked(left[::-1]) == [url for url in ranked(urls) if url != gone]
+
+
+# -- how many at a time ----------------------------------------------------------------------------
+
+
+Load = Callable[
+    [int], tuple[float, bool]
+]  # of requests at a time: an answer's s, and is it refused
+AT_ONCE: dict[str, tuple[Load, int, int]] = {  # and how many there may be at the end
+    "one that takes all": (lambda n: (1.0, False), 256, 256),
+    "one that refuses above 20": (lambda n: (1.0, n > 20), 10, 21),
+    "one where others wait above 16": (lambda n: (max(1.0, n / 16), False), 16, 48),
+    "one that is slower with each": (lambda n: (1 + n / 50, False), 30, 120),
+    "one of which all wait": (lambda n: (float(n), False), 1, 10),
+    "one that refuses all": (lambda n: (0.0, True), 1, 1),
+}
+
+
+@pytest.mark.parametrize("load", AT_ONCE)
+def test_a_pace_finds_how_many_a_server_takes_well(load: str) -> None:
+    """In a time of its own: as many are sent as may be, and each takes what it is told then."""
+    takes, least, most = AT_ONCE[load]
+    pace, under_way, now_s = Pace("auto"), list[tuple[float, float, int, bool]](), 0.0
+    for _ in range(6000):
+        while len(under_way) < pace.limit:
+            seconds, refused = takes(len(under_way) + 1)
+            heappush(under_way, (now_s + (0.01 if refused else seconds), now_s, pace.turn, refused))
+        full = len(under_way) >= pace.limit
+        now_s, sent_s, turn, refused = heappop(under_way)
+        if refused:
+            pace.refused(turn)
+        elif full:
+            pace.answered(turn, now_s - sent_s)
+    assert least <= pace.limit <= most
+
+
+def test_longer_answers_do_not_end_in_one_at_a_time() -> None:
+    """Ten times as long from one moment on, whatever the load: the measure begins anew."""
+    pace = Pace("auto")
+    for seconds in (1.0, 10.0):
+        for _ in range(5000):
+            pace.answered(pace.turn, seconds)
+        assert pace.limit == 256
+
+
+def test_a_server_that_refuses_is_asked_less_and_answers_all() -> None:
+    """No refusal counts as an attempt, of which there is one; nothing is asked while it rests."""
+    busy, most, lock = [0], [0], threading.Lock()
+    refused_s, came_s = list[float](), list[float]()
+
+    def play(asked: Asked) -> None:
+        with lock:
+            busy[0] += 1
+            most[0], now = max(most[0], busy[0]), busy[0]
+        if now > 6:
+            refused_s.append(time.monotonic())
+            asked.reply({"error": "too many"}, 429, retry_after="0.05")
+        else:
+            came_s.append(time.monotonic())
+            time.sleep(0.005)
+            said_back(asked)
+        with lock:
+            busy[0] -= 1
+
+    asked = decisions(30)
+    with serving(play) as there:
+        done = opened(there, batch_size="auto", retries=0).complete(asked)
+    assert [(c.text, c.error) for c in done] == [(r.id, None) for r in asked]
+    assert refused_s
+    assert most[0] <= 8, "4 are doubled once"
+    assert sum(c.retries for c in done) == len(refused_s)
+    rests = [(at + 0.02, at + 0.045) for at in refused_s]  # what was on its way may come before
+    assert not any(begin < at < end for at in came_s for begin, end in rests)
 
 
 # -- who is set aside ------------------------------------------------------------------------------
@@ -447,6 +525,21 @@ def test_with_no_server_left_the_run_stops_and_goes_on_at_others(
     assert "\n" not in said
     with served() as url:
         assert same_files(evaluated(served_spec(small, url), tmp_path / "run"), whole)
+
+
+@pytest.mark.slow
+def test_no_row_depends_on_a_number_that_adapts(
+    whole: Path, small: Dataset, tmp_path: Path
+) -> None:
+    with served() as url:
+        out = evaluated(served_spec(small, url).changed(batch_size="auto"), tmp_path / "run")
+    assert same_decisions(out, whole)
+    for name in ("episodes.csv", "summary.csv"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    assert same_but_alone(out, whole)
+    adapted, fixed = (folder.read(run).manifest for run in (out, whole))
+    assert (adapted.batch_size, fixed.batch_size) == ("auto", 4)
+    assert adapted.identity.keys() == fixed.identity.keys()
 
 
 @pytest.fixture

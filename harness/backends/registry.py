@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from harness.backends.base import AnswerMode, Backend
 from harness.backends.engine_of_package import EngineOfPackage
 from harness.core import extras
+from harness.core.at_once import AUTO, AtOnce
 from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
@@ -36,7 +37,8 @@ class Capabilities:
     loads some, `asks_helpers` that helpers are asked as well as the ego, and `closed_loop` that it
     answers for new scenes. With `own_latency` its answers were timed earlier; a `reference` is a
     driver that reports compare models with; `samples` says that it heeds a temperature, `from_file`
-    that another program wrote its answers, so that nothing is asked or timed here.
+    that another program wrote its answers, so that nothing is asked or timed here, and `adapts`
+    that it finds how many requests its servers take at once.
     """
 
     # whether it is a model that reads prompts, whose answers are timed and which can fuse messages
@@ -56,6 +58,7 @@ class Capabilities:
     samples: bool = False
     # whether its answers come from a file of another program: nothing is asked or timed here
     from_file: bool = False
+    adapts: bool = False  # whether its `batch_size` may be `auto`: what its servers take well
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ class Registration:
 
 _RULE = Capabilities(language_model=False, answer_modes=("json",), thinks="never", renders=False)
 _DECIDES = Capabilities(answer_modes=("decision",), thinks="never")
+_ASKS = replace(_DECIDES, adapts=True)
 _WEIGHTS = ("revision", "sha256", "gated", "adapter")
 BUILT_IN: Mapping[str, Registration] = {
     "proxy": Registration("harness.backends.proxy:open", _RULE, card_keys=("failures",)),
@@ -133,7 +137,7 @@ BUILT_IN: Mapping[str, Registration] = {
     ),
     "openai": Registration(
         "harness.backends.openai.backend:open",
-        Capabilities(thinks="card", samples=True),
+        Capabilities(thinks="card", samples=True, adapts=True),
         # 2: an answer that was broken off is none, a refusal and parts of a content are read
         answers=2,
         card_keys=("vision", "system", "price"),
@@ -142,7 +146,7 @@ BUILT_IN: Mapping[str, Registration] = {
     **{
         wire: Registration(
             f"harness.backends.decisions.wires:open_{wire}",
-            _DECIDES,
+            _ASKS,
             card_keys=("vision", "price"),
             required_keys=("weights", "server"),
         )
@@ -217,22 +221,25 @@ def is_from_file(model: Mapping[str, Any], identity: Mapping[str, Any]) -> bool:
 
 
 def open_backend(
-    card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: int = 8
+    card: "Card", *, device: str | None = None, dtype: str | None = None, batch_size: AtOnce = 8
 ) -> Backend:
     """Return the backend of the model that a model card describes, with its weights loaded.
 
     A model card is what a TOML file of `models/` says. The options are for engines with weights.
     The device is `cpu`, or a GPU: `cuda` or `cuda:N` of transformers, `gpu` of llama.cpp; None
     takes a GPU if there is any. `dtype` is a number format instead of the card's; `batch_size` the
-    most requests that go through the engine together. Raises UserError if a package or the weights
-    are missing, an option is wrong, or a file does not load.
+    most requests that go through the engine together, or `auto` where servers answer, which is 8
+    for a rule. Raises UserError if a package or the weights are missing, an option is wrong, or a
+    file does not load.
     """
     engine = registration(card.engine)
     if package := missing_package(card.engine):
         raise UserError(
             f"{card.shown} needs {package}, which is not installed; run `{engine.install}`"
         )
-    if batch_size < 1:
+    if batch_size == AUTO:
+        batch_size = AUTO if engine.capabilities.adapts else 8
+    elif batch_size < 1:
         raise UserError(f"batch size {batch_size}; allowed: 1 or more")
     options = {"device": device, "dtype": dtype, "batch_size": batch_size}
     what = f"engine {printable(card.engine)}"
@@ -246,7 +253,7 @@ def open_backend(
         )
 
 
-def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int) -> Backend:
+def opened(card: "Card", device: str | None, dtype: str | None, batch_size: AtOnce) -> Backend:
     """Return the backend of the model that a card describes, opened only once in each process.
 
     `card` is the model card, the content of a model's TOML file. `device` says where the model
@@ -261,7 +268,7 @@ def opened(card: "Card", device: str | None, dtype: str | None, batch_size: int)
 # read each other's answers.
 @lru_cache(maxsize=8)
 def _opened_in(
-    process: int, card: "Card", device: str | None, dtype: str | None, batch_size: int
+    process: int, card: "Card", device: str | None, dtype: str | None, batch_size: AtOnce
 ) -> Backend:
     return open_backend(card, device=device, dtype=dtype, batch_size=batch_size)
 

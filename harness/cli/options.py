@@ -217,6 +217,7 @@ def takes(
             given = {name: values.pop(name) for name in names}
             given = {name: value for name, value in given.items() if value is not None}
             given |= {name: ",".join(given[name]) for name in listed & given.keys()}
+            given |= {name: parsers[name](given[name]) for name in parsers.keys() & given.keys()}
             if "scenario" in given:
                 typed_scenario(given["scenario"])
             if file:
@@ -230,6 +231,7 @@ def takes(
         ]
         names = [each.name for each in settings]
         listed = {each.name for each in stated.options(world) if each.listed}
+        parsers = {each.name: each.kind for each in stated.options(world) if each.is_parsed}
         file = inspect.Parameter(
             "file",
             inspect.Parameter.KEYWORD_ONLY,
@@ -278,16 +280,16 @@ def _parameter(option: stated.Option) -> inspect.Parameter:
         if option.default in (None, ()) or option.kind is bool
         else f" Default: {option.default}."
     )
+    kind = list[str] if option.listed else str if option.is_parsed else option.kind
+    default = Option(
+        None,
+        "/".join(flags),
+        help=option.help + usual,
+        metavar="INTEGER|auto" if option.is_parsed else None,
+        rich_help_panel=option.panel or None,
+    )
     return inspect.Parameter(
-        option.name,
-        inspect.Parameter.KEYWORD_ONLY,
-        default=Option(
-            None,
-            "/".join(flags),
-            help=option.help + usual,
-            rich_help_panel=option.panel or None,
-        ),
-        annotation=(list[str] if option.listed else option.kind) | None,
+        option.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind | None
     )
 
 

@@ -24,6 +24,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.at_once import first_at_once
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
@@ -170,7 +171,7 @@ class Asker:
         # An answer may depend on the other requests in its batch. Chunks are kept whole or not at
         # all, and all but the last are equally long. So what a resumed run lacks falls into the
         # same chunks.
-        backend, batch = self._backend(), self.spec.settings.batch_size
+        backend, batch = self._backend(), first_at_once(self.spec.settings.batch_size)
         size = batch * math.ceil(CHUNK / batch)
         chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
@@ -291,7 +292,8 @@ class Asker:
 
     def _first(self) -> int:
         """Return how many questions are asked before anything was answered: whole batches."""
-        return self.spec.settings.batch_size * math.ceil(FIRST / self.spec.settings.batch_size)
+        batch = first_at_once(self.spec.settings.batch_size)
+        return batch * math.ceil(FIRST / batch)
 
     def _refused_so_far(self) -> bool:
         return self.tally.asked == self.tally.unanswered

@@ -20,6 +20,7 @@ from harness.backends.base import Backend, Served, same_model
 from harness.backends.registry import open_backend, opened
 from harness.backends.swarm import open_each, together
 from harness.core import shards, work
+from harness.core.at_once import most_at_once
 from harness.core.errors import Unanswered, UserError, in_range, printable
 from harness.core.files import bytes_of, folder_in, write_whole
 from harness.core.formats import CONFIG, WORK
@@ -396,7 +397,9 @@ def spreadable(spec: Spec, workers: Workers) -> Workers:
         return workers
     asks_servers = all(agent.card.server or not agent.can.language_model for agent in spec.agents)
     return (
-        min(workers, spec.settings.batch_size) if asks_servers and isinstance(workers, int) else 1
+        min(workers, most_at_once(spec.settings.batch_size))
+        if asks_servers and isinstance(workers, int)
+        else 1
     )
 
 
@@ -429,7 +432,8 @@ def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
     numbers: Sequence[int] = range(min(world.episodes, most))
     if selection := recorded(world.selection):
         numbers = selection.choice(range(most), None).numbers
-    return _split(numbers, max(EPISODES_AT_ONCE, math.ceil(settings["batch_size"] / LEAST_VIEWERS)))
+    fill = math.ceil(most_at_once(settings["batch_size"]) / LEAST_VIEWERS)
+    return _split(numbers, max(EPISODES_AT_ONCE, fill))
 
 
 def _split(numbers: Sequence[int], size: int) -> list[Sequence[int]]:

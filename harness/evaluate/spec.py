@@ -19,6 +19,7 @@ from harness.coordination.counterparts import COUNTERPARTS
 from harness.coordination.operating_point import OperatingPoint, kept_of
 from harness.coordination.schedules import SCHEDULES
 from harness.core import extensions
+from harness.core.at_once import AUTO
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import LAST_SEED
 from harness.dataset.load import Scene
@@ -169,8 +170,7 @@ class Spec:
         ):
             if choice not in choices:
                 raise UserError(f"{flag} {printable(choice)}: give {' or '.join(choices)}")
-        if self.settings.batch_size < 1:
-            raise UserError(f"--batch-size {self.settings.batch_size}: give 1 or more")
+        self._check_batch_size()
         self._check_servers()
         self._check_sampling()
         for agent in self.agents:
@@ -577,6 +577,19 @@ class Spec:
             return self.settings.ties
         manifest = replayed(self.ego)
         return manifest.settings.ties or TIES[0] if manifest else TIES[0]
+
+    def _check_batch_size(self) -> None:
+        at_once = self.settings.batch_size
+        if at_once != AUTO:
+            if at_once < 1:
+                raise UserError(f"--batch-size {at_once}: give 1 or more")
+            return
+        for agent in self.agents:
+            if agent.can.language_model and not agent.can.adapts:
+                raise UserError(
+                    f"--batch-size {AUTO}: {printable(agent.card.name)} is not asked at servers, "
+                    "which alone say what they take; give a number, 1 or more"
+                )
 
     @property
     def opening(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType, defstruct, field, structs, t
 
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.part_settings import questions
+from harness.core.at_once import AtOnce
 from harness.core.config import Seconds, Whole, convert
 from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate
@@ -737,7 +738,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     # whether an answer whose numbers do not sum to 1 is refused or divided
     sums: Literal["refuse", "divide"]
     flip: bool  # whether read-outs were also asked with the actions reversed
-    batch_size: int  # number of prompts in one batch
+    batch_size: AtOnce  # number of prompts in one batch; `auto` of those that servers had at once
     dtype: str | None  # number format of the weights; None is the card's
     temperature: float  # sampling temperature; 0 is greedy
     sampling_seed: int  # seed of the sampling

@@ -9,6 +9,7 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from inspect import isfunction
 from pathlib import Path
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
@@ -16,6 +17,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hi
 from msgspec import Meta, Struct, structs, to_builtins
 
 from harness.core import extensions
+from harness.core.at_once import AtOnce, at_once_of
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, in_range, printable, sayable, unknown
 from harness.core.extensions import Setting
@@ -223,10 +225,10 @@ class Settings(Struct, frozen=True, kw_only=True):
         ),
     ] = "refuse"
     batch_size: Annotated[
-        int,
+        AtOnce,
         option(
             "Number of prompts in one batch; with a served model, of requests to each server at "
-            "once.",
+            "once, or auto: as many as it takes well.",
             ENGINE,
             compared=False,
         ),
@@ -308,7 +310,7 @@ class Option(NamedTuple):
 
     path: tuple[str, ...]  # the names of the table and the key in `run.toml`
     name: str  # as a parameter: batch_size
-    kind: Any  # str, int, float, bool or list[str]
+    kind: Any  # str, int, float, bool, list[str], or a function of what is typed
     default: Any  # the value if it is not typed
     help: str  # its help on the command line
     panel: str  # the heading that the help stands below
@@ -317,6 +319,10 @@ class Option(NamedTuple):
     compared: bool  # whether a comparison of two runs tells it
     models: bool = False  # whether its value names models
     is_added: bool = False  # whether an extension adds it
+
+    @property
+    def is_parsed(self) -> bool:
+        return isfunction(self.kind)
 
     @property
     def flag(self) -> str:
@@ -413,6 +419,8 @@ def _options(
 
 
 def _kind(plain: Any) -> Any:
+    if plain == AtOnce:
+        return at_once_of
     if isinstance(plain, UnionType):
         plain = get_args(plain)[0]
     return list[str] if get_origin(plain) is tuple else plain

@@ -17,6 +17,7 @@ from harness.backends.openai.http import Reply
 from harness.backends.openai.shapes import tokens_in
 from harness.backends.openai.wire import Wire
 from harness.backends.servers import Kind, Server
+from harness.core.at_once import AtOnce
 from harness.core.image import Image
 from harness.prompts.decision import Question
 
@@ -162,25 +163,25 @@ SYSTEMONE = Wire("systemone", "/systemone", _systemone, read_systemone, _remedy,
 DECISIONS = Wire("decisions", "/decisions", _decisions, read_decisions, _remedy, decides=True)
 
 
-def open_systemone(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
+def open_systemone(card: Card, *, batch_size: AtOnce = 8, **_: Any) -> OpenAIBackend:
     """Return the backend of a decision model whose servers answer `POST /v1/systemone`.
 
     A decision model gives each option of a typed question a probability, and writes no text. `card`
     is its model card, the TOML file that describes it, which has the servers' addresses; each
-    server gets at most `batch_size` requests at a time. Options for models in this process, such as
-    `device`, are ignored. Raises UserError if the servers' models differ or are no decision models,
-    Unanswered if none answers or one refuses the key.
+    server gets at most `batch_size` requests at a time, or finds it with `auto`. Options for models
+    in this process, such as `device`, are ignored. Raises UserError if the servers' models differ
+    or are no decision models, Unanswered if none answers or one refuses the key.
     """
     return OpenAIBackend(card, batch_size, SYSTEMONE)
 
 
-def open_decisions(card: Card, *, batch_size: int = 8, **_: Any) -> OpenAIBackend:
+def open_decisions(card: Card, *, batch_size: AtOnce = 8, **_: Any) -> OpenAIBackend:
     """Return the backend of a decision model whose servers answer OpenAI's `POST /v1/decisions`.
 
     A decision model gives each option of a typed question a probability, and writes no text. `card`
     is its model card, the TOML file that describes it, which has the servers' addresses; each
-    server gets at most `batch_size` requests at a time. Options for models in this process, such as
-    `device`, are ignored. Raises UserError if the servers' models differ or are no decision models,
-    Unanswered if none answers or one refuses the key.
+    server gets at most `batch_size` requests at a time, or finds it with `auto`. Options for models
+    in this process, such as `device`, are ignored. Raises UserError if the servers' models differ
+    or are no decision models, Unanswered if none answers or one refuses the key.
     """
     return OpenAIBackend(card, batch_size, DECISIONS)

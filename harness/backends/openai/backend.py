@@ -26,6 +26,7 @@ from harness.backends.openai.stream import ASKED, BROKE_OFF
 from harness.backends.openai.wire import CHAT, Wire
 from harness.backends.orders import average_orders
 from harness.backends.registry import BUILT_IN
+from harness.core.at_once import AtOnce, most_at_once
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json
 
@@ -34,12 +35,13 @@ _MOST_SERVED = 1 << 20  # answers whose servers are kept until somebody asks
 _CLOSED_S = 5.0  # longest wait for connections to close
 
 
-def open(card: Card, *, batch_size: int = 8, **_: Any) -> "OpenAIBackend":
+def open(card: Card, *, batch_size: AtOnce = 8, **_: Any) -> "OpenAIBackend":
     """Return the backend of the model behind the servers that a model card names.
 
     `card` is what a model's TOML file states. Each server gets at most `batch_size` requests at a
-    time; options for models in this process are ignored. Raises UserError if the servers' models
-    differ, Unanswered if none answers or one refuses the key.
+    time; with `auto`, as many as it takes without refusals and in good time. Options for models in
+    this process are ignored. Raises UserError if the servers' models differ, Unanswered if none
+    answers or one refuses the key.
     """
     return OpenAIBackend(card, batch_size)
 
@@ -51,15 +53,15 @@ class OpenAIBackend:
     be called during another call. Connections stay open between calls.
     """
 
-    def __init__(self, card: Card, batch_size: int, wire: Wire = CHAT) -> None:
+    def __init__(self, card: Card, batch_size: AtOnce, wire: Wire = CHAT) -> None:
         """Connect to a card's servers. Raises as `open`, and ValueError if the card has none."""
         if (server := card.server) is None:
             raise ValueError(f"card {card.name} has no server")
         self._card = card
         self._server = server
         self._wire = wire
-        self._batch_size = batch_size
-        self.window = batch_size * len(server.urls)
+        self._batch_size = most_at_once(batch_size)
+        self.window = self._batch_size * len(server.urls)
         self._streams = True  # until a server refuses to stream
         self._served = deque[Served](maxlen=_MOST_SERVED)
         self._named_other = False  # whether a server was said to name another model

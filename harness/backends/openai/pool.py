@@ -20,8 +20,10 @@ from typing import Any
 import msgspec
 
 from harness.backends.openai.http import Client, Reply
+from harness.backends.openai.pace import BUSY, Pace
 from harness.backends.openai.statements import Model, read_statement
 from harness.backends.servers import Server
+from harness.core.at_once import AtOnce, most_at_once
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.parallel import share
 
@@ -35,6 +37,7 @@ class _ServerState:
     """The state of one server."""
 
     url: str
+    pace: Pace  # how many requests it may have at a time
     queue: "deque[_Pending]" = field(default_factory=deque)
     busy: int = 0  # number of requests that it works on
     sent: int = 0  # number of requests that it has been sent so far
@@ -43,6 +46,16 @@ class _ServerState:
     unreached: int = 0  # failed attempts to reach it since it was set aside
     fault: str = ""  # its last failure
     aside: bool = False  # whether it is set aside: it gets no requests until it answers again
+    rests_until_s: float = 0.0  # by `perf_counter`: it has asked for no requests until then
+
+    @property
+    def rest_s(self) -> float:
+        """Return the seconds until it may get requests again, 0 or less if it may now."""
+        return self.rests_until_s - perf_counter()
+
+    @property
+    def has_room(self) -> bool:
+        return self.busy < self.pace.limit and self.rest_s <= 0 and not self.aside
 
 
 @dataclass(eq=False)
@@ -55,6 +68,7 @@ class _Pending:
     body: Callable[[], Mapping[str, Any]]
     reply: "asyncio.Future[Reply]"
     failed: Counter[_ServerState] = field(default_factory=Counter)
+    excused: int = 0  # failures that are no attempts: a server had too many requests at a time
     begun_s: float | None = None
 
 
@@ -74,17 +88,24 @@ class ServerPool:
     """
 
     def __init__(
-        self, client: Client, settings: Server, name: str, weights: str, at_once: int, path: str
+        self,
+        client: Client,
+        settings: Server,
+        name: str,
+        weights: str,
+        at_once: AtOnce,
+        path: str,
     ) -> None:
         """Prepare a pool, which `open` connects.
 
         Each server gets at most `at_once` requests at a time, from all workers together, at `path`
-        behind its base URL. `name` is the model's in messages, `weights` its name at the servers.
+        behind its base URL; `auto` finds the number. `name` is the model's in messages, `weights`
+        its name at the servers.
         """
         self._client, self._settings = client, settings
         self._name, self._weights = printable(name), weights
-        self._at_once, self._path = at_once, path
-        self._servers = [_ServerState(url) for url in settings.urls]
+        self._most, self._path = most_at_once(at_once), path
+        self._servers = [_ServerState(url, Pace(at_once)) for url in settings.urls]
         self._pending: set[_Pending] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._woken = False
@@ -121,8 +142,9 @@ class ServerPool:
         `key` ranks the servers, so that requests with one key share a prompt cache; `build` returns
         the request's JSON body when it is sent. If a server is busy (429), breaks down (5xx), is
         not reached or takes too long, the request is tried again: at once at another server, or at
-        the same one after the wait that it asks for, or else a doubling one. Raises UserError if
-        one has come back with another model, Unanswered if no server is left.
+        the same one after the wait that it asks for, during which it gets no other request, or else
+        a doubling one. Raises UserError if one has come back with another model, Unanswered if no
+        server is left.
         """
         if self._refused:
             raise self._refused
@@ -152,18 +174,20 @@ class ServerPool:
         for pending in requests:
             queue = min(self._ranked(pending.key), key=lambda s: (s.aside, pending.failed[s])).queue
             queue.insert(0 if pending.failed else len(queue), pending)  # a retry goes first
-        if not self._woken:  # once, after all ready coroutines have queued their requests
+        self._wake()
+
+    def _wake(self) -> None:
+        """Hand out requests once all ready coroutines have queued theirs."""
+        if not self._woken:
             self._woken = True
             asyncio.get_running_loop().call_soon(self._hand_out)
 
     def _hand_out(self) -> None:
-        """Give every server that is not aside as many requests as it may have."""
+        """Give every server that is neither aside nor at rest as many requests as it may have."""
         self._woken = False
-        available = [server for server in self._servers if not server.aside]
-        at_once = share(self._at_once)
         for take in (self._next, self._steal):  # first each server's own queue
-            for server in available:
-                while server.busy < at_once and (pending := take(server)):
+            for server in self._servers:
+                while server.has_room and (pending := take(server)):
                     server.busy += 1
                     self._run(self._work(server, pending))
 
@@ -178,7 +202,7 @@ class ServerPool:
         """Take the next request from a server's own queue,
         or else one from the end of the longest queue.
         """
-        if server.aside:
+        if not server.has_room:
             return None
         if pending := self._next(server):
             return pending
@@ -192,8 +216,9 @@ class ServerPool:
             except Exception as error:  # a bug, which the caller must see
                 if not pending.reply.done():
                     pending.reply.set_exception(error)
-            pending = self._steal(server)
-        server.busy -= 1
+            server.busy -= 1
+            if pending := self._steal(server):
+                server.busy += 1
 
     def _run(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -206,12 +231,13 @@ class ServerPool:
         """
         while True:
             server.sent += 1
-            nth, first = server.sent, server.busy == 1
-            pending.begun_s = perf_counter() if pending.begun_s is None else pending.begun_s
+            nth, first, turn = server.sent, server.busy == 1, server.pace.turn
+            sent_s = perf_counter()
+            pending.begun_s = sent_s if pending.begun_s is None else pending.begun_s
             reply = await self._client.post(
                 server.url, self._path, msgspec.json.encode(pending.body())
             )
-            alone = first and server.sent == nth and share(self._at_once) == self._at_once
+            alone = first and server.sent == nth and share(self._most) == self._most
             reply = msgspec.structs.replace(
                 reply,
                 retries=pending.failed[server],
@@ -221,25 +247,43 @@ class ServerPool:
             )
             if not reply.again:
                 server.failures = server.pauses = 0
+                full = server.busy >= server.pace.limit
+                if full and server.pace.answered(turn, perf_counter() - sent_s):
+                    self._wake()
                 break
             pending.failed[server] += 1
-            if reply.status != 429:
+            had_too_many = reply.status in BUSY and server.pace.refused(turn)
+            pending.excused += had_too_many
+            if reply.after_s is not None:
+                self._rest(server, reply.after_s)
+            if reply.status != 429 and not had_too_many:
                 server.failures, server.fault = server.failures + 1, reply.fault or ""
                 if server.failures >= BROKEN and not server.aside:
                     self._set_aside(server)
             if any(not pending.failed[other] for other in self._servers if not other.aside):
                 self._enqueue(pending)
                 return
-            attempts = pending.failed.total()
+            if had_too_many:
+                self._enqueue(pending)
+                return
+            attempts = pending.failed.total() - pending.excused
             if attempts > self._settings.retries:
                 break
-            wait_s = pause_s(attempts - 1) if reply.after_s is None else reply.after_s
-            await asyncio.sleep(min(wait_s, LONGEST_WAIT_S))
+            if reply.after_s is None:
+                await asyncio.sleep(pause_s(attempts - 1))
+            while (rest_s := server.rest_s) > 0:
+                await asyncio.sleep(rest_s)
             if server.aside:
                 self._enqueue(pending)
                 return
         if not pending.reply.done():
             pending.reply.set_result(reply)
+
+    def _rest(self, server: _ServerState, after_s: float) -> None:
+        """Send a server no request for the seconds that it asks for, `LONGEST_WAIT_S` at most."""
+        wait_s = min(after_s, LONGEST_WAIT_S)
+        server.rests_until_s = max(server.rests_until_s, perf_counter() + wait_s)
+        asyncio.get_running_loop().call_later(wait_s, self._hand_out)
 
     # -- who breaks down
     # ------------------------------------------------------------------------------------
