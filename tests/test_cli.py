@@ -92,6 +92,12 @@ def one_line(said: Said) -> str:
         (["eval", "--seeds", "a,b"], "--seeds a,b: give a range"),
         (["eval", "--seeds", "0:99999999999999999999"], "of 1000 seeds at most"),
         (["eval", "--batch-size", "0"], "--batch-size 0: give 1 or more"),
+        (["eval", "--batch-size", "all"], "--batch-size all: give a number, 1 or more, or auto"),
+        (
+            ["eval", "--model", "swarm-tiny", "--batch-size", "auto"],
+            "--batch-size auto: swarm-tiny is not asked at servers, which alone say what they take; "
+            "give a number, 1 or more",
+        ),
         (["eval", "--workers", "0"], 
             "--workers 0: give 1 to 256 "
             "processes, or ray for a Ray cluster"),

@@ -46,6 +46,7 @@ class Route:
     text: str = ""
     hops: tuple[Hop, ...] = ()
     by_name: dict[str, Link] | None = None
+    most: int | Literal["auto"] = "auto"
 
 
 GOOD: dict[str, Any] = {"link": {"model": "radio"}}
@@ -65,14 +66,14 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"nmae": "x"}, "unknown key in r 'nmae'; known: by_name, hops, link, size, text"),
+        ({"nmae": "x"}, "unknown key in r 'nmae'; known: by_name, hops, link, most, size, text"),
         (
             {"name": "x"},
-            "unknown key in r 'name'; did you mean 'by_name'? known: by_name, hops, link, size, text",
+            "unknown key in r 'name'; did you mean 'by_name'? known: by_name, hops, link, most, size, text",
         ),
         (
             {"sise": 1},
-            "unknown key in r 'sise'; did you mean 'size'? known: by_name, hops, link, size, text",
+            "unknown key in r 'sise'; did you mean 'size'? known: by_name, hops, link, most, size, text",
         ),
         (
             {"link": {"los": 1}},
@@ -108,6 +109,8 @@ def test_a_record_is_made_of_nested_tables_and_what_the_program_gives() -> None:
         ({"size": True}, "r: size = True; allowed: a whole number"),
         ({"size": 0}, "r: size = 0; allowed: a whole number >= 1"),
         ({"size": "1"}, "r: size = '1'; allowed: a whole number"),
+        ({"most": "all"}, "r: most = 'all'; allowed: a whole number or auto"),
+        ({"most": 1.5}, "r: most = 1.5; allowed: a whole number or auto"),
         (
             {"hops": [{"delay_s": 1}, {"delay_s": "x"}]},
             "r [hops.1]: delay_s = 'x'; allowed: a number",

@@ -259,11 +259,17 @@ def _mistake(table: Mapping[str, Any], kind: Any, where: str) -> UserError:
         return UserError(
             f"{here}: {printable(repr(name))} is no name for this; {printable(problem)}"
         )
-    if problem.startswith("Invalid") and (choices := _choices(hint)):
+    choices = _choices(hint)
+    if choices and int in _members(hint):
+        allowed = " or ".join([_IN_WORDS["int"], *choices])
+        return UserError(
+            f"{_place(where, tables)}: {key} = {printable(repr(value))}; allowed: {allowed}"
+        )
+    if problem.startswith("Invalid") and choices:
         return unknown(f"{key} in {_place(where, tables)}", str(value), choices)
     expected, _, got = problem.removeprefix("Expected ").replace("`", "").partition(", got ")
     kinds = " or ".join(_in_words(name) for name in expected.split(" | ") if name != "null")
-    allowed = (" or ".join(_choices(hint)) or kinds) if got else description(hint) or kinds
+    allowed = (" or ".join(choices) or kinds) if got else description(hint) or kinds
     if not problem.startswith("Expected"):
         allowed = description(hint) or _ANY_NUMBER
     return UserError(
