@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from time import sleep
 
 import pytest
 from misbehaving import Server
@@ -13,6 +14,7 @@ from harness.backends import cards
 from harness.core.errors import UserError
 from harness.evaluate import costs
 
+PRICE = {"input": 1000.0, "output": 0.0, "currency": "USD"}
 Typed = Callable[..., tuple[int, str, str]]
 
 
@@ -20,6 +22,45 @@ Typed = Callable[..., tuple[int, str, str]]
 def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     with priced(tmp_path, monkeypatch) as server:
         yield server
+
+
+@pytest.mark.slow
+def test_a_run_says_while_it_goes_what_it_has_spent(
+    there: Server, two_path: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines come much more often than is usual, and the server takes its time."""
+    monkeypatch.setattr("harness.cli.progress.LINE_S", 0.05)
+    monkeypatch.setattr("harness.cli.progress.SETTLE_S", 0.0)
+    play = there.play
+    monkeypatch.setattr(there, "play", lambda asked: (sleep(0.02), play(asked)))
+    code, _, said = harness(*typed_eval(two_path, "--limit", "2"))
+    assert code == 0
+    spent = re.findall(r"^asking mine \d+/\d+ (\S+) tokens, (\S+) EUR .*$", said, re.MULTILINE)
+    assert spent
+    for tokens, cost in spent:
+        of_cost, of_tokens = (float(text.replace("k", "e3")) for text in (cost, tokens))
+        assert of_cost / of_tokens == pytest.approx(EACH / 32, 0.01)
+
+
+def test_what_is_spent_is_read_on_from_where_it_was_read_before(tmp_path: Path) -> None:
+    record = {"model": {"name": "a", "price": PRICE}, "helpers": [{"model": {"name": "b"}}]}
+    spending = costs.Spending(record, tmp_path)
+    assert spending() == "", "the file is not there yet"
+    said = []
+    with (tmp_path / costs.FILE).open("ab", 0) as file:
+        for model, read in (("a", 950), ("b", 30_000), ("a", 999_000)):
+            line = json.dumps(
+                {"model": model, "asked": 1, "uncounted": 0, "read": read, "written": 0}
+            )
+            file.write(line[:9].encode())
+            said.append(spending())
+            file.write(f"{line[9:]}\n".encode())
+            said.append(spending())
+    assert said == [
+        "", "950 tokens, 0.95 USD",
+        "950 tokens, 0.95 USD", "30.9k tokens, 0.95 USD",
+        "30.9k tokens, 0.95 USD", "1.03M tokens, 1k USD",
+    ]  # fmt: skip
 
 
 @pytest.mark.slow

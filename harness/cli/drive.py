@@ -14,6 +14,7 @@ from harness.cli.run import Column, as_mapping, default_out, evaluate, show
 from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, in_range, printable
 from harness.core.figures import crossed
+from harness.core.formats import WORK
 from harness.core.plugins import Plugins
 from harness.core.seeds import seeds_text
 from harness.runs.settings import OUTPUT, DriveSettings, Settings, changed
@@ -87,6 +88,7 @@ def command(
     """
     from harness.backends.cache import default_file
     from harness.evaluate import command_options, resolve
+    from harness.evaluate.costs import Spending
     from harness.evaluate.run import evaluate_shard
     from harness.runs.folder import read
     from harness.world.scenarios import DEFAULT
@@ -122,6 +124,7 @@ def command(
     with command_options.guarded(of_command, [spec], who) as [spec]:
         if part and out:
             with bar(f"driving {printable(spec.ego.card.name, 30)}", quiet=silent) as progress:
+                progress.spent = Spending(spec.record(), out / WORK)
                 mine = evaluate_shard(spec, out, part, progress, who)
             if not silent:
                 options.say_shard(part, out, f"{mine} of {driven} episodes")

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 LINE_S = 30.0
 SETTLE_S = 5.0  # by when what a killed command left is counted: it is no measure of the pace
 MARKS = 5  # lines over which the pace is taken
+# Characters of a label beside what is spent, on a terminal with fewer than so many columns.
+SHORT, ROOMY = 16, 110
 
 
 class Bar(Progress):
@@ -32,10 +34,12 @@ class Bar(Progress):
         total: number of items, as far as is known; 0 if unknown.
         grows: whether finished items can add more, so that the time left is a least one.
         done: number of items done.
+        spent: says what the work has cost so far; empty for nothing.
     """
 
     def __init__(self, label: str, total: int, grows: bool = False) -> None:
         self.label, self.total, self.grows, self.done = label, total, grows, 0
+        self.spent: Callable[[], str] = lambda: ""
         self.changed: Callable[[], object] = lambda: None
         self.write: Callable[[str], None] = lambda text: None  # a line above the bar
 
@@ -74,7 +78,9 @@ def bar(label: str, total: int = 0, quiet: bool = False, grows: bool = False) ->
     from rich.console import Console
 
     with drawn(Console(stderr=True)) as bars:
-        task = bars.add_task(label, total=total or None, grows=grows)
+        task = bars.add_task(
+            label, total=total or None, grows=grows, spent=lambda: progress.spent()
+        )
         progress.changed = lambda: bars.update(
             task, completed=progress.done, total=progress.total or None, description=progress.label
         )
@@ -110,6 +116,8 @@ def _lines(progress: Bar) -> Iterator[None]:
 def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> str:
     """Return a progress bar as a line of text: `asking proxy 812/1206 58.0/s 0:00:07 left`.
 
+    What the work has cost so far, such as `31.2k tokens`, stands behind the count.
+
     It is for output that is no terminal. `progress` has what is counted. `marks` are pairs of a
     time in s and the number done by then, from which the speed is taken; `took_s` is the time since
     the start, s.
@@ -122,21 +130,27 @@ def line(progress: Bar, marks: Sequence[tuple[float, int]], took_s: float) -> st
         pace_text = pace(speed, left_s, None, progress.grows)
     else:
         pace_text = f"{timedelta(seconds=round(took_s))} so far"
-    return " ".join(filter(None, (progress.label, reached, pace_text)))
+    return " ".join(filter(None, (progress.label, reached, progress.spent(), pace_text)))
 
 
 def drawn(console: "Console") -> "Columns":
-    """Return Rich's progress display with a label, a bar, a count and the pace, for a console."""
+    """Return Rich's progress display for a console: label, bar, count, what is spent, and pace."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
         Progress,
         ProgressColumn,
         Task,
-        TextColumn,
     )
     from rich.table import Column
     from rich.text import Text
+
+    class Label(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            label, spent = Text(task.description), task.fields.get("spent")
+            if spent and spent() and console.width < ROOMY:
+                label.truncate(SHORT, overflow="ellipsis")
+            return label
 
     class Pace(ProgressColumn):
         max_refresh = 0.5
@@ -145,10 +159,20 @@ def drawn(console: "Console") -> "Columns":
             speed, grows = task.finished_speed or task.speed, bool(task.fields.get("grows"))
             return Text(pace(speed, task.time_remaining, task.finished_time, grows))
 
+    class Spent(ProgressColumn):
+        max_refresh = 0.5
+
+        def render(self, task: Task) -> Text:
+            spent: Callable[[], str] | None = task.fields.get("spent")
+            return Text(spent() if spent else "")
+
     return Progress(
-        TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis")),
+        Label(table_column=Column(no_wrap=True, overflow="ellipsis")),
         BarColumn(bar_width=None),
-        *(column(table_column=Column(no_wrap=True)) for column in (MofNCompleteColumn, Pace)),
+        *(
+            column(table_column=Column(no_wrap=True))
+            for column in (MofNCompleteColumn, Spent, Pace)
+        ),
         console=console,
     )
 

@@ -103,6 +103,7 @@ def evaluate(
         follows: what is told of the run as it goes, such as a tracker.
     """
     from harness.cli.report import write
+    from harness.evaluate.costs import Spending
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.run import evaluate as evaluated
 
@@ -115,6 +116,7 @@ def evaluate(
     with ExitStack() as stack:
         followers = [stack.enter_context(follow(folder, spec.record())) for follow in follows]
         with progress as done:
+            done.spent = Spending(spec.record(), folder / WORK)
             count_new: Callable[[int], None] = done
             for follower in followers:
                 count_new = follower.counting(count_new)

@@ -1,8 +1,8 @@
-"""What a run's questions cost, by the price in a card.
+"""What a run's questions cost, by the price in a card, and how many tokens they take.
 
-Every completion that a model with a price is asked for counts, whatever becomes of it; one from the
-cache costs nothing. Each part of a run appends to a file in the working folder, so that a stopped
-run goes on counting.
+Every completion that a model with a price or a server is asked for counts, whatever becomes of it;
+one from the cache costs nothing. Each part of a run appends to a file in the working folder, so
+that a stopped run goes on counting.
 """
 
 from collections import Counter
@@ -56,18 +56,19 @@ class Asked(msgspec.Struct, frozen=True):
 def metered(
     cards: Sequence[Card], backends: Sequence[Backend], work: Path | None, guards: Sequence[Guard]
 ) -> list[Backend]:
-    """Return the models' backends, wrapped so that the cost of those with a price is counted.
+    """Return the models' backends, wrapped so that tokens of those at servers are counted.
 
-    A backend is the code that runs a model. A price stands in the model's card, the file that
-    describes it; `cards` and `backends` are in the same order, the ego's first. Counts go to a file
-    in the working folder `work`; nothing is counted with None. `guards`, functions that may make a
-    backend refuse to ask, wrap each one, too.
+    A backend is the code that runs a model. So is one with a price, which stands in the model's
+    card, the file that describes it; `cards` and `backends` are in the same order, the ego's first.
+    Counts go to a file in the working folder `work`; nothing is counted with None. `guards`,
+    functions that may make a backend refuse to ask, wrap each one, too.
     """
     models = []
     for card, backend in zip(cards, backends, strict=True):
         for guard in guards:
             backend = guard(card, backend)
-        models.append(Metered(backend, card.name, work) if card.price and work else backend)
+        is_counted = card.price or card.server
+        models.append(Metered(backend, card.name, work) if is_counted and work else backend)
     return models
 
 
@@ -96,10 +97,7 @@ def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]
     `settings` are a run's record, the content of its `run.json`, with the prices; `works` are the
     folders. A model without a price or without a question is left out.
     """
-    prices = {}
-    for model in (settings["model"], *(helper["model"] for helper in settings["helpers"])):
-        if price := model.get("price"):
-            prices[model["name"]] = msgspec.convert(price, Price)
+    prices = _prices(settings)
     sums: dict[str, Counter[str]] = {}
     for work in works:
         for line in bytes_of(work / FILE, "rows").splitlines() if (work / FILE).is_file() else ():
@@ -118,3 +116,53 @@ def total(settings: Mapping[str, Any], works: Iterable[Path]) -> dict[str, Cost]
         for name, n in sums.items()
         if name in prices
     }
+
+
+def _prices(settings: Mapping[str, Any]) -> dict[str, Price]:
+    """Return the prices that a run's record states, by model name."""
+    prices = {}
+    for model in (settings["model"], *(helper["model"] for helper in settings["helpers"])):
+        if price := model.get("price"):
+            prices[model["name"]] = msgspec.convert(price, Price)
+    return prices
+
+
+class Spending:
+    """Say what a run's questions have taken so far, while other threads or processes ask.
+
+    Called, it returns tokens and cost, such as `31.2k tokens, 0.24 USD`; empty if none are counted.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], work: Path) -> None:
+        """Begin at the beginning: `settings` are the run's record, `work` its working folder."""
+        self._prices, self._file = _prices(settings), work / FILE
+        self._at, self._tokens, self._costs = 0, 0, Counter[str]()
+
+    def __call__(self) -> str:
+        for line in self._new_lines():
+            with suppress(msgspec.MsgspecError):
+                counts = msgspec.json.decode(line, type=Asked)
+                self._tokens += counts.read + counts.written
+                if price := self._prices.get(counts.model):
+                    self._costs[price.currency] += price.of(counts.read, counts.written)
+        if not self._tokens:
+            return ""
+        costs = [f"{_short(cost)} {currency}" for currency, cost in self._costs.items()]
+        return ", ".join([f"{_short(self._tokens)} tokens", *costs])
+
+    def _new_lines(self) -> Sequence[bytes]:
+        """Return the lines that are whole now, and were not at the last call."""
+        with suppress(OSError), self._file.open("rb") as file:  # not begun, or tidied away
+            file.seek(self._at)
+            whole, end, _ = file.read().rpartition(b"\n")
+            self._at += len(whole + end)
+            return whole.splitlines()
+        return ()
+
+
+def _short(number: float) -> str:
+    """Return a number in three digits and a letter: `950`, `31.2k`, `4.56M`, `0.0243`."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= 0.9995 * size:  # what is rounded to it
+            return f"{number / size:.3g}{letter}"
+    return f"{number:.3g}"

@@ -35,26 +35,34 @@ def test_where_more_follows_the_time_left_is_the_least() -> None:
         line(progress, [(0.0, 0), (10.0, 100)], 10.0)
         == "asking proxy 100/1206 10.0/s at least 0:01:51 left"
     )
+    progress.spent = lambda: "31.2k tokens"
+    marks = [(0.0, 0), (10.0, 100)]
+    assert (
+        line(progress, marks, 10.0)
+        == "asking proxy 100/1206 31.2k tokens 10.0/s at least 0:01:51 left"
+    )
 
 
 @pytest.mark.parametrize("grows", [False, True])
 @pytest.mark.parametrize("label", ["asking proxy", "driving " + "x" * 30])
-def test_a_line_fits_eighty_columns_and_tells_all(label: str, grows: bool) -> None:
+@pytest.mark.parametrize("spent", ["", "31.2k tokens, 0.243 USD"])
+def test_a_line_fits_eighty_columns_and_tells_all(label: str, grows: bool, spent: str) -> None:
     now = [0.0]
     out = io.StringIO()
     progress = drawn(Console(file=out, width=80, force_terminal=True, color_system=None))
     progress.get_time = lambda: now[0]
-    task = progress.add_task(label, total=1206, grows=grows)
+    task = progress.add_task(label, total=1206, grows=grows, spent=lambda: spent)
     for done in (0, 406, 406):
         now[0] += 7
         progress.advance(task, done)
     progress.console.print(progress.get_renderable())
     [line] = out.getvalue().splitlines()
     assert len(line.rstrip()) <= 80
-    assert line.startswith(label)
-    assert " 812/1206 " in line
+    assert line.startswith(label[:7])
+    assert line.startswith(label) or spent  # which is not cut short
+    assert f" 812/1206 {spent}" in line
     assert line.rstrip().endswith(f"58.0/s {'at least ' * grows}0:00:07 left")
-    assert "━━" in line or (grows and "x" in label)  # the bar gives way
+    assert "━━" in line or spent or (grows and "x" in label)  # the bar gives way
 
 
 TYPED = """
