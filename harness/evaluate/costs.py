@@ -136,7 +136,7 @@ class Spending:
     def __init__(self, settings: Mapping[str, Any], work: Path) -> None:
         """Begin at the beginning: `settings` are the run's record, `work` its working folder."""
         self._prices, self._file = _prices(settings), work / FILE
-        self._at, self._tokens, self._costs = 0, 0, Counter[str]()
+        self._at, self._tokens, self._costs = 0, 0, dict[str, float]()
 
     def __call__(self) -> str:
         for line in self._new_lines():
@@ -144,7 +144,8 @@ class Spending:
                 counts = msgspec.json.decode(line, type=Asked)
                 self._tokens += counts.read + counts.written
                 if price := self._prices.get(counts.model):
-                    self._costs[price.currency] += price.of(counts.read, counts.written)
+                    cost = price.of(counts.read, counts.written)
+                    self._costs[price.currency] = self._costs.get(price.currency, 0.0) + cost
         if not self._tokens:
             return ""
         costs = [f"{_short(cost)} {currency}" for currency, cost in self._costs.items()]
