@@ -262,7 +262,7 @@ def test_the_old_spelling_of_a_full_page_writes_that_page(
     assert (code, out) == (0, "")
     assert err == (
         f"harness: `harness {command} --full` is now `harness report RUN --full`; the old "
-        "spelling works until 0.4.0\n"
+        "spelling works until 0.5.0\n"
     )
     page = Path("run/report.html").read_bytes()
     assert harness("report", "run", "--full")[0] == 0

@@ -55,7 +55,7 @@ PANELS = {
     "More": ("plan", "study", "run", "model", "prompt", "dataset"),
 }
 
-# Spellings of 0.2 and what replaces them; they work until 0.4.0, with a note.
+# Spellings of 0.2 and what replaces them; they work until 0.5.0, with a note.
 OLD = {
     "sweep": "study sweep",
     "ls": "run ls",

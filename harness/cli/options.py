@@ -129,7 +129,7 @@ def _say_report(context: Context, is_typed: bool) -> bool:
     if is_typed and not context.resilient_parsing:
         echo(
             f"harness: `harness {context.info_name} --full` is now `harness report RUN --full`; "
-            "the old spelling works until 0.4.0",
+            "the old spelling works until 0.5.0",
             err=True,
         )
     return is_typed
@@ -143,7 +143,7 @@ FullPage = Annotated[
         "page too.",
     ),
 ]
-# Of a command whose page `harness report` writes again, until 0.4.0.
+# Of a command whose page `harness report` writes again, until 0.5.0.
 OldFullPage = Annotated[bool, Option("--full", hidden=True, callback=_say_report)]
 Shard = Annotated[
     str | None,

@@ -162,7 +162,7 @@ class Group(TyperGroup):
         if new and old not in short() and not ctx.resilient_parsing:
             echo(
                 f"harness: `harness {old}` is now `harness {new}`; the old spelling works until "
-                "0.4.0",
+                "0.5.0",
                 err=True,
             )
         args = [*new.split(), *rest]

@@ -26,10 +26,10 @@ class Closed(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __getitem__(self, key: str) -> Any:
         """Return a member by its name in a file:
-        how plug-ins of 0.2 read it, until 0.4.0, with a warning.
+        how plug-ins of 0.2 read it, until 0.5.0, with a warning.
         """
         names = dict(zip(self.__struct_encode_fields__, self.__struct_fields__, strict=True))
         if key not in names or (value := getattr(self, names[key])) is UNSET:
             raise KeyError(key)
-        warn(f"[{key!r}] is now .{names[key]}; it works until 0.4.0", FutureWarning, stacklevel=2)
+        warn(f"[{key!r}] is now .{names[key]}; it works until 0.5.0", FutureWarning, stacklevel=2)
         return value

@@ -156,7 +156,7 @@ class Scenario:
     # the class of its worlds, an `OwnWorld`, if they are played elsewhere; None for the harness's
     # own simulator
     world: type[Any] | None = None
-    # spelling of 0.2, until 0.4.0: what starts an episode of such a world; takes the scenario and
+    # spelling of 0.2, until 0.5.0: what starts an episode of such a world; takes the scenario and
     # the layout seed
     start: InitVar[Callable[["Scenario", int], Any] | None] = None
 
@@ -200,7 +200,7 @@ def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:
     from harness.world.own_world import OwnWorld
 
     warn(
-        "Scenario(start=f) is now Scenario(world=Class), whose `begun` is f; it works until 0.4.0",
+        "Scenario(start=f) is now Scenario(world=Class), whose `begun` is f; it works until 0.5.0",
         FutureWarning,
         stacklevel=4,
     )
@@ -210,11 +210,11 @@ def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        """Return what stood here in 0.2; until 0.4.0, with a warning."""
+        """Return what stood here in 0.2; until 0.5.0, with a warning."""
         if name.startswith("_") or not hasattr(_parameters, name):
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         warn(
-            f"{name} is now in harness.world.parameters; it works here until 0.4.0",
+            f"{name} is now in harness.world.parameters; it works here until 0.5.0",
             FutureWarning,
             stacklevel=2,
         )

@@ -101,7 +101,7 @@ def test_an_old_spelling_works_and_says_the_new_one(
     assert (code, out) == (0, harness(*new.split(), "--help")[1])
     assert (
         err
-        == f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.4.0\n"
+        == f"harness: `harness {old}` is now `harness {new}`; the old spelling works until 0.5.0\n"
     )
 
 

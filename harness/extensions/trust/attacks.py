@@ -81,7 +81,7 @@ class Attack:
     def __init_subclass__(cls) -> None:
         if "by_moment" in vars(cls):
             warn(
-                f"{cls.__name__}.by_moment is now by_scene; it works until 0.4.0",
+                f"{cls.__name__}.by_moment is now by_scene; it works until 0.5.0",
                 FutureWarning,
                 stacklevel=2,
             )

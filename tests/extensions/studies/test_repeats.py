@@ -305,7 +305,7 @@ def test_a_dry_run_counts_every_repeat_and_the_old_spelling_is_the_same(
     assert before[:2] == now[:2]
     assert before[2] == (
         "harness: `harness eval --repeats` is now `harness study repeats`; the old spelling works "
-        "until 0.4.0\n"
+        "until 0.5.0\n"
     )
     assert there.asked == []
 
