@@ -64,6 +64,9 @@ AIMS = {"of_ideal": 0.95, "cpu_ms": 0.25}
 EGO = '{"action_distribution":{"SLOWER":0.20,"IDLE":0.70,"FASTER":0.10}}'
 HELPER = f'{EGO[:-1]},"evidence":"a car comes from the left, 34 m away","risk":"high"}}'
 LISTED = {"data": [{"id": "m", "owned_by": "benchmark"}]}
+# What a server does with more requests than it takes at once: they wait, are refused with HTTP 429,
+# or all take longer, twice as long at that number.
+LOADS = ("waits", "refuses", "slows")
 MOST = 1 << 13  # requests of a part, which memory holds at once: 256 layouts have some more
 assert client
 
@@ -88,10 +91,10 @@ def main() -> None:
     arguments.add_argument("--batch-size", type=int, help="default: as many as a server takes")
     arguments.add_argument("--workers", type=int, default=1, help="client processes")
     arguments.add_argument("--ways", nargs="+", default=["sockets", "complete", "ask"])
-    arguments.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
+    arguments.add_argument("--serve", choices=LOADS, help=argparse.SUPPRESS)
     given = arguments.parse_args()
     if given.serve:
-        serve(given.seconds, given.at_once)
+        serve(given.seconds, given.at_once, given.serve)
         return
     batch_size, workers = given.batch_size or given.at_once, given.workers
     ideal_s = given.requests * given.seconds / (given.at_once * given.servers)
@@ -288,9 +291,9 @@ def sized(data: bytes) -> bytes:
 
 
 @contextmanager
-def serving(seconds: float, at_once: int) -> Iterator[str]:
+def serving(seconds: float, at_once: int, load: str = "waits") -> Iterator[str]:
     """A server in a process of its own; its base URL."""
-    options = ["--serve", "--seconds", str(seconds), "--at-once", str(at_once)]
+    options = ["--serve", load, "--seconds", str(seconds), "--at-once", str(at_once)]
     process = subprocess.Popen(
         [sys.executable, __file__, *options], stdout=subprocess.PIPE, text=True
     )
@@ -311,18 +314,19 @@ def stats(url: str) -> dict[str, float]:
         return counted
 
 
-def serve(seconds: float, at_once: int) -> None:
+def serve(seconds: float, at_once: int, load: str) -> None:
     """Answer for ever; the base URL is printed first."""
     # `select` waits for microseconds, and `epoll` for whole milliseconds, which answers would wait
     # for.
     with asyncio.Runner(
         loop_factory=partial(asyncio.SelectorEventLoop, selectors.SelectSelector())
     ) as runner:
-        runner.run(served(seconds, at_once))
+        runner.run(served(seconds, at_once, load))
 
 
-async def served(seconds: float, at_once: int) -> None:
-    loop, counts = asyncio.get_running_loop(), {"answered": 0, "connections": 0, "busy": 0}
+async def served(seconds: float, at_once: int, load: str) -> None:
+    counts = dict.fromkeys(("answered", "connections", "busy", "refused", "most"), 0)
+    loop = asyncio.get_running_loop()
     messages = [
         {"choices": [{"finish_reason": "stop", "message": {"content": text}}]}
         for text in (EGO, HELPER)
@@ -337,11 +341,16 @@ async def served(seconds: float, at_once: int) -> None:
         to.write(b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n" + sized(data))
 
     def work(to: asyncio.Transport, answer: bytes) -> None:
-        if counts["busy"] == at_once:
+        if counts["busy"] >= at_once and load == "refuses":
+            counts["refused"] += 1
+            to.write(b"HTTP/1.1 429 Too Many Requests\r\n" + sized(b"{}"))
+        elif counts["busy"] >= at_once and load == "waits":
             waiting.append((to, answer))
         else:
             counts["busy"] += 1
-            loop.call_later(seconds, done, to, answer)
+            counts["most"] = max(counts["most"], counts["busy"])
+            slower = 1 + counts["busy"] / at_once if load == "slows" else 1
+            loop.call_later(seconds * slower, done, to, answer)
 
     def done(to: asyncio.Transport, answer: bytes) -> None:
         counts["busy"] -= 1
