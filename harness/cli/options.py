@@ -92,7 +92,9 @@ Agents = Annotated[
 FirstSeed = Annotated[int, Option(help="Layout seed of the first episode; the others follow.")]
 Thinking = Annotated[bool, Option("--thinking", help=HELP["thinking"])]
 Answer = Annotated[AnswerMode, Option(help=HELP["answer"])]
-BatchSize = Annotated[int, Option(help=HELP["batch_size"])]
+NUMBER_OR_AUTO = "INTEGER|auto"
+# Typed as `at_once_of` reads it.
+BatchSize = Annotated[str, Option(metavar=NUMBER_OR_AUTO, help=HELP["batch_size"])]
 Device = Annotated[str | None, Option(help=HELP["device"])]
 Dtype = Annotated[str | None, Option(help=HELP["dtype"])]
 Latency = Annotated[str | None, Option(help=HELP["latency"])]
@@ -285,7 +287,7 @@ def _parameter(option: stated.Option) -> inspect.Parameter:
         None,
         "/".join(flags),
         help=option.help + usual,
-        metavar="INTEGER|auto" if option.is_parsed else None,
+        metavar=NUMBER_OR_AUTO if option.is_parsed else None,
         rich_help_panel=option.panel or None,
     )
     return inspect.Parameter(

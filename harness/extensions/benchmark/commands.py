@@ -17,6 +17,7 @@ from harness.cli.eval import show_counted
 from harness.cli.progress import bar
 from harness.cli.run import evaluate
 from harness.cli.terminal import echo_json, echo_text, table
+from harness.core.at_once import at_once_of
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount, interval_of
 from harness.core.formats import SUITE, refuse_data
@@ -44,7 +45,7 @@ def run(
     prompt: options.ScenarioPrompt = None,
     answer: options.Answer = "json",
     thinking: options.Thinking = False,
-    batch_size: options.BatchSize = 8,
+    batch_size: options.BatchSize = "8",
     server: Annotated[list[str] | None, typer.Option(help=options.HELP["server"])] = None,
     device: options.Device = None,
     dtype: options.Dtype = None,
@@ -88,7 +89,7 @@ def run(
         "prompt": prompt,
         "answer": answer,
         "thinking": thinking,
-        "batch_size": batch_size,
+        "batch_size": at_once_of(batch_size),
         "server": tuple(server or ()),
         "device": device,
         "dtype": dtype,

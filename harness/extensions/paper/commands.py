@@ -8,6 +8,7 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.run import file_name
 from harness.cli.show import finish
+from harness.core.at_once import at_once_of
 from harness.core.errors import UserError, in_range, printable
 from harness.core.seeds import FIRST
 from harness.runs.settings import HELP, parse_seeds
@@ -63,7 +64,7 @@ def closed_loop(
     ),
     seeds: options.Seeds = "0:5",
     workers: options.ModelWorkers = "2",
-    batch_size: options.BatchSize = 8,
+    batch_size: options.BatchSize = "8",
     latency: options.Latency = None,
     out: Path | None = typer.Option(
         None,
@@ -98,7 +99,7 @@ def closed_loop(
         source,
         tuple(points.values()),
         parse_seeds(seeds),
-        settings=Settings(batch_size=batch_size, latency=latency),
+        settings=Settings(batch_size=at_once_of(batch_size), latency=latency),
     )
     where = out or Path("reports") / f"closed-loop-{file_name(spec.ego.card.name)}-{prompt}"
     refuse_taken(where, "closed-loop")

@@ -9,6 +9,7 @@ from harness.cli.progress import bar
 from harness.cli.run import free_folder
 from harness.cli.show import finish
 from harness.core import resources, work
+from harness.core.at_once import at_once_of
 from harness.core.errors import in_range, printable, unknown
 from harness.core.seeds import LAST_SEED
 
@@ -35,7 +36,7 @@ def command(
     ),
     thinking: options.Thinking = False,
     answer: options.Answer = "json",
-    batch_size: options.BatchSize = 8,
+    batch_size: options.BatchSize = "8",
     workers: options.ModelWorkers = "2",
     device: options.Device = None,
     dtype: options.Dtype = None,
@@ -100,7 +101,7 @@ def command(
         points=(),
         seeds=(0,),
         # Every viewer has a twin.
-        settings=Settings(batch_size=batch_size, device=device, dtype=dtype, ask="all"),
+        settings=Settings(batch_size=at_once_of(batch_size), device=device, dtype=dtype, ask="all"),
     )
     questions = asking.Questions(spec, tuple(dict.fromkeys(twin or TWINS)), sample_seed)
     able = [name for name in questions.twins if asking.lack(spec, TWINS[name]) is None]
