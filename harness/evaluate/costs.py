@@ -17,7 +17,7 @@ from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.price import Price
 from harness.core.config import Whole
-from harness.core.files import appending, bytes_of
+from harness.core.files import appending, bytes_of, opened
 from harness.evaluate.command_options import Guard
 from harness.runs.records import Cost
 
@@ -153,7 +153,7 @@ class Spending:
 
     def _new_lines(self) -> Sequence[bytes]:
         """Return the lines that are whole now, and were not at the last call."""
-        with suppress(OSError), self._file.open("rb") as file:  # not begun, or tidied away
+        with suppress(OSError), opened(self._file, "rows") as file:  # not begun, or tidied away
             file.seek(self._at)
             whole, end, _ = file.read().rpartition(b"\n")
             self._at += len(whole + end)
