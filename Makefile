@@ -14,7 +14,7 @@ SEES := $(BIN)/python -c "import llama_cpp.mtmd_cpp" 2>/dev/null || $(LLAMA_CPP)
 REAL_PROMPT ?= v10
 REAL_LIMIT ?= 5
 
-.PHONY: eval real results quick test exhaustive core check light browser docs bench clean
+.PHONY: eval real results quick test exhaustive core check light browser docs bench release clean
 
 eval: .venv/base ## a rule at once; then build llama.cpp, and evaluate the default language model with a report
 	$(BIN)/harness eval --model proxy
@@ -73,6 +73,9 @@ docs: .venv/docs ## the documentation as a site: build/docs/index.html
 bench: .venv/dev ## the table of benchmarks/README.md, in some ten minutes
 	$(BIN)/python benchmarks/table.py --page benchmarks/README.md
 
+release: .venv-release/tools ## wheel, sdist, locked list and licences in dist/, tried; PYTHONS="python3.11 python3.13"
+	.venv-release/bin/python release.py $(PYTHONS)
+
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
@@ -99,5 +102,11 @@ bench: .venv/dev ## the table of benchmarks/README.md, in some ten minutes
 	$(INSTALL) test .venv-light/bin/python --no-compile
 	touch $@
 
+.venv-release/tools: release.lock
+	$(PYTHON) -m venv .venv-release
+	.venv-release/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps \
+	  --requirement release.lock
+	touch $@
+
 clean:
-	rm -rf .venv .venv-light build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf .venv .venv-light .venv-release build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

@@ -28,6 +28,27 @@ def test_the_citation_is_of_this_version() -> None:
     assert [paper["url"] for paper in citation["references"]] == [PROJECT["urls"]["Paper"]]
 
 
+def test_the_readme_cites_as_the_citation_file_does() -> None:
+    """In BibTeX: the harness in its version, and the paper with all its authors."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    [bibtex] = re.findall(r"```bibtex\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    software, paper = (
+        dict(re.findall(r"^  (\w+) += \{+(.*?)\}+,?$", entry, re.MULTILINE))
+        for entry in bibtex.split("@misc")
+    )
+    assert [software[key] for key in ("title", "version", "license")] == [
+        citation[key] for key in ("title", "version", "license")
+    ]
+    assert software["author"] == citation["authors"][0]["name"]
+    [cited] = citation["references"]
+    authors = [f"{each['family-names']}, {each['given-names']}" for each in cited["authors"]]
+    assert (paper["title"], paper["author"]) == (cited["title"], " and ".join(authors))
+    assert (paper["year"], f"arXiv:{paper['eprint']}") == (
+        str(cited["year"]),
+        cited["identifiers"][0]["value"],
+    )
+
+
 def test_code_dataset_and_weights_have_one_licence() -> None:
     licence = PROJECT["license"]
     assert "Apache License" in (ROOT / "LICENSE").read_text()
@@ -48,8 +69,18 @@ def test_code_dataset_and_weights_have_one_licence() -> None:
         assert licence in row
 
 
-def _requirements() -> Any:
-    spec = importlib.util.spec_from_file_location("requirements", ROOT / "requirements.py")
+def test_a_release_lists_locked_packages_with_digests_and_names_what_is_not_locked() -> None:
+    release = _module("release")
+    text = release.locked(["Jinja2", "typing_extensions"])
+    assert re.findall(r"^(\S+)==", text, re.MULTILINE) == ["jinja2", "typing-extensions"]
+    assert text.count("--hash=sha256:") >= 4
+    with pytest.raises(SystemExit, match=r"not in requirements\.lock: no-such; write it again"):
+        release.locked(["jinja2", "No.Such"])
+
+
+def _module(name: str) -> Any:
+    """A program of the checkout, which is in no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -61,7 +92,7 @@ def test_the_lock_has_all_that_an_install_needs_with_digests(install: str) -> No
     if install == "dev":
         pytest.importorskip("torch")
         pytest.importorskip("llama_cpp")
-    requirements = _requirements()
+    requirements = _module("requirements")
     groups = re.split(r"^# (.*)\n", requirements.LOCK.read_text(), flags=re.MULTILINE)[1:]
     text = "".join(
         lines for head, lines in zip(groups[::2], groups[1::2], strict=True)
