@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 # And what extensions add.
 __all__ = ["Extension", "Setting", "UserError", "compare", "load", "ls", "run", "sweep"]
-__version__ = "0.3.0"
+__version__ = "0.4.0"
 
 
 def __dir__() -> list[str]:
