@@ -14,6 +14,19 @@ function themes() {
   say();
 }
 
+// What is folded is not printed, and not found by a search of the browser.
+function unfolding() {
+  const button = document.getElementById("unfold"), folds = report.querySelectorAll("details");
+  button.addEventListener("click", () => folds.forEach((fold) => { fold.open = true; }));
+  button.hidden = false;
+}
+
+// A section that the address names is opened.
+function unfold(name) {
+  const fold = document.getElementById(name)?.querySelector(":scope > .fold");
+  if (fold) fold.open = true;
+}
+
 async function route() {
   const params = new URLSearchParams(location.hash.slice(1)), opened = params.has("scene");
   report.hidden = opened;
@@ -27,6 +40,7 @@ async function route() {
   }
   list.show();
   strips.show();
+  unfold(params.has("decisions") ? "decisions" : location.hash.slice(1));
   drawn ??= drawAll(about.charts);
   if (params.has("decisions")) {
     const coming = document.getElementById("decisions").getBoundingClientRect().top;
@@ -42,6 +56,7 @@ addEventListener("keydown", (event) => {
 
 (async () => {
   themes();
+  unfolding();
   document.querySelectorAll("table[data-csv]").forEach(copied);
   document.querySelectorAll("table.sortable").forEach(sortable);
   [about, index] = (await Promise.all([unpacked("about"), unpacked("index")])).map(JSON.parse);

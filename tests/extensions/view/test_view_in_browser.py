@@ -108,6 +108,7 @@ def test_a_report_works_in_its_sandbox(page, address):
     with page.expect_download() as saved:
         page.get_by_text("Save as SVG").first.click()
     assert saved.value.path().read_text().startswith("<svg")
+    page.get_by_text("The list of all decisions").click()
     said, search = page.locator("#list > p[aria-live]"), page.locator("input[name=q]")
     search.fill("no such scene")
     expect(said).to_have_text(re.compile("^0 of "))
@@ -121,6 +122,7 @@ def open_whole_decision(page, address):
     page.goto(address)
     page.get_by_role("link", name="first").click()
     wait(page)
+    page.get_by_text("The list of all decisions").click()
     page.locator("#list a[data-n]").nth(1).click()
     page.get_by_role("link", name="Show them").click()
     page.wait_for_url("**/run?path=first&scene=*#scene=*")
