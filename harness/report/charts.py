@@ -79,10 +79,10 @@ def success_latency(
     x, y = x_axis("latency_ms", "latency of a decision, ms"), share_axis("success", f"{label} rate")
     conditions = dict.fromkeys(str(row["condition"]) for row in rows)
     layers = [
-        band(*REACTION_MS, "reaction window of the paper, 150 to 250 ms", named=True),
+        band(*REACTION_MS, "the paper's reaction window", named=True),
         _references(references, y),
         *rules_at("latency_ms", window_ms, "decision window"),
-        *_paper(conditions, x, y),
+        *_paper(conditions, x, y, condition),
     ]
     if any(row.get("low") is not None for row in rows):
         low, high = {**y, "field": "low"}, {"field": "high"}
@@ -94,27 +94,27 @@ def success_latency(
     return layered(*layers, rows=rows, height=300)
 
 
-def _paper(conditions: Iterable[str], x: Spec, y: Spec) -> list[Spec]:
-    """Return what the paper reports for its own operating points, as a ring with its name."""
+def _paper(conditions: Iterable[str], x: Spec, y: Spec, colour: Spec) -> list[Spec]:
+    """Return what the paper reports for its own operating points, as a ring in their colour."""
     values = []
     for name in conditions:
         if name in PAPER:
             latency_ms, success = PAPER[name]
-            row = {"paper": f"paper: {name}", "latency_ms": latency_ms, "success": success}
-            values.append(row)
+            row = {"paper": "paper", "condition": name, "latency_ms": latency_ms}
+            values.append({**row, "success": success})
     if not values:
         return []
     ring = {
         "type": "point",
         "shape": "circle",
         "filled": False,
+        "opacity": 1,
         "size": 60,
-        "color": "currentColor",
     }
     text = {key: value for key, value in NAME.items() if key != "dy"} | {"dx": 7}
-    tip = {"tooltip": [{"field": name} for name in ("paper", "latency_ms", "success")]}
+    tip = {"tooltip": [{"field": name} for name in ("condition", "latency_ms", "success")]}
     layer = [
-        {"mark": ring, "encoding": {"x": x, "y": y, **tip}},
+        {"mark": ring, "encoding": {"x": x, "y": y, "color": colour, **tip}},
         {"mark": text, "encoding": {"x": x, "y": y, "text": {"field": "paper"}}},
     ]
     return [{"data": {"values": values}, "layer": layer}]

@@ -27,7 +27,7 @@ from harness.report.decisions import Decisions
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
 from harness.report.drawing.geometry import VIEW_M, ground_of
-from harness.report.findings import FIRST, LAST, findings, of_runs
+from harness.report.findings import LAST, Kind, findings, of_runs
 from harness.report.panels import panels
 from harness.report.remarks import sentences
 from harness.report.runs import Runs
@@ -165,7 +165,8 @@ def _pieces(
             title=title,
             policy=library.policy(library.vega(), library.script()),
             lacks=" ".join(decisions.lacks()),
-            warnings=of_runs(by_name, *FIRST),
+            warnings=of_runs(by_name, Kind.VOID, Kind.CAVEAT),
+            limits=of_runs(by_name, Kind.LIMIT),
             size=contents.size(runs),
             headline=headline,
             key_figures=key_figures,

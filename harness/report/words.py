@@ -145,15 +145,15 @@ def figures(run: Run) -> list[dict[str, str]]:
     best, base = compared(run)
     metric = headline_of(run)
     scores = {f"{IN_WORDS[metric]} under {best}": run.score(best, metric)}
-    if better := adjusted(run, best, metric):
-        score, worth_of_it = better
-        scores[f"adjusted for difficulty, {worth_of_it}"] = score
+    if base == BASELINE:
+        scores[f"gain over {base}"] = run.score(best, GAINS[metric])
     if halves := entry(metric).halves:
         dangerous, harmless = halves
         scores["with a danger"] = run.score(best, dangerous)
         scores["without a danger"] = run.score(best, harmless)
-    if base == BASELINE:
-        scores[f"gain over {base}"] = run.score(best, GAINS[metric])
+    if better := adjusted(run, best, metric):
+        score, worth_of_it = better
+        scores[f"adjusted for difficulty, {worth_of_it}"] = score
     scores[f"unsafe episodes under {best}"] = run.score(best, "unsafe_rate")
     scores[f"latency of a decision under {best}"] = run.score(best, LATENCY)
     scores["ego's answers that could not be read"] = run.score(ALL, "failed_rate_ego")

@@ -79,16 +79,24 @@ def test_it_opens_from_disk_with_every_chart_drawn(opened, report):
 
 
 @pytest.mark.exhaustive
-def test_what_is_read_first_stands_on_the_first_screen(opened, report):
+@pytest.mark.parametrize("size", [{"width": 1440, "height": 900}, NARROW], ids=["wide", "narrow"])
+def test_what_is_read_first_stands_on_the_first_screen(opened, report, size):
     one = report.parent / ONE / "report.html"
-    page = opened(one, size={"width": 1440, "height": 900})
-    for what in (".caveat", ".headline", ".key div:last-child", "#chart-success-latency svg"):
+    page = opened(one, size=size)
+    above = 0
+    for what in (".caveat", ".headline", ".first > .key div:last-child"):
         box = page.locator(what).first.bounding_box()
-        assert box["y"] + box["height"] <= 900, what
+        assert box["y"] > above, what
+        above = box["y"]
+    figure = page.locator("#chart-success-latency svg").bounding_box()
+    assert figure["y"] + figure["height"] <= size["height"]
+    limits = page.locator(".more .caveat")
+    assert limits.first.bounding_box()["y"] > above, "how far numbers carry stands below them"
+    assert page.locator(".first > .key > div").count() == 2
     assert page.locator(".key > div").count() == 7
     assert len(page.locator(".headline").inner_text()) < 280
     assert not page.locator("#metrics table").is_visible(), "all metrics are behind a fold"
-    picture(page, "report-first")
+    picture(page, f"report-first-{size['width']}")
 
 
 @pytest.mark.exhaustive

@@ -69,11 +69,14 @@ function tableOf(spec) {
   return [names, ...rows.map((row) => names.map((name) => row[name]))];
 }
 
+// On a telephone a chart is as wide as it can be, and less high: the page's first is seen without scrolling.
+const low = (spec, width) => (spec.layer ? { ...spec, height: Math.min(spec.height, 0.6 * width) } : spec);
+
 async function drawAll(specs) {
   for (const place of document.querySelectorAll("[data-chart]")) {
     const name = place.dataset.chart, spec = specs[name];
     try {
-      await chart(place, name, spec);
+      await chart(place, name, low(spec, place.clientWidth));
     } catch (error) {
       place.replaceChildren(h("p", { class: "bad" }, `This chart cannot be drawn: ${error.message}`));
     }
