@@ -148,9 +148,9 @@ def test_a_copied_cell_is_no_formula_in_a_spreadsheet(opened, attacked):
     file, text = attacked
     if len(gathered(text)) == 1:
         pytest.skip("the table is of several runs")
-    page = opened(file)
+    page = opened(file, "#matrix")
     page.evaluate("navigator.clipboard.writeText = async (text) => { window.copied = text; }")
-    page.locator("#matrix > div.scroll + button").click()
+    page.locator("#matrix .fold > div.scroll + button").click()
     cells = [
         cell for row in csv.reader(page.evaluate("window.copied").splitlines()) for cell in row
     ]
