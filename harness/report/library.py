@@ -36,6 +36,7 @@ SCRIPTS = (
     "decision",
     "list",
     "episodes",
+    "replay",
     "main",
 )
 FOLDER = Path(__file__).parent / "scripts"

@@ -241,13 +241,14 @@ def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
 
 
 def _settings(run: Run) -> dict[str, Any]:
-    """Return a run's inference times, in s, and the settings of its conditions by their names."""
+    """Return a run's best condition, its inference times, in s, and all conditions' settings."""
     points = {}
     for condition in run.manifest.conditions:
         point = {name: condition.get(name) for name in SETTINGS}
         points[condition["name"]] = {**point, "question": question_under(condition).name}
     latency = run.manifest.latency
-    return {"inference_s": {"ego": latency.ego_s, "helper": latency.helper_s}, "points": points}
+    seconds = {"ego": latency.ego_s, "helper": latency.helper_s}
+    return {"best": words.compared(run)[0], "inference_s": seconds, "points": points}
 
 
 def _actions(runs: Runs) -> dict[str, tuple[str, str]]:

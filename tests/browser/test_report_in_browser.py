@@ -118,6 +118,29 @@ def test_the_answer_that_lost_an_episode_is_two_clicks_away(opened, report, inde
 
 
 @pytest.mark.exhaustive
+def test_the_lost_episode_is_played_from_its_first_decision_on(opened, report):
+    page = opened(report.parent / ONE / "report.html")
+    film = page.locator("#replay")
+    steps, now = film.locator(".strip .cell"), film.locator("[aria-current]")
+    lost = now.get_attribute("aria-label")
+    assert lost.endswith("the answer that lost this episode")
+    said = film.locator("p").first.inner_text()
+    step, action = re.search(r"lost at step (\d+) by (\w+)", said).groups()
+    assert lost.startswith(f"step {step}: {action}")
+    assert film.locator("svg.scene").is_visible()
+    expect(film.locator(".pair strong")).to_have_text(f"Step {step}: {action}")
+    page.clock.install()
+    film.get_by_role("button", name="Play").click()
+    for n in range(steps.count()):
+        expect(now).to_have_attribute("aria-label", steps.nth(n).get_attribute("aria-label"))
+        page.clock.run_for(1500)
+    film.get_by_role("button", name="Play").wait_for()
+    film.get_by_role("button", name="one decision back").click()
+    label = steps.nth(steps.count() - 2).get_attribute("aria-label")
+    expect(now).to_have_attribute("aria-label", label)
+
+
+@pytest.mark.exhaustive
 def test_episodes_are_sorted_by_what_they_cost(opened, report, index):
     page = opened(report, "#episodes")
     run, S = index["runs"][0], len(index["runs"][0]["seeds"])

@@ -1,7 +1,7 @@
 // What the address says is shown: the report, or one decision.
 
 const report = document.getElementById("report"), single = document.getElementById("decision");
-let about, index, list, strips, page, drawn;
+let about, index, list, strips, replay, page, drawn;
 
 function themes() {
   const button = document.getElementById("theme"), root = document.documentElement;
@@ -40,6 +40,7 @@ async function route() {
   }
   list.show();
   strips.show();
+  await replay.show();
   unfold(params.has("decisions") ? "decisions" : location.hash.slice(1));
   drawn ??= drawAll(about.charts);
   if (params.has("decisions")) {
@@ -62,6 +63,7 @@ addEventListener("keydown", (event) => {
   [about, index] = (await Promise.all([unpacked("about"), unpacked("index")])).map(JSON.parse);
   list = new List(index, about, document.getElementById("list"));
   strips = new Episodes(list, about.actions, document.getElementById("strips"));
+  replay = new Replay(strips, about, document.getElementById("replay"));
   page = new DecisionPage(single, list, index, about);
   document.querySelectorAll("a[data-scene]").forEach((a) => { a.href = `#${new URLSearchParams(a.dataset)}`; });
   addEventListener("hashchange", route);

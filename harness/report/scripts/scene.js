@@ -44,12 +44,13 @@ function shadows(world, eye, far) {
   })));
 }
 
+// `zoom` is all, or the west and south ends of a square and its side; else what the messages need is shown.
 // `agents` are those that decide in the same step: each with its id, what it decided and its page.
 function birdsEye(world, ground, viewer, messages, zoom, agents) {
   const eye = world.vehicles.find((v) => v.id === viewer), sees = world.viewers[viewer];
   const seen = new Set([viewer, ...sees.seen]), most = ground.view_m;
   const ego = world.vehicles.find((v) => v.part === "ego") ?? eye;
-  const [west, south, side] = zoom === "all" ? [-most, -most, 2 * most] : sees.views[messages.map((m) => m.from).join(" ")];
+  const [west, south, side] = zoom === "all" ? [-most, -most, 2 * most] : Array.isArray(zoom) ? zoom : sees.views[messages.map((m) => m.from).join(" ")];
   const north = -south - side;
   const view = [west, north, west + side, north + side], size = side / 38;
   const within = (v) => v.x > west + 1 && v.x < view[2] - 1 && -v.y > north + 1 && -v.y < view[3] - 1;
