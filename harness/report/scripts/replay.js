@@ -105,7 +105,7 @@ class Replay {
       h("p", { class: "strip" }, cells),
       h("div", { class: "pair" },
         world ? birdsEye(world, this.about.ground, Object.keys(world.viewers)[0], decision.messages, this.view, [])[0]
-          : h("p", { class: "quiet" }, "No picture of this decision point lies in the page: `harness run video` draws the whole episode."),
+          : h("p", { class: "quiet" }, "No picture of this decision point lies in the page."),
         h("div", {},
           h("p", {}, h("strong", {}, `Step ${step}${agent ? `, ${agent}` : ""}: ${decision.action}`), " ",
             live ? null : h("span", { class: look }, `${sign} ${endWords(live)[most.ends[at]]}`)),
