@@ -91,10 +91,10 @@ def after_comparison(comparison: "Comparison") -> None:
     Where no condition differs clearly, that is a plan of how many layouts decide it; else what
     shows the answers that changed side by side.
     """
-    from harness.report.compare.words import headlines, verdict
+    from harness.report.compare.words import of_success, verdict
 
     a, b = comparison.pair.a.run.path, comparison.pair.b.run.path
-    if any(verdict(difference) for _, difference in headlines(comparison)):
+    if any(map(verdict, of_success(comparison).values())):
         echo_next("compare", a, b, "--html", "compare.html")
     else:
         echo_next("plan", a, b)

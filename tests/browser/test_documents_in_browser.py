@@ -10,7 +10,7 @@ pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
 from axe_playwright_python.sync_playwright import Axe
 from evaluating import run as evaluate
 from evaluating import spec_of
-from opening import NARROW, SCROLLS, picture
+from opening import NARROW, SCROLLS, SHEETS, picture, sheets
 
 from harness.coordination.named_points import named_point
 from harness.report.compare.difference import compare
@@ -63,6 +63,20 @@ def test_a_document_fits_a_telephone_and_is_read_aloud(browser, pages, name, sch
     assert any(sign for _, _, sign in said)
     assert Axe().run(page).response["violations"] == []
     picture(page, f"{name}-narrow-{scheme}")
+    page.close()
+
+
+@pytest.mark.exhaustive
+def test_a_comparison_begins_with_its_verdict_two_numbers_and_the_figure(browser, pages):
+    page = browser.new_page(viewport={"width": 1440, "height": 900})
+    page.goto(pages["compare"].as_uri())
+    verdict = page.locator(".found").bounding_box()
+    for what in (".first .key", ".first figure"):
+        box = page.locator(what).bounding_box()
+        assert verdict["y"] < box["y"] <= box["y"] + box["height"] <= 900, what
+    assert page.locator(".key > div").count() == 2
+    assert page.get_by_text("alone lost", exact=False).first.is_visible()
+    assert sheets(page) <= SHEETS
     page.close()
 
 

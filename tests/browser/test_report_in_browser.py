@@ -14,7 +14,7 @@ pytest.importorskip("axe_playwright_python", reason="needs the dev extra")
 from axe_playwright_python.sync_playwright import Axe
 from evaluating import run as evaluate
 from evaluating import spec_of
-from opening import NARROW, WIDE, picture, wait
+from opening import NARROW, SHEETS, WIDE, picture, sheets, wait
 from playwright.sync_api import expect
 from reading import packed
 
@@ -31,7 +31,6 @@ SIZE = """async (shown) => {
 }"""
 RUNS = (("proxy", "v1"), ("proxy", "v2"), ("proxy-faulty", "v2"), ("local-view", "v2"))
 ONE = "proxy-v2"
-SHEETS = 6  # that a page prints on at most, unless more is asked for
 
 
 def typed(*words):
@@ -422,11 +421,6 @@ def test_figures_are_saved_as_svg_and_png(opened, report, index):
         with page.expect_download() as saved:
             page.locator(".picture").get_by_text(f"Save as {kind}").click()
         assert saved.value.path().read_bytes().startswith(begins)
-
-
-def sheets(page):
-    """How many sheets a page prints on, of the size that its style sheet names."""
-    return len(re.findall(rb"/Type\s*/Page\b", page.pdf(prefer_css_page_size=True)))
 
 
 def paper(page):

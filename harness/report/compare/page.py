@@ -1,7 +1,7 @@
 """A comparison as one HTML file: needs no network and runs no script."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote, urlencode
 
@@ -16,6 +16,7 @@ from harness.report.compare.difference import Comparison, DecisionFlip, Differen
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side
 from harness.report.document import forest, reach
+from harness.report.findings import Kind
 from harness.report.templating import environment
 from harness.runs.folder import Run
 from harness.runs.metrics import entry
@@ -66,6 +67,10 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
         links=links,
         decided=decided,
         marked=marked,
+        above=words.caveats(pair, (Kind.VOID, Kind.CAVEAT)),
+        below=words.caveats(pair, (Kind.LIMIT,)),
+        changes=_drawn(words.of_success(comparison)),
+        first_lost=words.first_lost(comparison),
         forest=_forest(comparison),
     )
 
@@ -105,6 +110,13 @@ def _lost(side: Side) -> dict[tuple[str, int, int], str]:
             if regret[n]:
                 losing.setdefault(key, scene)
     return last | losing
+
+
+def _drawn(changes: Mapping[str, Difference]) -> dict[str, Markup]:
+    """Draw differences on one scale, with 0 in the middle; by the same names."""
+    low, high = reach(d.change for d in changes.values())
+    most = max(abs(low), abs(high)) or 1.0
+    return {name: forest(d.change, -most, most, words.verdict(d)) for name, d in changes.items()}
 
 
 def _forest(comparison: Comparison) -> Callable[[Difference], Markup]:

@@ -25,6 +25,7 @@ from harness.report.compare.difference import (
 )
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side, where
+from harness.report.findings import Kind
 from harness.runs.headline import IN_WORDS, SUCCESS
 
 WIDTH = 80
@@ -64,12 +65,14 @@ def _brief_lines(comparison: Comparison, verdicts: Sequence[Verdict]) -> Iterato
     pair = comparison.pair
     yield from (f"{name}: {side}" for name, side in words.sides(pair, whole=True))
     yield f"paired: {words.paired(pair)}; {words.differing(comparison)}"
-    changes = words.headlines(comparison)
-    metrics = dict.fromkeys(f"{IN_WORDS[d.metric]}, %" for _, d in changes)
+    changes = words.of_success(comparison)
+    metrics = dict.fromkeys(f"{IN_WORDS[d.metric]}, %" for d in changes.values())
     numbers = f"{'A':>6}{'B':>6}{'B - A':>7} {'[95 % interval]':>17}{'p':>8}"
     yield f"{' or '.join(metrics):<22}{numbers}{'gained':>8}{'lost':>5}"
-    for condition, difference in changes:
-        row = words.line(difference)
+    for condition in comparison.conditions:
+        if condition.condition not in changes:
+            continue
+        row = words.line(changes[condition.condition])
         label = f"{words.SIGNS[row.verdict]} {printable(condition.condition, 19)}".strip()
         gained, lost = words.counts(condition)
         numbers = f"{row.a:>6}{row.b:>6}{row.change:>7} {row.interval:>17}{row.p:>8}"
@@ -83,7 +86,7 @@ def _brief_lines(comparison: Comparison, verdicts: Sequence[Verdict]) -> Iterato
         if episodes := ways.get("lost"):
             yield f"lost under {printable(condition.condition)}: {episodes}"
     yield f"answers: {words.answers_held(comparison.held)}"
-    warnings = words.warnings(pair)
+    warnings = words.caveats(pair, (Kind.VOID, Kind.CAVEAT))
     yield from warnings
     notes = [note for note in words.caveats(pair) if note not in warnings]
     if notes:

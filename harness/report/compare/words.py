@@ -137,20 +137,6 @@ def rest(c: InCondition) -> list[Difference]:
     return [d for d in c.differences if d not in (*primary, *striking)]
 
 
-def headlines(comparison: Comparison) -> list[tuple[InCondition, Difference]]:
-    """Return each condition with its change of success, balanced if both runs have that.
-
-    A condition is a named set of settings of the radio, of asking helpers and of fusing their
-    messages; one without such a change is left out.
-    """
-    changes = []
-    for condition in comparison.conditions:
-        differences = {d.metric: d for d in condition.differences}
-        if d := differences.get(headline_metric(set(differences))):
-            changes.append((condition, d))
-    return changes
-
-
 def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
     """Return for each condition a sentence on the change of success, and its verdict.
 
@@ -159,7 +145,7 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
     messages.
     """
     outcomes = []
-    for condition, d in headlines(comparison):
+    for name, d in of_success(comparison).items():
         row = line(d)
         if math.isnan(d.change.low):
             verdict, interval = "not clear, since there is no interval", ""
@@ -168,8 +154,66 @@ def outcomes(comparison: Comparison) -> list[tuple[str, str]]:
             verdict, interval = row.verdict or f"not clear, but within {bounds}", f" {row.interval}"
         p = "" if d.p_corrected is None else f", Holm's p {row.p}"
         change = f"{IN_WORDS[d.metric]} {row.change} points{interval}: {verdict}{p}"
-        outcomes.append((f"{condition.condition}: {change}", row.verdict))
+        outcomes.append((f"{name}: {change}", row.verdict))
     return outcomes
+
+
+def of_success(comparison: Comparison) -> dict[str, Difference]:
+    """Return by condition the difference of success, balanced if both runs have that.
+
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages; one without success is left out.
+    """
+    differences = {}
+    for condition in comparison.conditions:
+        by_metric = {d.metric: d for d in condition.differences}
+        metric = headline_metric(set(by_metric))
+        if metric in by_metric:
+            differences[condition.condition] = by_metric[metric]
+    return differences
+
+
+def key_figures(comparison: Comparison) -> list[dict[str, str]]:
+    """Return success in A and in B as key figures: texts at `what` and `value`.
+
+    They are of the condition in which A has the most, a named set of settings of the radio, of
+    asking helpers and of fusing their messages.
+    """
+    differences = of_success(comparison)
+    if not differences:
+        return []
+    best = max(differences, key=lambda name: differences[name].a)
+    d = differences[best]
+    row, what = line(d), f"{IN_WORDS[d.metric]} under {best}"
+    return [
+        {"what": f"A: {what}", "value": f"{row.a} %"},
+        {"what": f"B: {what}", "value": f"{row.b} %"},
+    ]
+
+
+def first_lost(comparison: Comparison) -> tuple[InCondition, DecisionFlip] | None:
+    """Return a decision by which one run alone lost an episode, and its condition.
+
+    It is B's, else A's, of the last condition that has one; None where none is known.
+    """
+    for run in ("B", "A"):
+        for condition in reversed(comparison.conditions):
+            for flip in condition.flips:
+                if flip.lost_by == run:
+                    return condition, flip
+    return None
+
+
+def lost_by(condition: InCondition, flip: DecisionFlip) -> str:
+    """Return sentences on a decision by which one run alone lost an episode, under a condition."""
+    chose = {"A": flip.a, "B": flip.b}
+    run, other = ("A", "B") if flip.lost_by == "A" else ("B", "A")
+    return (
+        f"Under {condition.condition}, {amount(len(condition.lost), 'episode')} that A clears "
+        f"{'is' if len(condition.lost) == 1 else 'are'} lost by B, and {len(condition.gained)} the "
+        f"other way. {run} lost episode {flip.episode} by {chose[run]}, where {other} chose "
+        f"{chose[other]}"
+    )
 
 
 def who(side: Side) -> str:
@@ -202,20 +246,15 @@ def paces(pair: Pair) -> list[str]:
     return sentences
 
 
-def caveats(pair: Pair) -> list[str]:
+def caveats(pair: Pair, kinds: Sequence[Kind] = FIRST) -> list[str]:
     """Return the warnings on two compared runs; one about a single run begins with `A` or `B`.
 
-    If a run might stop early, the differences of success with intervals that allow for it are
-    added.
+    `kinds` says which. If a run might stop early, the differences of success with intervals that
+    allow for it belong to the limits.
     """
-    warnings = of_runs({"A": pair.a.run, "B": pair.b.run}, *FIRST)
-    return [*(finding.sentence for finding in warnings), *_by_stopping_rule(pair)]
-
-
-def warnings(pair: Pair) -> list[str]:
-    """Return why a run is no result, and who decided; of one run it begins with `A` or `B`."""
-    findings_on_both = of_runs({"A": pair.a.run, "B": pair.b.run}, Kind.VOID, Kind.CAVEAT)
-    return [finding.sentence for finding in findings_on_both]
+    warnings = of_runs({"A": pair.a.run, "B": pair.b.run}, *kinds)
+    limits = _by_stopping_rule(pair) if Kind.LIMIT in kinds else ()
+    return [*(finding.sentence for finding in warnings), *limits]
 
 
 def _by_stopping_rule(pair: Pair) -> Iterator[str]:
