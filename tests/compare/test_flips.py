@@ -129,6 +129,8 @@ def test_the_text_that_changed_stands_beside_the_flips(
     assert "<ins> {+(%)+}</ins>" in page
     assert '<del> [-"%.2f"-]</del>' in page
     assert f"{both} IDLE → FASTER: B alone gave success away" in page
+    assert "An episode that B alone lost" in page
+    assert f"B lost episode {int(both.split('-')[0])} by FASTER, where A chose IDLE." in page
     assert page.index(both) < page.index(f"{other} FASTER → IDLE")
     links = re.findall(r'<a href="([^"]+)">([AB])', page)
     assert {name for href, name in links if f"scene={both}" in href} == {"A", "B"}
