@@ -1,6 +1,8 @@
 """Every study's figures in a browser: all texts lie in them, and a dark page has no white card."""
 
+import re
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,12 +11,14 @@ pytest.importorskip("playwright", reason="needs the dev extra")
 
 from evaluating import run as evaluate
 from evaluating import spec_of
+from former import DRIVE
 from opening import NARROW, WIDE, picture
 from PIL import Image
 from typer.testing import CliRunner
 
 from harness.cli import app
 from harness.coordination.named_points import named_point
+from harness.report.drawing import colours
 from harness.report.page import write_report
 from harness.report.runs import gather
 
@@ -24,6 +28,7 @@ OUTSIDE = """() => { const all = document.documentElement.getBoundingClientRect(
   return [...document.querySelectorAll("text")].filter((text) => { const box = text.getBoundingClientRect();
     return box.left < all.left - 1 || box.right > all.right + 1 || box.top < all.top - 1
       || box.bottom > all.bottom + 1; }).map((text) => text.textContent); }"""
+COLOUR = r"#[0-9a-f]{6}\b"
 DARK = 70  # of 255: the brightest that the corner of a figure on a dark page is
 
 
@@ -34,6 +39,13 @@ def studies(small, tmp_path_factory):
     run = folder / "proxy"
     evaluate(spec_of(small, points=[*map(named_point, CONDITIONS)], seeds=(0,)), run)
     every = [option for name in CONDITIONS for option in ("--condition", name)]
+    driven = folder / "driven"
+    layouts = ("--episodes", "4", "--first-seed", "100", "--seeds", "0", "--workers", "1")
+    drawn = {
+        "driven": [*DRIVE, *layouts, "--quiet", "--out", driven],
+        "radio": ["radio", "check", "mode4", "-n", "100", "--out", folder / "radio/radio.svg"],
+        "crowd": ["radio", "crowd", "mode4", "--out", folder / "crowd/crowd.svg"],
+    }
     commands = {
         "sweep": ["sweep", run, "--over", "loss", "--grid", "0,0.5", *every],
         "panels": ["sweep", run, *every],
@@ -47,21 +59,25 @@ def studies(small, tmp_path_factory):
         "paper": ["paper"],
     }  # fmt: skip
     for name, typed in commands.items():
-        done = CliRunner().invoke(
-            app, ["study", *map(str, typed), "--out", str(folder / name), "--quiet"]
-        )
-        assert done.exit_code == 0, (name, done.exception)
-    return {name: folder / name for name in commands}
+        drawn[name] = ["study", *typed, "--out", folder / name, "--quiet"]
+    drawn["fidelity"] = ["study", "fidelity", run, driven, "--out", folder / "fidelity"]
+    for name, typed in drawn.items():
+        (folder / name).mkdir(exist_ok=True)
+        done = CliRunner().invoke(app, [*map(str, typed)])
+        assert done.exit_code == 0, (name, done.output, done.exception)
+    return {name: folder / name for name in drawn if name != "driven"}
 
 
 @pytest.mark.exhaustive
-def test_every_text_of_every_studys_figures_lies_in_its_figure(browser, studies):
+def test_every_studys_figures_are_whole_and_in_the_reports_palette(browser, studies):
+    palette = set(re.findall(COLOUR, Path(colours.__file__).read_text().lower()))
     page = browser.new_page(viewport={"width": 2400, "height": 2400})
     drawn = [svg for folder in studies.values() for svg in sorted(folder.glob("*.svg"))]
     assert {svg.parent.name for svg in drawn} == studies.keys()
     for svg in drawn:
         page.goto(svg.as_uri())
         assert page.evaluate(OUTSIDE) == [], svg
+        assert set(re.findall(COLOUR, svg.read_text().lower())) <= palette, svg
     page.close()
 
 
@@ -87,6 +103,8 @@ def test_every_name_of_a_reports_legends_lies_in_its_chart(opened, small, tmp_pa
 def test_a_dark_page_has_no_white_figure(browser, studies):
     page = browser.new_page(viewport=WIDE, color_scheme="dark")
     for name, folder in studies.items():
+        if not (folder / "index.html").exists():
+            continue  # a radio's picture has no page
         page.goto((folder / "index.html").as_uri())
         for place, figure in enumerate(page.locator("figure img").all()):
             shown = np.asarray(Image.open(BytesIO(figure.screenshot())).convert("L"))

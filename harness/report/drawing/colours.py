@@ -48,6 +48,8 @@ _MORE = ("#5B5BD0", "#8094AC")
 _SLOW_TO_FAST = ("#E6D7AE", "#CBB176", "#AE8A42", "#866828", "#5F430F")
 # Of sources that a study draws along one axis; no page of a run has them.
 COLOURS = ("#0979AA", "#E67300", "#38948B", "#7033FF", "#A6683F", "#3D87F5", INK)
+# Of numbers in a table, from the least to the most.
+SHADES = (FAINT, CONDITIONS["v2x"])
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 
 

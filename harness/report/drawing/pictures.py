@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from harness.core.errors import unknown
 from harness.core.files import write_whole
-from harness.report.drawing.colours import INK
+from harness.report.drawing.colours import COLOURS, INK
 
 Format = Literal["svg", "pdf", "png"]
 FORMATS: tuple[Format, ...] = ("svg", "pdf", "png")
@@ -27,6 +27,7 @@ STYLE: dict[Any, Any] = {
     "font.size": 8.0,
     "axes.edgecolor": INK,
     "axes.labelcolor": INK,
+    "axes.prop_cycle": matplotlib.cycler(color=COLOURS),
     "xtick.color": INK,
     "ytick.color": INK,
     "pdf.fonttype": 42,  # text stays text, as journals ask

@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from harness.core.arrays import Floats
-from harness.report.drawing.colours import ON_DATA, WHITE
+from harness.report.drawing.colours import ON_DATA, SHADES, WHITE
 from harness.report.drawing.pictures import styled
 
 MOST_BESIDE = 3  # columns of panels that stand beside each other
@@ -35,13 +36,14 @@ def heat_map(
         0.7 + 0.08 * max(map(len, columns)) + (0.35 + 0.24 * len(rows)) * shape[0],
     )
     figure = Figure(figsize=size, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.06))
+    shades = LinearSegmentedColormap.from_list("shades", SHADES)
     low, high = (float(end(list(map(end, panels.values())))) for end in (np.nanmin, np.nanmax))
     for axes, (title, percent) in zip(
         figure.subplots(*shape, squeeze=False).flat, panels.items(), strict=True
     ):
         edges = beside or axes is figure.axes[-1], not beside or axes is figure.axes[0]
         axes.imshow(
-            percent, cmap="Blues", vmin=low - 0.1 * (high - low) - 1, vmax=high + 1, aspect="auto"
+            percent, cmap=shades, vmin=low - 0.1 * (high - low) - 1, vmax=high + 1, aspect="auto"
         )
         axes.set_title(title, fontsize=8)
         axes.set_xticks(
@@ -52,7 +54,7 @@ def heat_map(
         axes.tick_params(length=0)
         axes.spines[:].set_visible(False)
         for (i, j), value in np.ndenumerate(percent):
-            light = high > low and value > low + 0.55 * (high - low)
+            light = high > low and value > low + 0.8 * (high - low)
             ink = WHITE if light else ON_DATA
             axes.text(j, i, f"{value:.0f}", ha="center", va="center", fontsize=7, color=ink)
     return figure
