@@ -11,7 +11,7 @@ from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests/browser"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from opening import FLAGS, wait
 
 HERE = Path(__file__).parent

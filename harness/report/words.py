@@ -146,7 +146,7 @@ def figures(run: Run) -> list[dict[str, str]]:
     metric = headline_of(run)
     scores = {f"{IN_WORDS[metric]} under {best}": run.score(best, metric)}
     if base == BASELINE:
-        scores[f"gain over {base}"] = run.score(best, GAINS[metric])
+        scores[f"what messages add over {base}"] = run.score(best, GAINS[metric])
     if halves := entry(metric).halves:
         dangerous, harmless = halves
         scores["with a danger"] = run.score(best, dangerous)
