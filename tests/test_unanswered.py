@@ -18,7 +18,7 @@ from tiers import some
 
 from harness.core import resources, work
 from harness.core.errors import EXIT_CODES
-from harness.evaluate import servers
+from harness.evaluate import costs, servers
 from harness.evaluate.asking import FIRST, IN_A_ROW
 from harness.runs.unanswered import MOST_LOST, Tally
 
@@ -216,7 +216,12 @@ def test_the_same_command_asks_only_the_errors_and_makes_the_run_that_had_none(
     errors = refused(refuses, before)
     assert errors
     files = sorted((tmp_path / "run/.work").rglob("*.jsonl"))
-    kept = [row for file in files if file.name != servers.FILE for row in rows_in(file)]
+    kept = [
+        row
+        for file in files
+        if file.name not in (servers.FILE, costs.FILE)
+        for row in rows_in(file)
+    ]
     assert kept
     assert not [row for row in kept if row["error"]]
     served = [row["id"] for file in files if file.name == servers.FILE for row in rows_in(file)]

@@ -68,26 +68,29 @@ def metered(
         for guard in guards:
             backend = guard(card, backend)
         is_counted = card.price or card.server
-        models.append(Metered(backend, card.name, work) if is_counted and work else backend)
+        models.append(Metered(backend, card, work) if is_counted and work else backend)
     return models
 
 
 class Metered:
     """Wrap a backend, the code that runs a model, and count the tokens of its completions.
 
-    Counts are appended to a file in a working folder; all else is as in the backend.
+    Counts are appended to a file in a working folder; all else is as in the backend. Completions
+    without any count of tokens are counted only if the model's card has a price.
     """
 
-    def __init__(self, backend: Backend, model: str, work: Path) -> None:
-        self._backend, self._model, self._work = backend, model, work
+    def __init__(self, backend: Backend, card: Card, work: Path) -> None:
+        self._backend, self._card, self._work = backend, card, work
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         completions = self._backend.complete(requests)
-        with appending(self._work / FILE) as file:
-            file.write(msgspec.json.encode(Asked.of(self._model, completions)) + b"\n")
+        counts = Asked.of(self._card.name, completions)
+        if self._card.price or counts.uncounted < counts.asked:
+            with appending(self._work / FILE) as file:
+                file.write(msgspec.json.encode(counts) + b"\n")
         return completions
 
 
