@@ -20,6 +20,19 @@ from harness.runs.records import roles
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "commands.md"
+GROUPS = DOCS / "commands"  # a page for each group
+GROUP_HEAD = """\
+# harness {}
+
+Written by `python docs/reference.py`, as [all commands](../commands.md) are.
+"""
+TREE = """\
+```{{toctree}}
+:hidden:
+
+{}
+```
+"""
 NAMES_PAGE = DOCS / "names.md"
 HEAD = """\
 # Commands
@@ -50,7 +63,8 @@ HELP = r"(.*?)(?: \[?(?:[Dd]efault: )?((?<=efault: ).*?|(?<=\[)required)[.\]]?)?
 def pages() -> list[Path]:
     """The documents whose commands are run, in the order in which examples are looked for."""
     top = [DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md"]
-    return [*top, *sorted(page for page in DOCS.rglob("*.md") if page != PAGE)]
+    written = {PAGE, *GROUPS.glob("*.md")}
+    return [*top, *sorted(page for page in DOCS.rglob("*.md") if page not in written)]
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
@@ -122,9 +136,20 @@ def section(path: str, command: Any, example: str, common: dict[str, tuple[str, 
         shown = f"`{flag if flags.count(flag) == 1 else name}`"
         named.append(f"{shown} ({_plain(default)})" if default and len(defaults) > 1 else shown)
     if named:
-        own.append(f"- [shared](#shared-options): {', '.join(named)}")
+        own.append(f"- [shared]({to_shared(path)}): {', '.join(named)}")
     lines = [f"## {path}", "", command.help, "", "```text", usage, "```", "", *own, ""]
     return "\n".join([*lines, "```console", f"$ {example}", "```", ""])
+
+
+def group(path: str) -> str:
+    """The word of a command's group, such as `study`; none for a command by itself."""
+    _, word, *rest = path.split()
+    return word if rest else ""
+
+
+def to_shared(path: str) -> str:
+    """Where the shared options are, for a command's page."""
+    return "../commands.md#shared-options" if group(path) else "#shared-options"
 
 
 def shared_section(common: dict[str, tuple[str, set[str]]]) -> str:
@@ -144,12 +169,13 @@ def overview(found: list[tuple[str, Any]]) -> str:
         for path, command in found:
             if path.split()[1] in names:
                 purpose = _plain(re.split(r"\.\s", command.help)[0].rstrip("."))
-                lines.append(f"| [{path}](#{path.replace(' ', '-')}) | {purpose} |")
+                page = f"commands/{group(path)}.md" if group(path) else ""
+                lines.append(f"| [{path}]({page}#{path.replace(' ', '-')}) | {purpose} |")
     return "\n".join([*lines, ""])
 
 
-def reference() -> str:
-    """The page."""
+def reference() -> dict[Path, str]:
+    """The pages' texts by their files: the first has all commands in a table."""
     lines = [" ".join(line.partition(" #")[0].split()) for line in all_typed()]
     found = list(commands(get_command(app), "harness"))
     # A command without an example ends this here: the documents have to show each of them.
@@ -157,8 +183,17 @@ def reference() -> str:
         path: next(line for line in lines if f"{line} ".startswith(f"{path} ")) for path, _ in found
     }
     common = shared(found)
-    sections = (section(path, command, examples[path], common) for path, command in found)
-    return "\n".join([HEAD, overview(found), shared_section(common), *sections])
+    sections: dict[str, list[str]] = {}
+    for path, command in found:
+        text = section(path, command, examples[path], common)
+        sections.setdefault(group(path), []).append(text)
+    alone = sections.pop("")
+    tree = TREE.format("\n".join(f"commands/{word}" for word in sections))
+    pages = {PAGE: "\n".join([HEAD, overview(found), tree, shared_section(common), *alone])}
+    for word, texts in sections.items():
+        head = GROUP_HEAD.format(word)
+        pages[GROUPS / f"{word}.md"] = "\n".join([head, *texts])
+    return pages
 
 
 def names() -> str:
@@ -203,5 +238,7 @@ def _plain(text: str) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(reference())
+    GROUPS.mkdir(exist_ok=True)
+    for file, text in reference().items():
+        file.write_text(text)
     NAMES_PAGE.write_text(names())

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from reference import pages
 
 from harness.backends.base import AnswerMode
 from harness.backends.card import Failures
@@ -62,9 +63,9 @@ def test_the_overview_for_language_models_leads_to_pages_that_exist_under_their_
         assert (docs / page).read_text().startswith(f"# {title}\n"), page
 
 
-def test_the_overviews_gains_are_those_of_the_claims_page() -> None:
+def test_the_gains_of_the_six_families_are_those_of_the_claims_page() -> None:
     claims = (ROOT / "docs/claims.md").read_text().replace(" points [", " [")
-    results = (ROOT / "README.md").read_text().partition("## Results\n")[2]
+    results = (ROOT / "docs/scenarios.md").read_text().partition("## What models gain there\n")[2]
     block = results.partition("```\n")[2].partition("```")[0]
     gains = [
         found[2]
@@ -74,6 +75,35 @@ def test_the_overviews_gains_are_those_of_the_claims_page() -> None:
     assert len(gains) == 6
     for gain in gains:
         assert gain in claims, gain
+
+
+HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
+BLOCK = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+
+
+def headings(page: Path) -> set[str]:
+    """What a link behind # may name on a page, as GitHub and the site call its headings."""
+    texts = HEADING.findall(BLOCK.sub("", page.read_text()))
+    bare = [re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text).replace("`", "").lower() for text in texts]
+    return {re.sub(r"[^\w\- ]", "", text).replace(" ", "-") for text in bare}
+
+
+@pytest.mark.parametrize("page", [*pages(), ROOT / "CHANGELOG.md", ROOT / "SECURITY.md"], ids=str)
+def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", BLOCK.sub("", page.read_text())):
+        path, _, heading = link.partition("#")
+        if ":" in path:
+            continue
+        there = (page.parent / path).resolve() if path else page
+        assert there.exists(), link
+        assert not heading or heading in headings(there), link
+
+
+def test_the_front_door_is_short() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert len(readme.split()) <= 600
+    assert len(readme.splitlines()) <= 100
+    assert (ROOT / "docs/pictures/lost-episode.gif").stat().st_size <= 1e6
 
 
 def test_every_decision_stands_once_in_the_index() -> None:

@@ -17,7 +17,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from reference import NAMES_PAGE, PAGE, all_typed, blocks, commands, names, pages, reference, typed
+from reference import (
+    GROUPS,
+    NAMES_PAGE,
+    PAGE,
+    all_typed,
+    blocks,
+    commands,
+    names,
+    pages,
+    reference,
+    typed,
+)
 from tiers import some
 from typer import TyperException
 from typer.main import get_command
@@ -67,7 +78,6 @@ CUT = {
     "harness drive --model proxy --shard 1/2 --out reports/split/1": SHARD,
     "harness drive --model proxy --shard 2/2 --out reports/split/2": SHARD,
     "harness eval --model ./my-checkpoint": "--limit 1",  # by transformers, which is slow on a CPU
-    "harness eval --model ./my-checkpoint --prompt v2": "--limit 1",
     "harness eval --model my-model": "--limit 1",
     # of each of six families
     **{line: "--limit 1" for line in TYPED if "--dataset suite:" in line},
@@ -385,7 +395,8 @@ class Followed:
             pytest.fail("\n\n".join(told), pytrace=False)
 
 
-FOLLOWABLE = [page for page in pages() if blocks(page) and page != PAGE]
+WRITTEN = [PAGE, *sorted(GROUPS.glob("*.md"))]  # by the program
+FOLLOWABLE = [page for page in pages() if blocks(page)]
 
 
 @pytest.mark.exhaustive
@@ -475,7 +486,7 @@ def test_commands_that_measured_something_are_still_there(page: Path) -> None:
             hold_against_options(args)
 
 
-@pytest.mark.parametrize("page", [*pages(), PAGE, *MEASURED], ids=name)
+@pytest.mark.parametrize("page", [*pages(), *WRITTEN, *MEASURED], ids=name)
 def test_commands_named_in_a_sentence_are_taken_and_parts_of_them_exist(page: Path) -> None:
     prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     for mention in re.findall(r"`harness\s+([a-z][^`]*)`", prose):
@@ -521,9 +532,11 @@ def test_what_the_program_refuses_is_no_command(said: str) -> None:
 
 
 def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> None:
-    assert PAGE.read_text() == reference(), "run `python docs/reference.py`"
-    elsewhere = {line for page in pages() if page != PAGE for line in lines_of(page)}
-    assert set(lines_of(PAGE)) <= elsewhere
+    texts = reference()
+    assert {page: page.read_text() for page in WRITTEN} == texts, "run `python docs/reference.py`"
+    elsewhere = {line for page in pages() for line in lines_of(page)}
+    for page in WRITTEN:
+        assert set(lines_of(page)) <= elsewhere
 
 
 def test_the_page_of_names_is_the_programs() -> None:
