@@ -148,7 +148,7 @@ def test_spellings_of_0_2_work_with_a_warning(small: Dataset) -> None:
     from harness.world.world import World
 
     graph = next(iter(small.scenes(small.forest.ids[:1])[0].graphs.values()))
-    with pytest.warns(FutureWarning, match=r"\['self'\] is now \.itself; it works until 0\.4\.0"):
+    with pytest.warns(FutureWarning, match=r"\['self'\] is now \.itself; it works until 0\.5\.0"):
         assert graph["self"] is graph.itself
     for name in ("braking", "__class__", "plain"):
         with pytest.raises(KeyError):
