@@ -11,10 +11,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from harness.backends import cards
-from harness.backends.card import Failures, Latency
+from harness.backends.answered_prompts import prompt_for
+from harness.backends.card import Card, Failures, Latency
 from harness.backends.registry import capabilities
 from harness.backends.servers import Server
 from harness.core import resources
+from harness.core.config import convert
 from harness.core.errors import UserError
 
 SERVED = """\
@@ -287,6 +289,23 @@ def test_an_engine_that_a_model_has_not_is_one_line(
         cards.resolve(text, engine)
     for part in said:
         assert part in str(caught.value)
+
+
+SEEN = '[[prompts]]\nversion = "v10"\nread = 24\nasked = 24\n[[prompts]]\nversion = "v2"\nread = 1\nasked = 24\n'
+
+
+def test_a_card_names_the_prompts_that_its_model_was_seen_to_answer(shelf: Path) -> None:
+    """The scenario's where the card has it, else the card's first."""
+    write_card(shelf, TWO_ENGINES + SEEN)
+    card = cards.load("mine")
+    assert [prompt_for(usual, card.prompts) for usual in ("v2", "v4")] == ["v2", "v10"]
+    assert prompt_for("v2", ()) == "v2"
+    record = card.record()
+    assert record["prompts"][0] == {"version": "v10", "read": 24, "asked": 24}
+    assert convert(record, Card, "the record") == card
+    write_card(shelf, TWO_ENGINES + SEEN.replace("read = 24", "read = 25"))
+    with pytest.raises(UserError, match="read 25 of 24 asked; give as many at most"):
+        cards.load("mine")
 
 
 TWO_ENGINES = """\

@@ -122,6 +122,12 @@ def test_answers_that_cannot_be_read_ask_for_another_prompt(
     assert code == 0
     assert "None of the ego's 34 answers could be read" in out
     assert out.splitlines()[-1] == "next: harness prompt check v2 --model proxy-broken"
+    broken = Path("models/proxy-broken.toml")
+    broken.write_text(f"{broken.read_text()}[[prompts]]\nversion = 'v10'\nread = 24\nasked = 24\n")
+    for typed, taken in (((), "v10"), (("--prompt", "v4"), "v4")):
+        code, out, _ = harness(*command, *typed, "--out", taken)
+        assert (code, out.startswith(f"proxy-broken · prompt {taken} ")) == (0, True)
+    assert out.splitlines()[-1] == "next: harness eval --model proxy-broken --prompt v10"
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from harness.coordination.named_points import POINTS
+from harness.core.at_once import at_once_of
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate import resolve
@@ -42,6 +43,7 @@ TEXTS = st.text(
 VALUES: dict[str, st.SearchStrategy[Any]] = {
     str(str): TEXTS, str(int): st.integers(0, 99), str(float): st.floats(0, 2), str(bool): st.booleans(),
     str(list[str]): st.lists(TEXTS, min_size=1, max_size=3).map(tuple),
+    str(at_once_of): st.integers(1, 99) | st.just("auto"),
 }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
+from harness.backends.answered_prompts import Readable
 from harness.backends.base import Letters
 from harness.backends.price import Price
 from harness.backends.registry import ENGINES
@@ -139,8 +140,8 @@ class Card:
     for at most `thinking_tokens`. `vision` says how it takes pictures, by the file `projector`;
     `adapter` is the folder of a LoRA adapter. `system` says where the system text goes, `letters`
     whether an answer by the probabilities of one letter an action is averaged over orders of the
-    actions. `server`, `failures` and `price` are tables for the engines that have them; None is
-    none, or unknown.
+    actions, and `prompts` which prompts the model was seen to answer. `server`, `failures` and
+    `price` are tables for the engines that have them; None is none, or unknown.
     """
 
     # what is typed after `--model` to get it: the name of its file without `.toml`, that with
@@ -188,6 +189,9 @@ class Card:
     # read-out over their orders, unless `--letters` says otherwise.
     letters: Letters | None = None
     price: Price | None = None  # what its tokens cost; None if it costs nothing, or nobody says
+    # prompts that it was seen to answer, as `harness prompt check` counted; the first is taken
+    # where none is typed and the scenario's is not among them
+    prompts: tuple[Readable, ...] = ()
 
     @property
     def slow_s(self) -> float:
@@ -220,8 +224,8 @@ class Card:
         """
         record = asdict(self)
         del record["letters"]  # the agent's settings say how its letters are read
-        for name in ("adapter", "price"):
-            if record[name] is None:
+        for name in ("adapter", "price", "prompts"):
+            if not record[name]:
                 del record[name]
         if self.server:
             server = {key: value for key, value in record["server"].items() if value is not None}

@@ -57,9 +57,10 @@ def after_run(run: "Run") -> None:
     model, prompt = manifest.model["name"], manifest.prompt["version"]
     failed = run.score(ALL, FAILED)
     if failed and (failed.value or 0.0) >= UNREAD:
-        readable = [name for name in manifest.model.get("prompts") or () if name != prompt]
-        if readable:
-            echo_next("eval", "--model", model, "--prompt", readable[0])
+        versions = [str(each["version"]) for each in manifest.model.get("prompts", ())]
+        others = [version for version in versions if version != prompt]
+        if others:
+            echo_next("eval", "--model", model, "--prompt", others[0])
         else:
             echo_next("prompt", "check", prompt, "--model", model)
         return

@@ -86,7 +86,9 @@ def _say_unread(card: Card, prompt: str) -> None:
     """Say on stderr that none of the first answers could be read,
     and which prompt to try instead.
     """
-    other = WITH_EXAMPLES if prompt != WITH_EXAMPLES else "VERSION"
+    versions = [*(each.version for each in card.prompts), WITH_EXAMPLES]
+    readable = [version for version in versions if version != prompt]
+    other = readable[0] if readable else "VERSION"
     command = shlex.join(["harness", "prompt", "check", other, "--model", cards.argument(card)])
     print(
         f"harness: none of the first answers of {printable(card.name)} to prompt {prompt} could "

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from harness.backends import cards
+from harness.backends.answered_prompts import prompt_for
 from harness.backends.base import BARE
 from harness.backends.card import Card
 from harness.coordination.counterparts import counterparts
@@ -120,7 +121,7 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     not exist or do not fit.
     """
     card = _card(settings)
-    prompt = versions.load(settings.prompt or scenario.prompt)
+    prompt = versions.load(settings.prompt or prompt_for(scenario.prompt, card.prompts))
     # Agent checks the modes.
     how = (
         settings.answer,

@@ -71,6 +71,7 @@ def test_a_format_that_fails_is_one_line(proxy_run: Path, monkeypatch: pytest.Mo
         "junit": None,
         "dataset": None,
         "as_csv": False,
+        "schema": None,
     }
     with pytest.raises(
         UserError, match=r"^format --names-of fails \(IndexError: list index out of range at "
@@ -89,6 +90,7 @@ def test_a_format_that_writes_nothing_is_one_line(
         "junit": None,
         "dataset": None,
         "as_csv": False,
+        "schema": None,
     }
     with pytest.raises(
         UserError, match=r"^format --names-of fails \(ValueError: it wrote no file at "
@@ -121,7 +123,9 @@ def test_a_format_whose_words_are_none_is_one_line(
 @pytest.mark.usefixtures("names")
 def test_a_format_gets_what_was_typed_of_its_options(proxy_run: Path, tmp_path: Path) -> None:
     file = tmp_path / "names"
-    usual: dict[str, Any] = {"as_jsonl": False, "out": None, "junit": None, "dataset": None}
+    usual: dict[str, Any] = {
+        "as_jsonl": False, "out": None, "junit": None, "schema": None, "dataset": None,
+    }  # fmt: skip
 
     def written(most: float | None, all: bool) -> int:
         export.command(run=proxy_run, names_of=file, most=most, all=all, as_csv=False, **usual)

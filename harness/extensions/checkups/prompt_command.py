@@ -125,6 +125,11 @@ def _show_trial(trial: "Trial", findings: "Findings | str | None") -> None:
         for sentence in role.sentences():
             typer.echo(f"        {sentence}")
         typer.echo(f"        such as {printable(role.sample, 70)}")
+    readable, of = sum(role.readable for role in trial.roles), n * len(trial.roles)
+    typer.echo(
+        f'its card may say: prompts = [{{ version = "{trial.prompt}", read = {readable}, '
+        f"asked = {of} }}]"
+    )
     _show_moved("pairs", trial.pairs)
     if any(pair.n for pair in trial.pairs) and not any(pair.read for pair in trial.pairs):
         typer.echo("        the ego's answer ignores what differs between the scenes")

@@ -31,6 +31,7 @@ ORDER = (
     "model",
     "prompt",
     "answer",
+    "answers",
     "thinking",
     "image",
     "letters",

@@ -362,7 +362,7 @@ def test_trl_prefers_by_the_file_as_it_is(run: Path, harness: Harness, tmp_path:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ((), "--junit, --every-eval, --inspect, --sft, --dpo: give exactly one of them"),
+        ((), "--junit, --schema, --every-eval, --inspect, --sft, --dpo: give exactly one of them"),
         (
             ("--junit", "a.xml", "--report-seeds-too"),
             "--report-seeds-too only goes with --sft and --dpo; give one, or leave it out",
