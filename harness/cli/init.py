@@ -1,5 +1,6 @@
 """`harness init`: a project of one's own."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import typer
@@ -49,7 +50,7 @@ def command(
         raise UserError(
             f"{printable(folder)} cannot be made ({reason}); give another folder"
         ) from None
-    typer.echo(
-        f"made {printable(folder)}; next: cd there, `harness eval --model swarm-tiny --prompt "
-        "mine`; README.md says more"
-    )
+    command = "harness eval --model swarm-tiny --prompt mine"
+    if find_spec("llama_cpp") is None:  # the engine of that model
+        command = "harness eval settings.toml"
+    typer.echo(f"made {printable(folder)}; next: cd there, `{command}`; README.md says more")
