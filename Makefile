@@ -66,6 +66,7 @@ check: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python readable.py
+	$(BIN)/codespell
 
 docs: .venv/docs ## the documentation as a site: build/docs/index.html
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --nitpicky docs build/docs
