@@ -1,10 +1,11 @@
-"""Writes docs/commands.md and docs/names.md out of the program: `python docs/reference.py`.
-A test holds the pages to it.
+"""Writes pages out of the program, commands.md, commands/*.md and names.md, and model-cards.md out
+of docs/cards: `python docs/reference.py`. Tests hold the pages to it.
 
 Examples are not written here: each is a command of another page, which the tests run.
 """
 
 import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,37 @@ runs](comparing.md) how metrics are compared.
 METRICS_HEAD = """\
 Names are those of `summary.csv`. Metrics of answers have one for each role: {}. *Only* names the kind of run that has a
 metric: frozen (`harness eval`) or closed-loop (`harness drive`).
+"""  # noqa: E501
+CARDS = DOCS / "cards"
+CARDS_PAGE = DOCS / "model-cards.md"
+CARDS_HEAD = """\
+# Cards to copy
+
+Written by `python docs/reference.py` out of the cards in `docs/cards/`. Nobody has run these models in this project, so they are
+no models of the harness yet. Names, licences, sizes and times are what others published: the comment of each card says who.
+
+Copy a card to `models/` in the folder of your project, which `harness init` makes. Then its name is a [model](models.md)
+like any other, and a run made while the card still shipped runs again with it. Where pip put the cards, the error
+line of `harness model check qwen3-8b` says.
+"""  # noqa: E501
+TEXTS_HEAD = """\
+## Models that read texts
+
+`context_tokens` may be less than a model reads. Gemma 4, Ministral 3 and Qwen3.5 also take pictures, which these cards do not
+send.
+"""  # noqa: E501
+SEE_HEAD = """\
+## Models that see
+
+`[vision]` has the size of a model's pictures, and what their tokens are counted by. On llama.cpp the projector is a file
+beside the weights. They answer [image prompts](prompts.md#image-prompts). The hub was not asked about them.
+"""  # noqa: E501
+DECIDE_HEAD = """\
+## Decision models
+
+They answer with [`--answer decision`](models.md#decision-models), by a server at port 8080 with `POST /v1/systemone`: start it as
+the card's comment says, and mend what differs. A `cited` time counts with
+[`--latency card`](latency.md#where-inference-times-come-from). Clef and d1 also take pictures, which these cards do not send.
 """  # noqa: E501
 # meaning and default
 HELP = r"(.*?)(?: \[?(?:[Dd]efault: )?((?<=efault: ).*?|(?<=\[)required)[.\]]?)?"
@@ -219,6 +251,22 @@ def names() -> str:
     return "\n".join([NAMES_HEAD, *("\n".join(section) for section in sections)])
 
 
+def cards() -> str:
+    """The page of the cards to copy, each with what its file says of it and who published that."""
+    rows: dict[str, list[tuple[str, ...]]] = {TEXTS_HEAD: [], SEE_HEAD: [], DECIDE_HEAD: []}
+    for file in sorted(CARDS.glob("*.toml")):
+        text = file.read_text()
+        card = tomllib.loads(text)
+        decides = card["engine"] == "systemone"
+        head = DECIDE_HEAD if decides else SEE_HEAD if "vision" in card else TEXTS_HEAD
+        comment = _plain(" ".join(re.findall(r"^# (\w.*)", text, re.MULTILINE)))
+        link = f"[{file.stem}](cards/{file.name})"
+        rows[head].append((link, _plain(card["description"]), card["licence"], comment))
+    columns = ("card", "what it is", "licence", "who says so")
+    sections = (f"{head}\n{_table([columns, *each])}" for head, each in rows.items())
+    return "\n".join([CARDS_HEAD, *sections])
+
+
 def _table(rows: list[tuple[str, ...]]) -> str:
     """Rows as a table of Markdown, of which the first is its head."""
     rule = ("---",) * len(rows[0])
@@ -242,3 +290,4 @@ if __name__ == "__main__":
     for file, text in reference().items():
         file.write_text(text)
     NAMES_PAGE.write_text(names())
+    CARDS_PAGE.write_text(cards())

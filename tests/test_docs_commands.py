@@ -18,11 +18,13 @@ from typing import Any
 
 import pytest
 from reference import (
+    CARDS_PAGE,
     GROUPS,
     NAMES_PAGE,
     PAGE,
     all_typed,
     blocks,
+    cards,
     commands,
     names,
     pages,
@@ -539,8 +541,9 @@ def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> Non
         assert set(lines_of(page)) <= elsewhere
 
 
-def test_the_page_of_names_is_the_programs() -> None:
-    assert NAMES_PAGE.read_text() == names(), "run `python docs/reference.py`"
+@pytest.mark.parametrize(("page", "written"), [(NAMES_PAGE, names), (CARDS_PAGE, cards)])
+def test_a_page_out_of_the_program_is_the_programs(page: Path, written: Callable[[], str]) -> None:
+    assert page.read_text() == written(), "run `python docs/reference.py`"
 
 
 def test_console_is_the_one_form_of_a_shell_block() -> None:

@@ -84,9 +84,9 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(
     lacks = {m["name"]: m["missing"] for m in json.loads(harness("model", "list", "--json"))}
     assert (lacks["proxy"], lacks["qwen3-4b"]) == (None, "torch")
     lost = typed("eval", "--model", "qwen3-8b")
-    [page] = re.findall(r"copy its card from (\S+) to models/qwen3-8b\.toml", lost.stderr)
-    assert (lost.returncode, Path(page).is_relative_to(site)) == (2, True)
-    assert Path(page).read_bytes() == (ROOT / "docs/model-cards.md").read_bytes()
+    [card] = re.findall(r"copy its card (\S+) to models/qwen3-8b\.toml", lost.stderr)
+    assert (lost.returncode, Path(card).is_relative_to(site)) == (2, True)
+    assert Path(card).read_bytes() == (ROOT / "docs/cards/qwen3-8b.toml").read_bytes()
 
     told = json.loads(harness("eval", "--model", "proxy", "--limit", "2", "--json"))
     assert str(site) in told["manifest"]["world"]["path"]

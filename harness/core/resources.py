@@ -7,13 +7,11 @@ what extensions keep so.
 """
 
 import os
-import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeVar
 
 from harness.core.errors import UserError, printable, sayable
-from harness.core.files import text_of
 
 T = TypeVar("T")
 DATASET = "occluded-intersection-v3"  # taken if none is named
@@ -91,14 +89,14 @@ def card_to_copy(model: str) -> str | None:
     A model card is a TOML file that describes a model. `model` is what was typed, a name with
     options behind `:`.
     """
-    page = root() / "docs" / "model-cards.md"
     name, _, _ = model.partition(":")
-    file = f"models/{name}.toml"
-    if file not in re.findall("^### `(.+)`$", text_of(page), re.MULTILINE):
+    cards = {path.stem: path for path in (root() / "docs" / "cards").glob("*.toml")}
+    if name not in cards:
         return None
     return (
-        f"model {name!r} no longer ships; copy its card from {printable(page, 1000)} to {file} in "
-        "your project's folder, which `harness init` makes, and it runs again"
+        f"model {name!r} no longer ships; copy its card {printable(cards[name], 1000)} to "
+        f"models/{name}.toml in your project's folder, which `harness init` makes, and it runs "
+        "again"
     )
 
 

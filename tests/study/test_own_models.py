@@ -205,7 +205,7 @@ def test_a_run_of_a_model_that_no_longer_ships_is_read_and_runs_again_with_its_c
     for asks in (STUDY, again):
         code, _, err = harness(*asks)
         assert (code, err.count("\n"), run.asked) == (2, 1, [])
-        assert "model 'qwen3-8b' no longer ships; copy its card from " in err
+        assert "model 'qwen3-8b' no longer ships; copy its card " in err
     card.rename("models/qwen3-8b.toml")
     for asks in (STUDY, again):
         assert harness(*asks)[0] == 0
