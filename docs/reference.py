@@ -1,9 +1,10 @@
-"""Writes pages out of the program, commands.md, commands/*.md and names.md, and model-cards.md out
-of docs/cards: `python docs/reference.py`. Tests hold the pages to it.
+"""Writes pages out of the program, commands.md, commands/*.md, names.md and fields.md, and
+model-cards.md out of docs/cards: `python docs/reference.py`. Tests hold the pages to it.
 
 Examples are not written here: each is a command of another page, which the tests run.
 """
 
+import inspect
 import re
 import tomllib
 from collections.abc import Iterator
@@ -15,9 +16,15 @@ from typer.main import get_command
 
 from harness.cli import app
 from harness.cli.commands import panels
+from harness.cli.terminal import attributes
+from harness.core import extensions
 from harness.parsing.parse import Repair, Status
+from harness.runs import decisions, formats, records
+from harness.runs.difficulty import Layout
 from harness.runs.metrics import METRICS
 from harness.runs.records import roles
+from harness.runs.timers import TIMERS
+from harness.world.outcome import End
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "commands.md"
@@ -57,6 +64,65 @@ METRICS_HEAD = """\
 Names are those of `summary.csv`. Metrics of answers have one for each role: {}. *Only* names the kind of run that has a
 metric: frozen (`harness eval`) or closed-loop (`harness drive`).
 """  # noqa: E501
+FIELDS_PAGE = DOCS / "fields.md"
+FIELDS_HEAD = """\
+# Fields of a run's files
+
+Written by `python docs/reference.py` out of the records by which the program reads these files. [File formats](files.md) says
+what each file is for, the [glossary](glossary.md) what the terms mean. Times end in `_s` or `_ms`, distances in `_m`; a share is 0
+to 1. *None* and *unknown* are `null` in JSON and Parquet and an empty cell in CSV, *unset* is no key; *frozen* and *closed loop*
+name the kind of run that has a value. `ACTION` stands for each meta-action, `N` for the helpers' places, from 1.
+"""  # noqa: E501
+RUN_HEAD = """\
+## run.json
+
+On other pages: [how a model is asked](answers.md#four-answer-modes), what a server
+[states](servers.md#other-weights-under-the-same-name) of itself, [prices](models.md#a-card-of-your-own),
+[device profiles](latency.md#devices).
+"""  # noqa: E501
+SUMMARY_HEAD = """\
+## summary.csv and `run.summary`
+
+What each metric means: [Names](names.md#metrics).
+"""
+DIFFICULTY_HEAD = """\
+## difficulty.csv
+
+The `adjusted_` rows of `summary.csv` follow from it:
+[Adjusted for difficulty](comparing.md#adjusted-for-difficulty).
+"""
+EPISODES_HEAD = """\
+## episodes.csv and `run.episodes`
+
+On other pages: [outcomes](success.md#outcomes),
+[conflicts in time](success-details.md#conflicts-in-time).
+"""
+JOURNEYS_HEAD = """\
+### `run.agents`
+
+A row for each agent of an episode, with its `condition`, `seed` and `episode`, where [several vehicles decide](agents.md).
+`gave_way` says whether it lost the most time.
+"""  # noqa: E501
+DECISIONS_HEAD = """\
+## decisions.parquet and `run.decisions`
+
+In closed loop several episodes may share a decision point. Only where something fills them are
+there {}
+and columns of energy.
+"""
+ANSWERS_HEAD = """\
+## answers.jsonl and `run.answers`
+
+A line is an answer of the ego, a helper, one that is shown nothing (`blind`), or to a fusion call (`merge`), one for each set of
+messages that any condition and seed delivers. The table has `intent_ACTION` in place of `intent`, `v2+v4` in `heard`, `risk`,
+`evidence`, `recommended_maneuver` and `confidence` in place of `message`, and `turns`, `first_status` and `first_raw` in place of
+`first`. It adds `episode`, `step` and `danger`, and where several vehicles decide `decider`.
+"""  # noqa: E501
+ATTRIBUTION_HEAD = """\
+## attribution.json
+
+What `harness study attribute` [left out](stability.md#attribution).
+"""
 CARDS = DOCS / "cards"
 CARDS_PAGE = DOCS / "model-cards.md"
 CARDS_HEAD = """\
@@ -88,6 +154,8 @@ They answer with [`--answer decision`](models.md#decision-models), by a server a
 the card's comment says, and mend what differs. A `cited` time counts with
 [`--latency card`](latency.md#where-inference-times-come-from). Clef and d1 also take pictures, which these cards do not send.
 """  # noqa: E501
+TABLE = r"^ *{}\b[^\n]* = {{\n(.*?)^ *}}$"  # in code, to its closing brace
+ENTRY = r'((?:^ +# .*\n)*)^ +"(\w+)": [^#\n]+(?:  # (.*))?$'
 # meaning and default
 HELP = r"(.*?)(?: \[?(?:[Dd]efault: )?((?<=efault: ).*?|(?<=\[)required)[.\]]?)?"
 
@@ -251,6 +319,91 @@ def names() -> str:
     return "\n".join([NAMES_HEAD, *("\n".join(section) for section in sections)])
 
 
+def fields() -> str:
+    """The page of what the keys and columns of a run's files mean, by the comments beside them."""
+    from harness.extensions.studies.attribution.record import Attribution, LeftOut
+
+    optional = ", ".join(f"`{name}`" for name in decisions.OPTIONAL)
+    sections = {
+        RUN_HEAD: run_keys(),
+        "### `world` of a frozen run\n": meanings(records.FrozenScenes),
+        "### `world` of a closed-loop run\n": meanings(records.ClosedLoop),
+        "### An entry of `channels`\n": meanings(records.ChannelRecord),
+        "### `latency`\n": meanings(records.Latency),
+        "### An entry of `answer_times`\n": meanings(records.Times),
+        "### An entry of `cost`\n": meanings(records.Cost),
+        SUMMARY_HEAD: meanings(records.Variant, records.Score),
+        DIFFICULTY_HEAD: meanings(Layout),
+        EPISODES_HEAD: meanings(records.Variant, records.Episode),
+        JOURNEYS_HEAD: meanings(End),
+        DECISIONS_HEAD.format(optional): decision_columns(),
+        ANSWERS_HEAD: meanings(records.Answer),
+        "### `first`\n": meanings(records.FirstTurn),
+        ATTRIBUTION_HEAD: meanings(Attribution),
+        "### An entry of `left_out`\n": meanings(LeftOut),
+    }
+    texts = [FIELDS_HEAD]
+    for head, each in sections.items():
+        rows = [(f"`{name}`", _plain(meaning.rstrip("."))) for name, meaning in each.items()]
+        texts.append(f"{head}\n{_table([('name', 'meaning'), *rows])}")
+    return "\n".join(texts)
+
+
+def meanings(*kinds: type) -> dict[str, str]:
+    """What the fields of records mean, by the names that files have for them; a field without a
+    comment ends this here.
+    """
+    found: dict[str, str] = {}
+    for kind in kinds:
+        comments = attributes(kind)
+        tag = kind.__struct_config__.tag
+        if tag:
+            found[kind.__struct_config__.tag_field] = f"`{tag}`"
+        for name, in_file in zip(
+            kind.__struct_fields__, kind.__struct_encode_fields__, strict=True
+        ):
+            found[in_file] = comments[name]
+    return found
+
+
+def run_keys() -> dict[str, str]:
+    """What the keys of run.json mean; what settings of extensions opened stands among them."""
+    found = meanings(records.Manifest)
+    del found["beside"]
+    settings = extensions.beside()
+    for name in formats.BESIDE.values():
+        _, *behind = extensions.in_order([name])
+        for each in behind:
+            purpose = re.split(r"\.\s", settings[each].help)[0]
+            found[each] = f"what the setting of this name names: {purpose}"
+    return found
+
+
+def decision_columns() -> dict[str, str]:
+    """What the columns of a table of decisions mean, those that timers add with them."""
+    comments = attributes(records.Decision) | entry_comments(decisions, "COLUMNS")
+    found = {name: comments[name] for name in decisions.COLUMNS}
+    for timer in TIMERS.values():
+        added = entry_comments(type(timer), "adds")
+        found |= {name: added[name] for name in timer.adds}
+    of_actions = entry_comments(decisions, "OF_ACTIONS")
+    found |= {f"{name}_ACTION": of_actions[name] for name in decisions.OF_ACTIONS}
+    of_messages = attributes(records.Message) | entry_comments(decisions, "OF_MESSAGES")
+    return found | {f"{name}_N": of_messages[name] for name in decisions.OF_MESSAGES}
+
+
+def entry_comments(source: Any, table: str) -> dict[str, str]:
+    """The comments beside or above the entries of a table in a module or a class, by their keys."""
+    text = inspect.getsource(source)
+    entries = re.search(TABLE.format(table), text, re.MULTILINE | re.DOTALL)[1]
+    found = re.findall(ENTRY, entries, re.MULTILINE)
+    return {
+        name: beside or " ".join(above.replace("#", " ").split())
+        for above, name, beside in found
+        if above or beside
+    }
+
+
 def cards() -> str:
     """The page of the cards to copy, each with what its file says of it and who published that."""
     rows: dict[str, list[tuple[str, ...]]] = {TEXTS_HEAD: [], SEE_HEAD: [], DECIDE_HEAD: []}
@@ -290,4 +443,5 @@ if __name__ == "__main__":
     for file, text in reference().items():
         file.write_text(text)
     NAMES_PAGE.write_text(names())
+    FIELDS_PAGE.write_text(fields())
     CARDS_PAGE.write_text(cards())

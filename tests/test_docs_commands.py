@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from reference import (
     CARDS_PAGE,
+    FIELDS_PAGE,
     GROUPS,
     NAMES_PAGE,
     PAGE,
@@ -26,6 +27,7 @@ from reference import (
     blocks,
     cards,
     commands,
+    fields,
     names,
     pages,
     reference,
@@ -541,7 +543,9 @@ def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> Non
         assert set(lines_of(page)) <= elsewhere
 
 
-@pytest.mark.parametrize(("page", "written"), [(NAMES_PAGE, names), (CARDS_PAGE, cards)])
+@pytest.mark.parametrize(
+    ("page", "written"), [(NAMES_PAGE, names), (FIELDS_PAGE, fields), (CARDS_PAGE, cards)], ids=str
+)
 def test_a_page_out_of_the_program_is_the_programs(page: Path, written: Callable[[], str]) -> None:
     assert page.read_text() == written(), "run `python docs/reference.py`"
 

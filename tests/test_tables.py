@@ -118,7 +118,7 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 
 @pytest.mark.parametrize("kind", ["frozen", "live"])
 def test_every_column_and_key_is_documented(kind: str, request: pytest.FixtureRequest) -> None:
-    text = (ROOT / "docs/files.md").read_text()
+    text = (ROOT / "docs/fields.md").read_text()
     made = harness.load(request.getfixturevalue(kind))
     assert isinstance(made.config, dict)
     for name in (*made.summary, *made.episodes, *made.decisions, *made.answers, *made.config):

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 LABEL = pa.dictionary(pa.int32(), pa.string())
 WHOLE, FLAG, NUMBER = pa.int64(), pa.bool_(), pa.float64()
-# Unknown is null in the file and NaN in arrays; docs/files.md has the meaning of each column.
-# What times answers may add some (`timers.added_columns`).
+# Unknown is null in the file and NaN in arrays. A column without a comment means what the field of
+# `records.Decision` does. What times answers may add some (`timers.added_columns`).
 COLUMNS = {
     "scene": LABEL,
     "episode": WHOLE,
@@ -37,23 +37,23 @@ COLUMNS = {
     "condition": LABEL,
     "seed": WHOLE,
     "action": LABEL,
-    "messages": WHOLE,
-    "requests": WHOLE,
-    "request_bits": NUMBER,
-    "reply_bits": NUMBER,
-    "airtime_ms": NUMBER,
-    "busy_ratio": NUMBER,
+    "messages": WHOLE,  # number of replies that were scheduled
+    "requests": WHOLE,  # requests broadcast; 0 if nobody was asked
+    "request_bits": NUMBER,  # size of the requests
+    "reply_bits": NUMBER,  # size of the scheduled replies
+    "airtime_ms": NUMBER,  # time on air of both; unknown where the channel model does not know it
+    "busy_ratio": NUMBER,  # share of time that the channel is busy, where its model knows that
     "own_failed": FLAG,
     "triggered": FLAG,
     "entropy_nats": NUMBER,
-    "normalised_entropy": NUMBER,
+    "normalised_entropy": NUMBER,  # the same as a share of the most there can be
     "own_weight": NUMBER,
     "latency_ms": NUMBER,
     "deadline_missed": FLAG,
     "fusion_ms": NUMBER,
-    "fusion_failed": FLAG,
-    "effective_loss": NUMBER,
-    "observed_loss": NUMBER,
+    "fusion_failed": FLAG,  # whether the fusion call's answer could not be parsed
+    "effective_loss": NUMBER,  # probability that one transmission is lost
+    "observed_loss": NUMBER,  # share of scheduled replies that did not arrive
     "value": FLAG,
     "safe": FLAG,
     "regret": FLAG,
@@ -61,14 +61,15 @@ COLUMNS = {
     "off_lag": FLAG,
     "acts_at_s": NUMBER,
     "acted": FLAG,
+    # whether it made harm inevitable, which was not before; frozen only, like the next
     "miss": FLAG,
-    "false_alarm": FLAG,
-    "ttc_s": NUMBER,
-    "pet_s": NUMBER,
-    "short_ttc": FLAG,
-    "short_pet": FLAG,
+    "false_alarm": FLAG,  # whether it gave success away, and harm could still be avoided
+    "ttc_s": NUMBER,  # least time to collision until the next decision begins
+    "pet_s": NUMBER,  # least post-encroachment time until then
+    "short_ttc": FLAG,  # whether the time to collision was below 1.5 s
+    "short_pet": FLAG,  # whether the post-encroachment time was below 1.5 s
     "agent": LABEL,
-    "broke_word": FLAG,
+    "broke_word": FLAG,  # whether the vehicle did otherwise than the plan that it sent
 }
 # A file has no such column, and none that was added, if all its values are unknown.
 OPTIONAL = (
@@ -84,10 +85,15 @@ OPTIONAL = (
 )
 NEVER_UNKNOWN = ("scene", "episode", "step", "condition", "seed", "action")
 # One column for each action: the policy, and the outcome of the action.
-OF_ACTIONS = {"fused": NUMBER, "safe": FLAG, "delay_s": NUMBER}
-# One column for each message, numbered from 1: the helper asked, and what became of its reply.
+OF_ACTIONS = {
+    "fused": NUMBER,  # the policy: the action's probability after fusion
+    "safe": FLAG,  # whether success would still be possible after the action; frozen only
+    "delay_s": NUMBER,  # by how much the action would put off the earliest success; frozen only
+}
+# One column for each message, numbered from 1: the helper asked, and what became of its reply, as
+# `records.Message` has it.
 OF_MESSAGES = {
-    "helper": LABEL,
+    "helper": LABEL,  # the helper that was asked
     "delivered": FLAG,
     "on_time": FLAG,
     "arrival_ms": NUMBER,

@@ -1,4 +1,4 @@
-"""Define the typed records of a run's files; docs/files.md has the meaning of each name."""
+"""Define the typed records of a run's files. Comments beside fields are docs/fields.md, too."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -84,7 +84,7 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
     """
 
     raw: str  # the completion as it came
-    status: str  # the outcome of parsing (`harness.parsing.status`)
+    status: str  # the outcome of parsing, such as `bad_sum` (docs/names.md)
     finish_reason: FinishReason  # `stop`, `length`, `refusal` or `error`
     prompt_tokens: Whole | None  # tokens in
     completion_tokens: Whole | None  # tokens out
@@ -116,6 +116,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     viewer: str  # id of the vehicle that answered
     # keys of the helpers' answers whose messages were in the prompt of a fusion call
     heard: tuple[str, ...] = ()
+    # `ego`, `helper`, `merge` (the ego after it heard messages), or an extension's, as `blind`
     role: Role
     raw: str  # the completion as it came, except for lone surrogates, which no file can hold
     finish_reason: FinishReason  # `stop`, `length`, `refusal` or `error`
@@ -130,7 +131,7 @@ class Answer(Struct, frozen=True, kw_only=True):
     cached: bool  # whether it comes from the completion cache
     slow_s: float  # declared seconds that it takes beyond its card's latency
     prompt_sha256: str  # digest of the chat messages
-    status: str  # the outcome of parsing (`harness.parsing.status`)
+    status: str  # the outcome of parsing, such as `bad_sum` (docs/names.md)
     # the status in three classes: `strict`, `recovered` or `failed`
     verdict: Literal["strict", "recovered", "failed"]
     repairs: tuple[str, ...]  # corrections before parsing; empty unless recovered
@@ -282,9 +283,10 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     of the timer's own), the ego's first. An agent is a model with its prompt.
     """
 
-    # one of `SOURCES`, or what times each answer by itself, of `timers.TIMERS`
+    # where they come from: `card`, `declared`, `measured`, `paper`, or what times each answer by
+    # itself, such as `device`
     source: str
-    basis: str  # where the numbers come from
+    basis: str  # the same in words
     # seconds of one inference of the ego; None if each answer is timed, like the next two
     ego_s: Seconds | None = None
     # seconds of one inference of a helper; of the first of several agents
@@ -293,7 +295,7 @@ class Latency(Struct, frozen=True, omit_defaults=True):
     sample: dict[str, Times] = {}  # times of the answers behind a measured latency, by role
     # seconds of each of several agents of helpers; empty if there is only one
     helpers_s: tuple[Seconds, ...] = ()
-    # the speed of each agent, the ego's first, if each answer is timed (`Timer.speed`); else empty
+    # how fast each agent answers, the ego's first, if each answer is timed by itself; else empty
     speeds: tuple[Any, ...] = ()
 
     def __post_init__(self) -> None:
@@ -386,7 +388,8 @@ class Decision(Struct, frozen=True, kw_only=True):
     action: str  # the meta-action that was taken
     fused: tuple[float, ...]  # the policy, in the order of the actions
     entropy_nats: float | None  # entropy of the ego's own intent
-    triggered: bool  # whether the ego asked
+    # whether the ego asked; before 26 November 2026 also if it would have, and nobody was there
+    triggered: bool
     own_failed: bool  # whether the ego's own answer could not be parsed
     own_weight: float | None  # weight of its intent in the policy; None if a fusion call answered
     latency_ms: float | None  # time from seeing to acting
@@ -418,10 +421,10 @@ class Episode(Struct, frozen=True, kw_only=True):
     begun since one was open, and `never_acted` those not ready at the end; `trigger_rate` is the
     share that asked. `delay_s` is needless delay, `time_lost_s` how much later the ego cleared than
     it could; `miss` says that a decision made harm inevitable, `false_alarm` that one only gave
-    success away. Of a collision, `partner`, `striker` and `fault` are the ids of the other, who
-    hit, and who should have given way. `least_gap_m`, `least_ttc_s` and `least_pet_s` are the least
-    distance, time to collision and post-encroachment time, `short_ttc` and `short_pet` whether
-    these were below 1.5 s; `hard_brakings` and `other_crashes` are counts.
+    success away. Of a collision, `partner` is the other's id; `striker` and `fault` say whether the
+    ego or the other hit, and should have given way. `least_gap_m`, `least_ttc_s` and `least_pet_s`
+    are the least distance, time to collision and post-encroachment time, `short_ttc` and
+    `short_pet` whether these were below 1.5 s; `hard_brakings` and `other_crashes` are counts.
 
     Where several vehicles decide, `agents` is how many, of whom `arrived` reached their goal and
     `met` hit each other; `agents_lost_s` is how much later in sum than alone, `most_lost_s` that of
@@ -434,7 +437,7 @@ class Episode(Struct, frozen=True, kw_only=True):
     layout_seed: int  # seed of the layout
     danger: str  # where the hidden danger comes from; `none` without one
     success: bool  # whether it succeeded
-    failure: str  # how it failed; empty if it did not
+    failure: str  # `collision`, `late`, `time_out` or `off_road`; empty if it did not fail
     delay_s: float | None = None  # total needless delay
     messages: int = 0  # replies scheduled
     trigger_rate: float | None = None  # share of its decisions in which the ego asked
@@ -442,8 +445,10 @@ class Episode(Struct, frozen=True, kw_only=True):
     deadline_misses: int = 0  # decisions that outlasted the window
     time_s: float | None = None  # when the outcome was decided
     partner: str | None = None  # the vehicle that the ego collided with
-    striker: str | None = None  # the vehicle whose front hit
-    fault: str | None = None  # the vehicle that should have given way
+    # whose front hit the other: `ego`, `other`, `both` or `neither` (a side swipe)
+    striker: str | None = None
+    # who should have given way, or drove into the other's back: `ego` or `other`
+    fault: str | None = None
     least_gap_m: float | None = None  # smallest distance to another vehicle's outline
     hard_brakings: int | None = None  # times the ego began to brake harder than 4 m/s²
     other_crashes: int | None = None  # vehicles that crashed without the ego
@@ -476,7 +481,7 @@ class Episode(Struct, frozen=True, kw_only=True):
     agents_lost_s: float | None = None
     most_lost_s: float | None = None  # the same of the one who lost most
     gave_way: str | None = None  # id of that one; None if nobody lost time
-    # how each of them ended: JSON, a list of `harness.world.outcome.End`
+    # how each of them ended: JSON, a list with the columns of `run.agents` for each
     journeys: str | None = None
 
 
@@ -639,6 +644,7 @@ class ChannelRecord(Struct, frozen=True, kw_only=True):
     source: str  # where the parameters come from
     status: str  # how well they are supported, such as measured or assumed
     parameters: dict[str, Any]  # values by name, such as range in m
+    # least and greatest value for which the model was validated, by parameter
     limits: dict[str, tuple[float, float]] = {}
 
 
@@ -700,8 +706,7 @@ class Manifest(Struct, frozen=True, kw_only=True):
     from, `actions` are the names of what the ego can do, `seeds` are of the channel's random
     numbers, and `latency` has the seconds of answers. `identity` tells the model that answered
     apart, and `cost` says by model what it cost. `settings` has all settings as typed; fields of
-    the same names, such as `answer` and `ties`, are what these came to. docs/files.md has more on
-    each name.
+    the same names, such as `answer` and `ties`, are what these came to.
     """
 
     format: str  # the format of the run's files, such as `swarmdrive-run/2`
@@ -726,9 +731,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
     # what settings of extensions opened, by name of the setting
     beside: dict[str, Any] = field(default_factory=dict)
     seeds: tuple[int, ...]  # seeds of the channel's random numbers
-    # which helpers were asked: those whose answer a condition uses, or all
+    # which helpers were asked: those whose answer a condition uses, or all; `all` where missing
     ask: Literal["used", "all"]
-    # which of equally likely actions was taken: a drawn one, or the first
+    # which of equally likely actions was taken: a drawn one, or the first; `first` where missing
     ties: Literal["drawn", "first"]
     thinking: bool  # whether the model was asked to think before it answers
     answer: str  # how the model answers: `json`, `constrained`, `readout` or `decision`
@@ -742,8 +747,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
     dtype: str | None  # number format of the weights; None is the card's
     temperature: float  # sampling temperature; 0 is greedy
     sampling_seed: int  # seed of the sampling
-    latency_source: str | None  # the value of `--latency`; None for the default
-    settings: Settings  # all settings by their names in `run.toml`
+    latency_source: str | None  # the value of `--latency`; None is the card's, else the paper's
+    # all settings by their names in `run.toml`; what another key states, too, is the same there
+    settings: Settings
     latency: Latency  # the inference times that decide which messages arrive
     # what answers took that were asked alone, by role; they decide nothing
     answer_times: dict[str, Times] = field(default_factory=dict)

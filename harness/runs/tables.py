@@ -1,5 +1,5 @@
 """Load a run as pandas tables, for notebooks and scripts: `harness.load`.
-docs/files.md has the columns.
+docs/fields.md has the columns.
 """
 
 from collections.abc import Mapping

@@ -52,9 +52,14 @@ class Computer(Timer):
     option: ClassVar[str] = "--device-profile"
     chosen_by: ClassVar[tuple[str, ...]] = (PROFILE, MODEL)
     how: ClassVar[str] = "computed for each answer from its tokens, on a declared device"
-    adds: ClassVar[Mapping[str, str]] = dict.fromkeys(
-        ("inference_j", "helpers_j", "radio_mj", "waiting_j"), "busy_ratio"
-    )
+    adds: ClassVar[Mapping[str, str]] = {
+        # joules of inference: the ego's, of helpers that infer, and of a fusion call
+        "inference_j": "busy_ratio",
+        "helpers_j": "busy_ratio",  # the helpers' part of it
+        "radio_mj": "busy_ratio",  # millijoules to send the request and the replies
+        # joules of the ego's computer while it waits for messages and does not infer
+        "waiting_j": "busy_ratio",
+    }
 
     device: Device | None = None  # its profile; None where nothing is open
     model: str = ""  # whose row times all answers; empty for the one that gave each

@@ -30,7 +30,7 @@ class LeftOut(Struct, frozen=True, kw_only=True):
     # what the item was left out of: the prompt of the `ego` or a `helper`, or the `fusion`
     role: Literal["ego", "helper", "fusion"]
     item: str  # id of the object, or of the helper that sent the message
-    kind: str  # one of `harness.extensions.studies.attribution.study.KINDS`
+    kind: str  # what it is, such as `hidden conflict vehicle` or `helper with sight`
     action: str  # the likeliest action with the item
     instead: str | None  # the likeliest action without it; None if that answer failed
     # the probability of `action` without the item less that with it; None if that answer failed
