@@ -1,5 +1,5 @@
-"""Writes pages out of the program, commands.md, commands/*.md, names.md and fields.md, and
-model-cards.md out of docs/cards: `python docs/reference.py`. Tests hold the pages to it.
+"""Writes pages out of the program, commands.md, commands/*.md, names.md, settings.md and fields.md,
+and model-cards.md out of docs/cards: `python docs/reference.py`. Tests hold the pages to it.
 
 Examples are not written here: each is a command of another page, which the tests run.
 """
@@ -17,6 +17,8 @@ from typer.main import get_command
 from harness.cli import app
 from harness.cli.commands import panels
 from harness.cli.terminal import attributes
+from harness.coordination.named_points import POINTS
+from harness.coordination.part_settings import PARTS, more_parts, part_of_settings, typed_settings
 from harness.core import extensions
 from harness.parsing.parse import Repair, Status
 from harness.runs import decisions, formats, records
@@ -63,6 +65,14 @@ runs](comparing.md) how metrics are compared.
 METRICS_HEAD = """\
 Names are those of `summary.csv`. Metrics of answers have one for each role: {}. *Only* names the kind of run that has a
 metric: frozen (`harness eval`) or closed-loop (`harness drive`).
+"""  # noqa: E501
+SETTINGS_PAGE = DOCS / "settings.md"
+SETTINGS_HEAD = """\
+# Settings of a condition
+
+Written by `python docs/reference.py` out of the program. [Operating points](operating-points.md) says how they work together,
+and which pages have more: `--condition 6g:window_s=0.3` sets one, `harness study sweep RUN --over window_s` tries several values.
+Defaults are those of `v2x` and `6g`, which have their losses and latencies in a profile. A name ends in its unit.
 """  # noqa: E501
 FIELDS_PAGE = DOCS / "fields.md"
 FIELDS_HEAD = """\
@@ -319,6 +329,23 @@ def names() -> str:
     return "\n".join([NAMES_HEAD, *("\n".join(section) for section in sections)])
 
 
+def settings() -> str:
+    """The page of the settings of a condition, with their defaults."""
+    kinds, part_of = {**PARTS, **more_parts()}, part_of_settings()
+    rows = []
+    for name in typed_settings():
+        meaning = attributes(kinds[part_of[name]])[name]
+        rows.append(
+            (f"`{name}`", _default(POINTS["v2x"].setting(name)), _plain(meaning.rstrip(".")))
+        )
+    return f"{SETTINGS_HEAD}\n{_table([('setting', 'default', 'meaning'), *rows])}"
+
+
+def _default(value: Any) -> str:
+    words = {None: "none", "": "none", False: "false"}
+    return f"{value:g}" if type(value) in (int, float) else words.get(value, f"`{value}`")
+
+
 def fields() -> str:
     """The page of what the keys and columns of a run's files mean, by the comments beside them."""
     from harness.extensions.studies.attribution.record import Attribution, LeftOut
@@ -443,5 +470,6 @@ if __name__ == "__main__":
     for file, text in reference().items():
         file.write_text(text)
     NAMES_PAGE.write_text(names())
+    SETTINGS_PAGE.write_text(settings())
     FIELDS_PAGE.write_text(fields())
     CARDS_PAGE.write_text(cards())

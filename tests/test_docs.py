@@ -10,8 +10,6 @@ from reference import pages
 
 from harness.backends.base import AnswerMode
 from harness.backends.card import Failures
-from harness.coordination.named_points import POINTS
-from harness.coordination.part_settings import typed_settings
 from harness.coordination.rules import EGO_PROMPT, POOLS
 from harness.coordination.schedules import SCHEDULES
 
@@ -27,22 +25,6 @@ def test_every_failure_on_purpose_is_documented() -> None:
     documented = (ROOT / "docs/answers.md").read_text().partition("## Failures on purpose")[2]
     for name in asdict(Failures()):
         assert f"`{name}`" in documented
-
-
-@pytest.mark.parametrize("setting", typed_settings())
-def test_every_setting_of_an_operating_point_is_documented_with_its_default(setting: str) -> None:
-    text = (ROOT / "docs/operating-points.md").read_text()
-    [line] = [line for line in text.splitlines() if line.startswith(f"| `{setting}` |")]
-    default = POINTS["v2x"].setting(setting)
-    others = {
-        "ego_distance_m": "its distance",
-        "round_trip_s": "the model's",
-        "threshold": "its own",
-    }
-    words = {"None": others.get(setting, "the profile's"), "False": "false", "": "none"}
-    shown = words.get(str(default), default)
-    cell = line.split("|")[3].strip().strip("`")
-    assert cell == (f"{shown:g}" if isinstance(shown, float) else str(shown))
 
 
 @pytest.mark.parametrize("name", [*POOLS, EGO_PROMPT])

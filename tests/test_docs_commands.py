@@ -23,6 +23,7 @@ from reference import (
     GROUPS,
     NAMES_PAGE,
     PAGE,
+    SETTINGS_PAGE,
     all_typed,
     blocks,
     cards,
@@ -31,6 +32,7 @@ from reference import (
     names,
     pages,
     reference,
+    settings,
     typed,
 )
 from tiers import some
@@ -544,7 +546,14 @@ def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> Non
 
 
 @pytest.mark.parametrize(
-    ("page", "written"), [(NAMES_PAGE, names), (FIELDS_PAGE, fields), (CARDS_PAGE, cards)], ids=str
+    ("page", "written"),
+    [
+        (NAMES_PAGE, names),
+        (SETTINGS_PAGE, settings),
+        (FIELDS_PAGE, fields),
+        (CARDS_PAGE, cards),
+    ],
+    ids=str,
 )
 def test_a_page_out_of_the_program_is_the_programs(page: Path, written: Callable[[], str]) -> None:
     assert page.read_text() == written(), "run `python docs/reference.py`"

@@ -468,7 +468,7 @@ class Ask(Part, frozen=True, kw_only=True):
     their entropy.
     """
 
-    # the rule for whom and when: `entropy`, the paper's, or another of `SCHEDULES`
+    # the rule for whom the ego asks, and when: `entropy`, the paper's, or another
     schedule: Text = PAPER
     # the entropy of the ego's intent, in nats, above which it asks, under the paper's schedule
     tau_nats: Annotated[float, Meta(ge=0, description="a finite number of nats, 0 or more")] = 0.7
@@ -476,8 +476,8 @@ class Ask(Part, frozen=True, kw_only=True):
     threshold: Annotated[float, Meta(ge=0, description="a finite number, 0 or more")] | None = None
     # distance from the ego, m, beyond which helpers are not asked: the paper's R
     radius_m: Metres = 100.0
-    # the most helpers that are asked in one decision. If more may be, those are that the schedule
-    # says are worth the most, and of equals the nearest.
+    # the most helpers that are asked in one decision; of more, those that the schedule says are
+    # worth the most, and of equals the nearest
     max_helpers: Annotated[
         int,
         Meta(
@@ -491,7 +491,7 @@ class Ask(Part, frozen=True, kw_only=True):
     ] = 400.0
     # whether a helper infers only when it is asked, not in parallel with the ego
     on_demand: Flag = False
-    # what a message holds, such as `intent` (`harness.coordination.contents`)
+    # what a message holds, such as `intent`, probabilities of the ego's actions
     content: Text = INTENT
 
     def check(self) -> None:
@@ -542,7 +542,8 @@ class Radio(Part, frozen=True, kw_only=True):
     """
 
     profile: Text | None = None  # name of the channel profile, such as `6g`; None disables V2V
-    # probability that one transmission is lost; None keeps that of the profile or of the link
+    # probability that one transmission is lost, of which a request and a reply are one each; None
+    # keeps that of the profile or of the link
     loss: Annotated[float, Meta(ge=0, le=1, description="a probability from 0 to 1")] | None = None
     # seconds that one request with its replies takes, without losses; None keeps the profile's
     latency_s: Seconds | None = None
@@ -550,7 +551,7 @@ class Radio(Part, frozen=True, kw_only=True):
     # whether a helper that is unsure itself (entropy above `tau_nats`) asks others, too, which
     # loads the channel
     helper_rounds: Flag = False
-    # how messages are encoded, which is their size (`harness.coordination.encodings`)
+    # how messages are encoded, which is their size, such as `json`
     encoding: Text = JSON
     further: Text = ""  # further settings of the profile's channel, such as `jitter_s=0.01`
 
@@ -580,7 +581,7 @@ class Fusion(Part, frozen=True, kw_only=True):
     # the ego's d in Eq. 2, m; None takes its distance to the centroid of the conflict zone. The
     # paper's preset declares a proxy of 3.5 m (section IV-A).
     ego_distance_m: Metres | None = None
-    # largest share of the weight that one helper may have (`consensus.capped`); 1 caps nothing
+    # largest share of the weight that one helper may have; 1 caps nothing
     weight_cap: Annotated[float, Meta(gt=0, le=1, description="a share above 0, up to 1")] = 1.0
     # what replaces a failed answer of the ego: `uniform`, all actions alike, or `brake`, all mass
     # on the first action, which is the most conservative one
@@ -602,8 +603,8 @@ class Cloud(Part, frozen=True, kw_only=True):
     # seconds from the ego's question to the answer of a model in a cloud, in place of the ego's own
     # inference; None for none
     round_trip_s: Seconds | None = None
-    # network over which the ego asks its model in a cloud, a name of `harness.radio.networks`;
-    # empty for none. Each decision draws a round trip, which is added to the model's inference.
+    # network over which the ego asks its model in a cloud, a name of a file of `networks/`; empty
+    # for none. Each decision draws a round trip, which is added to the model's inference.
     round_trip: Text = ""
 
     def check(self) -> None:

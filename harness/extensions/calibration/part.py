@@ -29,7 +29,7 @@ class Calibrated(Part, frozen=True, kw_only=True):
     of_ego: ClassVar[bool] = True
     named: ClassVar = {"calibration": names}
 
-    # name of a file of `calibrations/`; empty for nothing
+    # name of a file of `calibrations/`, which corrects every answer before all else; empty for none
     calibration: Text = ""
 
     def check(self) -> None:

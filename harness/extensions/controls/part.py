@@ -65,8 +65,8 @@ class Controlled(Part, frozen=True, kw_only=True):
         f"messages={BLIND}": "helpers that are shown nothing",
     }
 
-    # Its `own` helpers, helpers of another layout (`shuffled`), or helpers that are shown nothing
-    # (`blind`).
+    # whom the ego hears: its `own` helpers, helpers of another layout (`shuffled`), or helpers that
+    # are shown nothing (`blind`)
     messages: Text = OWN
 
     def check(self) -> None:

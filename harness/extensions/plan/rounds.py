@@ -40,6 +40,7 @@ class Negotiated(Part, frozen=True, kw_only=True):
 
     behind: ClassVar[str] = "fallback"
 
+    # with `content=plan`: how often agents tell each other their plans before they act
     rounds: Annotated[
         int, Meta(ge=1, le=MOST_ROUNDS, description=f"a whole number from 1 to {MOST_ROUNDS}")
     ] = 1

@@ -35,17 +35,16 @@ class Roadside(Part, frozen=True, kw_only=True):
     behind: ClassVar[str] = "helper_rounds"
     of_radio: ClassVar[bool] = True
 
-    # What the unit does: `relay` sends replies once more; `fusion` asks the helpers for the ego and
-    # fuses (`harness.extensions.roadside.unit`). With the constant model a relay has no place
-    # (`harness.radio.constant.Radio`).
+    # what a unit beside the road does: `relay` sends replies once more; `fusion` asks the helpers
+    # for the ego and fuses; `none` is no unit. With the constant model a relay has no place.
     edge: Text = NONE
-    # Seconds from the end of what the unit receives to the start of what it sends: processing and
+    # seconds from the end of what the unit receives to the start of what it sends: processing and
     # backhaul. The default is declared: a unit that has nothing to wait for.
     edge_delay_s: Seconds = 0.0
     # m to the east of the centroid of the conflict zone; 0 and 0 is a gantry above it
     edge_x_m: Place = 0.0
     edge_y_m: Place = 0.0  # m to the south of it
-    # Height of the unit's antenna above the ground, m; by default that of TR 37.885, table 6.1.4-1,
+    # height of the unit's antenna above the ground, m; by default that of TR 37.885, table 6.1.4-1,
     # a roadside unit.
     edge_antenna_m: Annotated[float, Meta(ge=1, le=100, description="metres from 1 to 100")] = 5.0
 

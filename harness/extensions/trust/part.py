@@ -70,11 +70,11 @@ class Guard(Part, frozen=True, kw_only=True):
     named: ClassVar = {"attack": lambda: ATTACKS}
     usual: ClassVar = {"attack": ",".join(("none", *USUAL))}
 
-    # such as `liar:share=1/3+spoof` (`harness.extensions.trust.attacks`); empty for none
+    # what helpers that lie do, such as `liar:share=1/3+spoof`; empty for none
     attack: Text = ""
-    # Some of `DEFENCES` joined by `+`: `quoted` makes evidence a JSON string; `schema` removes free
-    # text from messages; `majority` lets an action on which most voices agree win against the
-    # call's.
+    # what guards a fusion call, joined by `+`: `quoted` makes evidence a JSON string; `schema`
+    # removes free text from messages; `majority` lets an action on which most voices agree win
+    # against the call's; empty for none
     defence: Text = ""
 
     @property
