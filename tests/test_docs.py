@@ -88,6 +88,18 @@ def test_the_front_door_is_short() -> None:
     assert (ROOT / "docs/pictures/lost-episode.gif").stat().st_size <= 1e6
 
 
+def test_the_documentation_grows_by_what_it_lets_go() -> None:
+    """The pages that people write, of 38 and 30 000 words at most; a new one pays by another's."""
+    mark = re.compile("Written by `|`make results` writes")
+    programs = [
+        page for page in (ROOT / "docs").glob("*.md") if mark.search(page.read_text()[:400])
+    ]
+    written = set((ROOT / "docs").glob("*.md")) - set(programs)
+    assert {"commands.md", "fields.md", "results.md"} <= {page.name for page in programs}
+    assert len(written) <= 38
+    assert sum(len(page.read_text().split()) for page in written) <= 30_000
+
+
 def test_every_decision_stands_once_in_the_index() -> None:
     folder = ROOT / "docs/decisions"
     listed = re.findall(r"\b(0\d{3}-[\w-]+)", (folder / "index.md").read_text())
