@@ -100,8 +100,9 @@ def test_a_second_run_of_the_same_scenes_is_compared_with_the_first(
     command = ("eval", "--dataset", small_path, "--limit", "2", "--condition", "6g")
     assert harness(*command, "--out", "one")[0] == 0
     _, out, _ = harness(*command, "--model", "local-view", "--out", "other")
-    assert out.splitlines()[-1] == "next: harness compare one other"
-    code, out, err = harness("compare", "one", "other")
+    # a driver is what a model is compared with
+    assert out.splitlines()[-1] == "next: harness compare other one"
+    code, out, err = harness("compare", "other", "one")
     lines = out.splitlines()
     assert (code, err, len(lines) <= 15) == (0, "", True)
     assert [line.split()[0] for line in lines[-1:]] == ["next:"]

@@ -70,7 +70,9 @@ def headings(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", text).replace(" ", "-") for text in bare}
 
 
-@pytest.mark.parametrize("page", [*pages(), ROOT / "CHANGELOG.md", ROOT / "SECURITY.md"], ids=str)
+@pytest.mark.parametrize(
+    "page", [*pages(), ROOT / "CHANGELOG.md", ROOT / "SECURITY.md"], ids=lambda page: page.name
+)
 def test_every_link_leads_to_a_file_and_a_heading(page: Path) -> None:
     for link in re.findall(r"\]\(([^)\s]+)\)", BLOCK.sub("", page.read_text())):
         path, _, heading = link.partition("#")

@@ -553,7 +553,7 @@ def test_the_reference_is_the_program_and_other_pages_type_its_examples() -> Non
         (FIELDS_PAGE, fields),
         (CARDS_PAGE, cards),
     ],
-    ids=str,
+    ids=["names", "settings", "fields", "cards"],
 )
 def test_a_page_out_of_the_program_is_the_programs(page: Path, written: Callable[[], str]) -> None:
     assert page.read_text() == written(), "run `python docs/reference.py`"

@@ -40,7 +40,7 @@ def captions(run: Path, episode: int) -> tuple[str, str]:
     first = next(s for s in steps if by_step["single-local", s] != by_step["6g", s])
     at = {}
     for name in ("single-local", "6g"):
-        at[name] = f"answer {first + 1}: {by_step[name, first]}, then "
+        at[name] = f"step {first}: {by_step[name, first]}, then "
     alone, heard = ends.loc["single-local"], ends.loc["6g"]
     return (
         f"alone, {at['single-local']}{alone['failure']} at {alone['time_s']:.1f} s",

@@ -10,8 +10,7 @@ from harness.core.config import Count
 class Readable:
     """Hold how many of a model's answers to a prompt could be read, as a model card states it.
 
-    `harness prompt check VERSION --model MODEL` asks `asked` questions by the prompt `version`, of
-    which `read` answers say what to do.
+    Of `asked` fixed questions by the prompt `version`, `read` answers say what to do.
     """
 
     version: str  # the prompt version

@@ -189,8 +189,8 @@ class Card:
     # read-out over their orders, unless `--letters` says otherwise.
     letters: Letters | None = None
     price: Price | None = None  # what its tokens cost; None if it costs nothing, or nobody says
-    # prompts that it was seen to answer, as `harness prompt check` counted; the first is taken
-    # where none is typed and the scenario's is not among them
+    # prompts that it was seen to answer, by fixed questions; the first is taken where none is typed
+    # and the scenario's is not among them
     prompts: tuple[Readable, ...] = ()
 
     @property

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from harness.cli.run import HALVES, Column, scores_table
 from harness.cli.terminal import echo_text
 from harness.core.errors import printable
-from harness.core.figures import PERCENT
+from harness.core.figures import PERCENT, amount
 from harness.runs import headline
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def show(
     scores_table(columns, rows, HEAD)
     echo_gain(run)
     echo_text(f"n = {n}")
+    echo_cost(run)
     if not echo_void(run):
         echo_note(run)
 
@@ -98,6 +99,17 @@ def echo_gain(run: "Run | SuiteRun") -> None:
         echo_text(f"{printable(best)} over {printable(base)}: {change}")
 
 
+def echo_cost(run: "Run | SuiteRun") -> None:
+    """Print what the answers of a run or suite cost, if its card has a price.
+
+    A suite has a run on each of several scenarios.
+    """
+    from harness.report.notes import cost
+
+    for sentence in cost(run):
+        echo_text(sentence)
+
+
 def echo_void(run: "Run | SuiteRun") -> bool:
     """Print why a run or suite is no result, if it is none; return whether it is.
 
@@ -116,16 +128,17 @@ def echo_note(run: "Run") -> None:
 
     How many more notes its page has is said.
     """
-    from harness.report.findings import LAST, Kind, findings
+    from harness.report.findings import Kind, findings
 
     warnings, limits = findings(run, Kind.CAVEAT), findings(run, Kind.LIMIT)
     for warning in warnings:
         echo_text(warning.sentence)
     if not limits:
         return
-    more = len(limits) + len(findings(run, Kind.FIGURE, *LAST))
+    more = len(limits) - (not warnings)
+    rest = f"({amount(more, 'more note')} and all tables: --verbose)"
     if warnings:
-        echo_text(f"{more} more notes: --verbose")
+        echo_text(rest)
     else:
         first, _, _ = limits[0].sentence.partition(". ")
-        echo_text(f"note: {first.rstrip('.')} ({more - 1} more notes: --verbose)")
+        echo_text(f"note: {first.rstrip('.')} {rest}")

@@ -114,7 +114,9 @@ def command(
         typer.echo(text.terminal(difference, verdicts, most, every))
     else:
         typer.echo(text.brief(difference, verdicts))
-        after_comparison(difference)
+        if html:
+            typer.echo(f"wrote {printable(html, 1000)}")
+        after_comparison(difference, html)
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
 
 

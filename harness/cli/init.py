@@ -43,6 +43,7 @@ def command(
                 Path(draft, "prompts/mine"),
                 copy_function=copyfile,
             )
+            _name_own(Path(draft, "prompts/mine/prompt.toml"))
             for whole in Path(draft).iterdir():
                 whole.rename(place / whole.name)
     except OSError as error:
@@ -54,3 +55,16 @@ def command(
     if find_spec("llama_cpp") is None:  # the engine of that model
         command = "harness eval settings.toml"
     typer.echo(f"made {printable(folder)}; next: cd there, `{command}`; README.md says more")
+
+
+def _name_own(file: Path) -> None:
+    """Say of a copied prompt what it is, in place of what is said of the released one."""
+    texts = {
+        "description": f'description = "mine, which began as {PROMPT}"',
+        "changed": f'changed = "against {PROMPT}: say here what you change, and why"',
+    }
+    lines = []
+    for line in file.read_text().splitlines():
+        key, _, _ = line.partition(" = ")
+        lines.append(texts.get(key, line))
+    file.write_text("\n".join(lines) + "\n")

@@ -188,6 +188,7 @@ def _show_briefly(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     layouts = sum(len(run.grid.episodes) for run in done.runs.values())
     seeds = amount(len(done.manifest.seeds), "channel seed")
     echo_text(f"n = {layouts} episodes × {seeds}; all tables and notes: --verbose")
+    brief.echo_cost(done)
     brief.echo_void(done)
 
 

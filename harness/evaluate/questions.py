@@ -61,8 +61,10 @@ def settle(spec: Spec, out: Path) -> None:
     dataset = cast("FrozenSource", spec.source).dataset
     left, tally = _walked(spec, dataset, file)
     _say_unknown(spec, dataset, file)
-    if tally.missing:  # too many helpers have no answer, and what was left depends on theirs
-        left = file.refused
+    if tally.missing:  # too many of the helpers so far have no answer; later ones may make up
+        if not left:
+            raise _too_many_refused(file, out)
+        left = {**file.refused, **left}
     if not left:
         (out / QUESTIONS).unlink(missing_ok=True)
         return
@@ -71,6 +73,16 @@ def settle(spec: Spec, out: Path) -> None:
     raise Unanswered(
         f"{name} has no answer to {amount(len(left), 'question')}, the first {first}: they are in "
         f"{printable(out / QUESTIONS)}; add a line for each to {name}, and type the same command"
+    )
+
+
+def _too_many_refused(file: AnswersFile, out: Path) -> Unanswered:
+    """Write the questions that have an error for an answer; return the error that names them."""
+    write(file.refused.values(), out)
+    return Unanswered(
+        f"{printable(file.path)} has an error in place of "
+        f"{amount(len(file.refused), 'answer')} of helpers, the first {next(iter(file.refused))}: "
+        "too many for a result; put answers in their place, and type the same command"
     )
 
 

@@ -29,16 +29,20 @@ def test_texts_that_changed_are_counted_where_no_verdict_did(
 ) -> None:
     reworded(runs[1], "v2")
     every, mine = answers_of(runs[0]), [a for a in answers_of(runs[0]) if a.viewer == "v2"]
-    said = (
-        f"{len(mine)} of {len(every)} to the same questions changed, none of them in their verdict"
-    )
+    said = f"{len(mine)} of {len(every)} to the same questions changed in their text, none of them in their status"
     out = " ".join(harness("compare", "--verbose", *runs)[1].split())
     assert f"answers: {said} first: {mine[0].id}, helper A strict: " in out
     assert f"all, side by side: --html FILE --show {len(mine)}" in out
     assert said in harness("compare", *runs, "--markdown")[1]
     told = json.loads(harness("compare", *runs, "--json", "--show", "1")[1])["answers_changed"]
     [listed] = told.pop("listed")
-    assert told == {"count": len(mine), "verdicts": 0, "of": len(every), "asked_otherwise": 0}
+    assert told == {
+        "count": len(mine),
+        "verdicts": 0,
+        "of": len(every),
+        "asked_otherwise": 0,
+        "asked_otherwise_leaning": 0,
+    }
     assert listed == {
         "request": mine[0].id, "role": "helper", "verdict_a": "strict", "verdict_b": "strict",
         "raw_a": mine[0].raw, "raw_b": f"{mine[0].raw} ",
@@ -89,14 +93,12 @@ def test_an_answer_to_another_question_is_said_and_not_counted(
     held = compare(pair(*runs)).held
     assert (held.same, held.other, held.changed) == (egos, len(every) - egos, ())
     out = " ".join(harness("compare", *runs)[1].split())
-    rest = f"{len(every) - egos} more questions asked otherwise and not compared"
+    rest = f"{len(every) - egos} questions asked otherwise (prompt, messages or picture), and "
     assert f"answers: 0 of {egos} to the same questions changed; {rest}" in out
     change(runs[1], answer=otherwise("ego"))
     out = " ".join(harness("compare", *runs)[1].split())
-    assert (
-        f"answers: none can be compared: each of the {len(every)} questions that both runs have"
-        in out
-    )
+    whole = f"answers: {len(every)} questions asked otherwise (prompt, messages or picture), and "
+    assert f"{whole}0 answers to them with another likeliest action or status" in out
     assert "first:" not in out
 
 
@@ -112,7 +114,7 @@ def test_a_verdict_that_changed_counts_where_the_text_did_not(runs: tuple[Path, 
 
 
 def test_runs_without_a_question_in_common_say_so() -> None:
-    assert words.answers_held(AnswersHeld(0, 0, ())) == "the runs have no question in common"
+    assert words.answers_held(AnswersHeld(0, 0, 0, ())) == "the runs have no question in common"
 
 
 def test_the_line_begins_a_little_before_the_texts_part() -> None:

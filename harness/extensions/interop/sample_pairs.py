@@ -93,7 +93,9 @@ class SampleComparison:
 
     @cached_property
     def unsure(self) -> str:
-        """Return why gates have nothing sure to judge: unfinished logs, and errors; else empty."""
+        """Return why gates have nothing sure to judge: unfinished logs, errors, or answers that
+        have no number in one of them, as those that it lacks; else empty.
+        """
         reasons, erring = list[str](), set[Key]()
         for log in (self.a, self.b):
             if log.status != "success":
@@ -101,6 +103,10 @@ class SampleComparison:
             erring |= {key for key in self.answers if _has_failed(log, key)}
         if erring:
             reasons.append(f"{amount(len(erring), 'answer')} of A or B failed with an error")
+        if alone := len(self.only_a) + len(self.only_b):
+            reasons.append(f"one log alone has {amount(alone, 'answer')}")
+        if unscored := max((each.unscored for each in self.differences), default=0) - len(erring):
+            reasons.append(f"no number has {amount(unscored, 'answer')} of A or B")
         return " and ".join(reasons)
 
     def terminal(self, verdicts: Sequence[Verdict], most: int) -> str:

@@ -10,7 +10,7 @@ MOST_SCORERS = 100  # of a log
 # The number that Inspect takes the text of a score for: of a letter, and of a word in any letters.
 LETTERS = {"C": 1.0, "P": 0.5, "I": 0.0, "N": 0.0}
 WORDS = {"yes": 1.0, "true": 1.0, "no": 0.0, "false": 0.0}
-MOST = 1e100  # whose square is still a number
+MOST = 1e12  # of a score: with more, a mean of others is lost in rounding
 T = TypeVar("T")
 
 

@@ -147,12 +147,13 @@ class AnswersHeld:
     """Hold the comparison of both runs' answers to the same questions.
 
     A question is the same if its chat messages and picture are: `same` counts these, `other` the
-    rest, which are not compared. Under another prompt none is the same. `changed` has the pairs of
-    answers that differ.
+    rest. Under another prompt none is the same. `changed` has the pairs of answers that differ; of
+    the rest, `other_leaning` counts those whose likeliest action or verdict does.
     """
 
     same: int  # how many questions were the same
-    other: int  # how many were not, so that their answers are not compared
+    other: int  # how many were not, so that their texts are not compared
+    other_leaning: int  # how many of these have another likeliest action, or another verdict
     # answers that differ; first where B gave success away, then where A did
     changed: tuple[AnswerChanged, ...]
 
@@ -233,12 +234,20 @@ def _answers_flipped(answers: Sequence[tuple[Answer, Answer]]) -> tuple[AnswersF
 def _held(answers: Sequence[tuple[Answer, Answer]]) -> AnswersHeld:
     """Hold answers of both runs against each other where they answer the same question."""
     same = [(a, b) for a, b in answers if _question(a) == _question(b)]
+    others = [(a, b) for a, b in answers if _question(a) != _question(b)]
     changed = tuple(
         AnswerChanged(a.id, a.role, a.raw, b.raw, (a.verdict, b.verdict))
         for a, b in same
         if (a.raw, a.verdict) != (b.raw, b.verdict)
     )
-    return AnswersHeld(len(same), len(answers) - len(same), changed)
+    leaning = sum((_leaning(a), a.verdict) != (_leaning(b), b.verdict) for a, b in others)
+    return AnswersHeld(len(same), len(others), leaning, changed)
+
+
+def _leaning(answer: Answer) -> int | None:
+    """Return the place of an answer's likeliest action, of equals the first; None if it failed."""
+    intent = answer.intent
+    return intent.index(max(intent)) if intent else None
 
 
 def _question(answer: Answer) -> tuple[str, str | None]:

@@ -50,12 +50,21 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
             if address:
                 yield name, address
 
-    def decided(condition: str, flip: DecisionFlip) -> Iterator[tuple[str, str, str | None]]:
-        """Yield of each run what its ego answered there alone, and where its page shows it."""
-        for name, side in sides.items():
+    def decided(condition: str, flip: DecisionFlip) -> Iterator[tuple[str, str, str, str | None]]:
+        """Yield of each run what its ego answered there alone, what it took if that is another
+        action, and where its page shows it.
+        """
+        for (name, side), action in zip(sides.items(), (flip.a, flip.b), strict=True):
             answers = side.run.answers_by_scene.get(flip.scene, ())
-            raw = next((answer.raw for answer in answers if answer.role == "ego"), "nothing")
-            yield name, printable(raw, RAW), link(side, flip.scene, condition, flip.seeds[0])
+            ego = next((answer for answer in answers if answer.role == "ego"), None)
+            leaning = ""
+            if ego and ego.intent:
+                leaning = side.run.actions[ego.intent.index(max(ego.intent))]
+            turned = (
+                f"; with what it heard, it took {action}" if leaning not in ("", action) else ""
+            )
+            raw = printable(ego.raw if ego else "nothing", RAW)
+            yield name, raw, turned, link(side, flip.scene, condition, flip.seeds[0])
 
     template = environment(TEMPLATES).get_template("compare.html.j2")
     return template.render(

@@ -283,6 +283,7 @@ def mapping(comparison: Comparison, verdicts: Sequence[Verdict], most: int) -> d
             "verdicts": comparison.held.verdicts,
             "of": comparison.held.same,
             "asked_otherwise": comparison.held.other,
+            "asked_otherwise_leaning": comparison.held.other_leaning,
             "listed": changed_answers(comparison.held, most),
         },
         "gates": [_gate(verdict) for verdict in verdicts],

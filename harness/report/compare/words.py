@@ -176,13 +176,13 @@ def of_success(comparison: Comparison) -> dict[str, Difference]:
 def key_figures(comparison: Comparison) -> list[dict[str, str]]:
     """Return success in A and in B as key figures: texts at `what` and `value`.
 
-    They are of the condition in which A has the most, a named set of settings of the radio, of
-    asking helpers and of fusing their messages.
+    They are of the condition in which both together have the most, a named set of settings of the
+    radio, of asking helpers and of fusing their messages.
     """
     differences = of_success(comparison)
     if not differences:
         return []
-    best = max(differences, key=lambda name: differences[name].a)
+    best = max(differences, key=lambda name: differences[name].a + differences[name].b)
     d = differences[best]
     row, what = line(d), f"{IN_WORDS[d.metric]} under {best}"
     return [
@@ -486,17 +486,16 @@ def answers_held(held: AnswersHeld) -> str:
     """Return a phrase on how many answers to the same questions differ between two runs."""
     if not (held.same or held.other):
         return "the runs have no question in common"
+    otherwise = (
+        f"{amount(held.other, 'question')} asked otherwise (prompt, messages or picture), and "
+        f"{amount(held.other_leaning, 'answer')} to them with another likeliest action or status"
+    )
     if not held.same:
-        return (
-            f"none can be compared: each of the {held.other} questions that both runs have was "
-            "asked otherwise (prompt, messages or picture)"
-        )
+        return otherwise
     text = f"{len(held.changed)} of {held.same} to the same questions changed"
     if held.changed:
-        text += f", {held.verdicts or 'none'} of them in their verdict"
-    if held.other:
-        text += f"; {amount(held.other, 'more question')} asked otherwise and not compared"
-    return text
+        text += f" in their text, {held.verdicts or 'none'} of them in their status"
+    return f"{text}; {otherwise}" if held.other else text
 
 
 def first_changed(changed: AnswerChanged) -> list[str]:

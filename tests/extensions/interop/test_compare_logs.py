@@ -151,10 +151,12 @@ def test_a_gate_that_has_nothing_sure_to_judge_is_refused(harness: Harness) -> N
     failed = sample(1, scores={}, error={"message": "no sandbox"})
     erring = log("erring.eval", [sample(0), failed, sample(2)])
     unknown = log("unknown.eval", [sample(n, "maybe") for n in range(3)])
+    part = log("part.eval", [sample(n) for n in range(2)])
     for b, gate, reason in (
         (begun, "score < 0", "begun.eval has status started"),
         (erring, "score < 0", "1 answer of A or B failed with an error"),
-        (unknown, "score < 0", "match has no such number"),
+        (unknown, "score < 0", "no number has 3 answers of A or B"),
+        (part, "score < 0", "one log alone has 1 answer"),
         (whole, "other:score < 0", "unknown condition of --fail-if"),
         (whole, "success_rate < 0", "unknown metric of --fail-if"),
     ):
