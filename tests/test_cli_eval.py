@@ -128,7 +128,7 @@ def test_answers_that_cannot_be_read_ask_for_another_prompt(
     for typed, taken in (((), "v10"), (("--prompt", "v4"), "v4")):
         code, out, _ = harness(*command, *typed, "--out", taken)
         assert (code, out.startswith(f"proxy-broken · prompt {taken} ")) == (0, True)
-    assert out.splitlines()[-1] == "next: harness eval --model proxy-broken --prompt v10"
+    assert out.splitlines()[-1] == "next: harness eval v4 --prompt v10"
 
 
 @pytest.mark.slow

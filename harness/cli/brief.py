@@ -51,8 +51,7 @@ def show(
     echo_gain(run)
     echo_text(f"n = {n}")
     echo_cost(run)
-    if not echo_void(run):
-        echo_note(run)
+    echo_note(run, echo_warnings(run))
 
 
 def echo_title(manifest: "Manifest", variant: "Variant", scenes: str) -> None:
@@ -110,34 +109,29 @@ def echo_cost(run: "Run | SuiteRun") -> None:
         echo_text(sentence)
 
 
-def echo_void(run: "Run | SuiteRun") -> bool:
-    """Print why a run or suite is no result, if it is none; return whether it is.
+def echo_warnings(run: "Run | SuiteRun") -> bool:
+    """Print why a run or suite is no result and who decided; return whether there was a line.
 
     A suite has a run on each of several scenarios.
     """
     from harness.report.findings import Kind, findings
 
-    void = findings(run, Kind.VOID)
-    for finding in void:
-        echo_text(finding.sentence)
-    return bool(void)
-
-
-def echo_note(run: "Run") -> None:
-    """Print the warnings on who decided in a run, else the first note on its numbers.
-
-    How many more notes its page has is said.
-    """
-    from harness.report.findings import Kind, findings
-
-    warnings, limits = findings(run, Kind.CAVEAT), findings(run, Kind.LIMIT)
+    warnings = findings(run, Kind.VOID, Kind.CAVEAT)
     for warning in warnings:
         echo_text(warning.sentence)
+    return bool(warnings)
+
+
+def echo_note(run: "Run", is_warned: bool) -> None:
+    """Print the first note on a run's numbers, unless there was a warning; and how many more."""
+    from harness.report.findings import Kind, findings
+
+    limits = findings(run, Kind.LIMIT)
     if not limits:
         return
-    more = len(limits) - (not warnings)
+    more = len(limits) - (not is_warned)
     rest = f"({amount(more, 'more note')} and all tables: --verbose)"
-    if warnings:
+    if is_warned:
         echo_text(rest)
     else:
         first, _, _ = limits[0].sentence.partition(". ")

@@ -14,6 +14,7 @@ from harness.core.errors import UserError, printable
 if TYPE_CHECKING:
     from harness.report.compare.difference import Comparison
     from harness.runs.folder import Run
+    from harness.runs.suite import SuiteRun
 
 MOST_BESIDE = 20  # runs beside a run, the newest, that are looked at for one to compare with
 LONGEST = 4000  # characters of a path that can be typed
@@ -60,14 +61,14 @@ def after_run(run: "Run") -> None:
     from harness.runs.metric_names import ALL
 
     manifest = run.manifest
-    model, prompt = manifest.model["name"], manifest.prompt["version"]
+    model, prompt = manifest.settings.model, manifest.prompt["version"]  # as it was typed
     failed = run.score(ALL, FAILED)
     of_file = is_from_file(manifest.model, manifest.identity)
     if failed and (failed.value or 0.0) >= UNREAD:
         versions = [str(each["version"]) for each in manifest.model.get("prompts", ())]
         others = [version for version in versions if version != prompt]
         if others:
-            echo_next("eval", "--model", model, "--prompt", others[0])
+            echo_next("eval" if run.world == "frozen" else "drive", run.path, "--prompt", others[0])
         elif not of_file:
             echo_next("prompt", "check", prompt, "--model", model)
         return
@@ -101,13 +102,21 @@ def _is_reference(run: "Run") -> bool:
     return capabilities(str(run.manifest.model["engine"])).reference
 
 
-def after_suite(model: str, name: str) -> None:
-    """Print what to type next, given the model of a suite's run and the suite's name.
+def after_suite(run: "SuiteRun") -> None:
+    """Print what to type next, given a suite's run: a rule beside which its figures can be read.
 
-    A suite is several datasets; its run has one on each of them. It is beside a rule that the
-    model's figures can be read.
+    A suite is several datasets; its run has one on each of them.
     """
-    echo_next("eval", "--model", DRIVER if model == RULE else RULE, "--dataset", f"suite:{name}")
+    from harness.runs.settings import Settings, parse_seeds
+
+    settings = run.manifest.settings
+    limit = getattr(settings.world, "limit", None)
+    few = ("--limit", limit) if limit is not None else ()
+    model = DRIVER if settings.model == RULE else RULE
+    dataset = ("--dataset", f"suite:{run.name}")
+    is_usual = parse_seeds(settings.seeds) == parse_seeds(Settings().seeds)
+    draws = () if is_usual else ("--seeds", settings.seeds)
+    echo_next("eval", "--model", model, *dataset, *few, *draws)
 
 
 def after_comparison(comparison: "Comparison", page: Path | None) -> None:

@@ -79,12 +79,11 @@ def show(study: "Study", verbose: bool) -> None:
 
 
 def _outcome(study: "Study") -> list[str]:
-    """Return the first sentence of a study's outcome, and its first caveat and more that fit."""
+    """Return the first sentence of a study's outcome and its first caveat, then more that fit."""
     first, *rest = study.headline
-    chosen, lines = [first], len(wrap(first, WIDTH))
-    for text in (*study.caveats[:1], *rest):
-        lines += len(wrap(text, WIDTH))
-        if lines <= OUTCOME:
+    chosen = [first, *study.caveats[:1]]
+    for text in rest:
+        if sum(len(wrap(each, WIDTH)) for each in (*chosen, text)) <= OUTCOME:
             chosen.append(text)
     return chosen
 

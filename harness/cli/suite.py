@@ -108,7 +108,7 @@ def evaluate(
     elif not quiet:
         (_show if verbose else _show_briefly)(done, lines)
         typer.echo(f"wrote {printable(page)}")
-        after_suite(done.variant.model, done.name)
+        after_suite(done)
     return folder
 
 
@@ -189,7 +189,7 @@ def _show_briefly(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     seeds = amount(len(done.manifest.seeds), "channel seed")
     echo_text(f"n = {layouts} episodes × {seeds}; all tables and notes: --verbose")
     brief.echo_cost(done)
-    brief.echo_void(done)
+    brief.echo_warnings(done)
 
 
 def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[Line]") -> None:

@@ -283,7 +283,8 @@ class Asker:
         self._unread = None if read else self._unread + len(answered)
         ego = self.spec.ego
         if self._unread is not None and self._unread >= FIRST and ego.can.language_model:
-            _say_unread(ego.card, ego.prompt.version)
+            if not ego.can.from_file:  # whose model is elsewhere
+                _say_unread(ego.card, ego.prompt.version)
             self._unread = None
 
     def _keep_servers(self, these: Sequence[Served]) -> None:
