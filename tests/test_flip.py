@@ -214,7 +214,7 @@ def test_the_terminal_says_how_often_beside_the_letter(
     pytest.importorskip("torch", reason="needs the transformers extra")
     code, out, err = harness(
         *command, "--model", "swarm-tiny:transformers", "--prompt", "v4", "--answer", "readout", "--flip",
-        "--seeds", "0:1", "--condition", "single-local", "--out", str(tmp_path / "run"),
+        "--seeds", "0:1", "--condition", "single-local", "--out", str(tmp_path / "run"), "--verbose",
     )  # fmt: skip
     assert code == 0, err
     score = folder.read(tmp_path / "run").score("all", "flip_rate_ego")

@@ -280,8 +280,9 @@ def direct_reads(source: Path) -> list[str]:
 
 
 def is_path(value: ast.expr) -> bool:
-    """Whether `open` of this is a path's: pools, backends and logs have one, too."""
+    """Whether `open` of this is a path's: pools, backends, logs and archives have one, too."""
     return "pool" not in ast.unparse(value) and ast.unparse(value) not in (
+        "archive",
         "module",
         "registration",
         "webbrowser",

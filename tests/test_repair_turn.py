@@ -350,7 +350,7 @@ def test_a_table_of_a_run_says_it_in_a_line_each(harness: Harness, small_path: P
         with Path(f"prompts/mine/{role}.j2").open("a", encoding="utf-8") as file:
             file.write(BLOCK)
     asked_for = ("--model", "proxy-faulty", "--prompt", "mine", "--dataset", small_path)
-    code, out, _ = harness("eval", *asked_for, "--out", "run")
+    code, out, _ = harness("eval", *asked_for, "--out", "run", "--verbose")
     assert code == 0
     for when in ("at first", "after repair"):
         [line] = re.findall(rf"ego answers valid {when}: [\d.]+ \[[\d.]+, [\d.]+\] % of \d+", out)

@@ -88,7 +88,7 @@ def test_a_run_says_how_many_were_divided_and_is_no_run_that_refuses_them(
                "--condition", "single-local", "--out", "run")  # fmt: skip
     with serving(lambda asked: asked.reply(completion(text(0.6, 0.2, 0.1)))) as there:
         (tmp_path / "models/mine.toml").write_text(CARD.format(url=there.url))
-        code, out, err = harness(*command, "--sums", "divide")
+        code, out, err = harness(*command, "--sums", "divide", "--verbose")
         assert code == 0, err
         run = folder.read(tmp_path / "run")
         n = sum(answer.role == "ego" for answer in run.answers)

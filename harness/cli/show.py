@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 LONGEST = 2000  # characters of a sentence
 CELL = 80
 OUTCOME, ROWS = 5, 3  # lines of sentences, and rows of a table, that --verbose is not needed for
-BASIS = ("n = ", "95 % interval")
+BASIS = (re.compile(r"\bn (=|is) "), re.compile("95 % interval"))
 SENTENCE = re.compile(r"(?<=[.;]) ")
 
 
@@ -63,7 +63,7 @@ def show(study: "Study", verbose: bool) -> None:
     """
     tables = [table for table in study.tables if table.terminal]
     if verbose:
-        _echo_texts((study.title, *study.headline, *study.caveats))
+        _echo_texts((study.title, *study.headline, *study.verdicts, *study.caveats))
         for each in tables:
             typer.echo()
             _echo_texts([each.title])
@@ -71,7 +71,7 @@ def show(study: "Study", verbose: bool) -> None:
         typer.echo()
         _echo_texts(study.about)
         return
-    _echo_texts([study.title, *_outcome(study)])
+    _echo_texts([study.title, *_outcome(study), *study.verdicts])
     for each in tables[:1]:
         _echo_table(each, ROWS)
     _echo_texts(_basis(study))
@@ -93,7 +93,7 @@ def _basis(study: "Study") -> list[str]:
     sentences = SENTENCE.split(" ".join(study.about))
     basis = []
     for mark in BASIS:
-        having = [each.rstrip(".;") for each in sentences if mark in each]
+        having = [each.rstrip(".;") for each in sentences if mark.search(each)]
         basis += [f"{each}." for each in having[:1] if f"{each}." not in basis]
     return basis
 

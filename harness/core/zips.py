@@ -32,9 +32,9 @@ def bounded_archive(file: Path, kind: Kind, longest_list: int) -> Iterator[ZipFi
     `kind`, a key of `LARGEST`, says how large the archive may be, and `longest_list` how many bytes
     its list of files may have. Raises OSError, and one of `BROKEN_ZIP` where it is no such archive.
     """
-    with opened(file, kind) as whole:
-        _refuse_long_list(whole, kind, longest_list)
-        with ZipFile(whole) as archive:
+    with opened(file, kind) as data:
+        _refuse_long_list(data, kind, longest_list)
+        with ZipFile(data) as archive:
             yield archive
 
 

@@ -42,9 +42,9 @@ class Study:
     says what it was made of.
 
     `kind` names its manifest's file; `headline` is the outcome in sentences, `about` says how it
-    was made, and `caveats` what a reader must know first. `tables` are to be shown, and `data` to
-    be written, by file name. `answer` is what --json prints, and `figures` draws the pictures by
-    file name. `more` is HTML that its page shows below the tables.
+    was made, `caveats` what a reader must know first, and `verdicts` what it passed. `tables` are
+    to be shown, and `data` to be written, by file name. `answer` is what --json prints, and
+    `figures` draws the pictures by file name. `more` is HTML that its page shows below the tables.
     """
 
     kind: str  # names its manifest, `<kind>.json`
@@ -60,6 +60,7 @@ class Study:
     # draws them by file name, where matplotlib is installed
     figures: "Callable[[], Mapping[str, Figure]]" = dict
     caveats: Sequence[str] = ()  # what a reader must know first
+    verdicts: Sequence[str] = ()  # of the tests that it was to pass, a sentence each
     more: Markup = field(default_factory=Markup)  # what else the page shows, below the tables
 
 
@@ -106,7 +107,7 @@ def write_study(study: Study, out: Path) -> Path:
         write_table(table, out / stem)
     section = Section(
         study.title,
-        study.headline,
+        [*study.headline, *study.verdicts],
         study.about,
         study.tables,
         caveats=study.caveats,

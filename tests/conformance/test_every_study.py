@@ -98,7 +98,7 @@ def test_its_json_has_every_interval_of_its_outcome_and_tables(kind: str, tries:
     typed = of.said["again" if of.trial.ends else "json"]
     assert (typed.code, typed.err) == (0, "")
     records = list(numbers(json.loads(typed.out)))
-    outcome, _, _ = of.said["whole"].out.rpartition("\n\n")
+    outcome, _, _ = of.said["whole"].out.rpartition("all tables and notes: ")
     shown = set(INTERVAL.findall(" ".join(outcome.split())))
     assert shown
     absent = [each for each in shown if not any(all(within(each, of)) for of in records)]

@@ -308,7 +308,8 @@ def test_time_outs_of_agents_have_a_column_and_nobody_is_late(
     """Who brakes forever meets nobody and arrives nowhere."""
     of = ("--scenario", "all-way-crossing", "--agents", agents, "--model", "brake", "--workers", 1)
     drawn = ("--condition", "single-local", "--episodes", 1, "--first-seed", 50_000, "--seeds", 0)
-    lines = harness("drive", *of, *drawn, "--out", tmp_path / "run")[1].splitlines()
+    typed = ("drive", *of, *drawn, "--out", tmp_path / "run", "--verbose")
+    lines = harness(*typed)[1].splitlines()
     heads = next(line for line in lines if "crash" in line)
     row = lines[lines.index(heads) + 1]
     ends = heads.index(f" {head} ") + len(head) + 1

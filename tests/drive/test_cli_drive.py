@@ -23,12 +23,14 @@ def test_a_run_is_driven_told_and_told_to_machines(harness, tmp_path):
     )
     code, out, err = harness("drive", "--model", "local-view", *options, "--out", tmp_path / "run")
     assert (code, err) == (0, "")
-    assert max(map(len, out.splitlines()[:-1])) <= 80
-    assert out.splitlines()[-1] == f"wrote {tmp_path / 'run' / 'report.html'}"
+    lines, (_, last, *_) = out.splitlines(), out.partition("\nnext: ")
+    page = f"wrote {tmp_path / 'run' / 'report.html'}"
+    assert max(map(len, lines[: lines.index(page)])) <= 80
+    assert last
     assert (tmp_path / "run" / "report.html").is_file()
     assert "…" not in out
     assert " · closed loop · occluded-intersection, scenes of v2v-safety-2" in " ".join(out.split())
-    assert "n = 2 episodes × 2 channel seeds; layout seeds 5 to 6 (tune);" in out
+    assert "n = 2 episodes × 2 channel seeds; layout seeds 5 to 6 (tune)\n" in out
     code, out, _ = harness(
         "drive", "--model", "local-view", *options, "--out", tmp_path / "run2", "--json"
     )

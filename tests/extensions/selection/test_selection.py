@@ -81,7 +81,7 @@ def test_a_run_says_which_and_its_command_and_file_select_them_again(harness: Ty
     words = "--danger left --sample 2 --sample-seed 7 --condition 6g --seeds 3:4"
     code, out, _ = harness("eval", *words.split(), "--out", "a")
     assert code == 0
-    assert "n = 2 episodes × 1 channel seed; of layout seeds 200000 to 200199 (report);" in out
+    assert "n = 2 episodes × 1 channel seed; of layout seeds 200000 to 200199 (report)\n" in out
     made = json.loads(Path("a/run.json").read_text())
     assert made["world"]["selection"] == {"danger": "left", "sample": 2, "sample_seed": 7}
     stated = made["settings"]["world"]

@@ -201,7 +201,7 @@ def test_of_a_model_a_run_is_made_first_and_not_twice(
         ),
         *("--share", "0,1/3", "--out", "bench"),
     )
-    code, out, _ = harness(*typed)
+    code, out, _ = harness(*typed, "--verbose")
     assert code == 0
     assert "On average over all 1 attacks" in " ".join(out.split())
     cells = Path("bench/cells.jsonl").read_bytes()

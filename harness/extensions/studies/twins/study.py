@@ -69,7 +69,7 @@ def twins_study(
     return Study(
         "twins",
         f"Twins: {spec.ego.name} on {spec.source.name}",
-        [headline(rows), *(judged(verdict, "-") for verdict in verdicts)],
+        [headline(rows)],
         [
             "The model is asked each question twice: as it is, and as its twin, which puts the "
             "same situation otherwise. So what must hold of both answers is known without knowing "
@@ -98,6 +98,7 @@ def twins_study(
         caveats=notes(questions, rows, unanswered),
         more=_examples(spec.actions, rows),
         figures=lambda: {"twins": _figure(rows)},
+        verdicts=[judged(verdict, "-") for verdict in verdicts],
     )
 
 
