@@ -34,7 +34,7 @@ def test_it_prints_a_table_and_where_the_report_is(
     assert len(lines) <= 15
     for part in (
         "proxy · prompt v2 (not read) · json · small",
-        "asked: ego 14 (100.0 % read), helper 33 (100.0 % read)",
+        "asked: ego 14, helper 33; all answers could be read",
         "success, % [95 % CI]",
         "single-local",
         "v2x",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from harness.cli.run import HALVES, Column, scores_table
 from harness.cli.terminal import echo_text
 from harness.core.errors import printable
-from harness.core.figures import PERCENT, amount
+from harness.core.figures import amount
 from harness.runs import headline
 
 if TYPE_CHECKING:
@@ -37,8 +37,10 @@ def show(
         n: a phrase on its episodes and seeds.
         references: scores by metric of references that need no model, by name; None for none.
     """
+    from harness.report.words import questions
+
     echo_title(run.manifest, run.manifest.variant, scenes)
-    echo_text(f"asked: {questions(run)}")
+    echo_text(questions(run))
     is_balanced = headline.headline_of(run) == headline.BALANCED
     columns: Sequence[Column] = BALANCED if is_balanced else (SUCCESS,)
     rows: dict[str, Mapping[str, Score | None]] = {}
@@ -68,20 +70,6 @@ def echo_title(manifest: "Manifest", variant: "Variant", scenes: str) -> None:
     helpers = f" · helpers: {printable(variant.helpers)}" if manifest.helpers else ""
     model = printable(variant.model, 40)
     echo_text(f"{model} · {prompt} · {variant.answer} · {scenes}{helpers}")
-
-
-def questions(run: "Run") -> str:
-    """Return how many questions each role was asked, and how many answers could be read, as text.
-
-    A role is `ego`, `helper` or `merge` (the ego after it heard messages).
-    """
-    from harness.runs.records import role_word
-
-    counts = []
-    for role, count in run.answered.count.items():
-        failed = sum(run.answered.failed.get(role, {}).values())
-        counts.append(f"{role_word(role)} {count} ({PERCENT.text(1 - failed / count)} read)")
-    return ", ".join(counts)
 
 
 def echo_gain(run: "Run | SuiteRun") -> None:

@@ -19,12 +19,14 @@ EXAMPLES = 3  # of each status of answers
 def size(runs: Runs) -> str:
     """Return a phrase on how many episodes and channel seeds runs have, and on which dataset.
 
-    A channel seed is the seed of the radio channel's random draws.
+    A channel seed is the seed of the radio channel's random draws. Of a single run it says who was
+    asked how much as well.
     """
     episodes = _either(len(run.grid.episodes) for run in runs.runs)
     seeds = _either(len(run.grid.seeds) for run in runs.runs)
     source = runs.runs[0].source
-    return f"{episodes} episodes × {seeds} channel seeds of {source}; 95 % intervals over episodes"
+    text = f"{episodes} episodes × {seeds} channel seeds of {source}; 95 % intervals over episodes"
+    return f"{text}; {words.questions(runs.runs[0])}" if len(runs.runs) == 1 else text
 
 
 def _either(counts: Iterable[int]) -> str:

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from harness.core.covariate import worth
 from harness.core.errors import printable
-from harness.core.figures import POINTS, within
+from harness.core.figures import PERCENT, POINTS, within
 from harness.core.figures import interval_of as shown_estimate
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.statistics import Estimate
@@ -18,7 +18,7 @@ from harness.runs.folder import Run
 from harness.runs.headline import ANY_TIME, IN_WORDS, SUCCESS, best_of, headline_of
 from harness.runs.metric_names import ADJUSTED, ALL, BASELINE, GAINS, LATENCY
 from harness.runs.metrics import entry
-from harness.runs.records import Score
+from harness.runs.records import Score, role_word
 from harness.runs.success import half_difference, mean_difference, p_of_mean
 from harness.runs.suite import SuiteRun, plays
 
@@ -96,6 +96,22 @@ def gain(run: Run | SuiteRun, best: str, base: str) -> tuple[Estimate, float]:
     corrected = dict(zip(p, holm(list(p.values())), strict=True))
     pairs = plays(_runs(run), headline_of(run)).pairs(best, base)
     return mean_difference(pairs), corrected[best]
+
+
+def questions(run: Run) -> str:
+    """Return how many questions each role was asked, and how many answers could be read, as text.
+
+    A role is `ego`, `helper` or `merge` (the ego after it heard messages).
+    """
+    counts = run.answered.count
+    failed = {role: sum(run.answered.failed.get(role, {}).values()) for role in counts}
+    if not any(failed.values()):
+        numbers = ", ".join(f"{role_word(role)} {n}" for role, n in counts.items())
+        return f"asked: {numbers}; all answers could be read"
+    parts = []
+    for role, n in counts.items():
+        parts.append(f"{role_word(role)} {n} ({PERCENT.text(1 - failed[role] / n)} read)")
+    return f"asked: {', '.join(parts)}"
 
 
 def shown_change(change: Estimate) -> str:

@@ -83,7 +83,7 @@ def test_what_is_read_first_stands_on_the_first_screen(opened, report, size):
     one = report.parent / ONE / "report.html"
     page = opened(one, size=size)
     above = 0
-    for what in (".caveat", ".headline", ".first > .key div:last-child"):
+    for what in ("h1", ".headline", ".first > .key div:last-child"):
         box = page.locator(what).first.bounding_box()
         assert box["y"] > above, what
         above = box["y"]
