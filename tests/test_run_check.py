@@ -555,10 +555,10 @@ def test_times_of_a_replay_are_held_to_what_it_replays_or_said_to_be_its_own(
     assert "another latency of the helpers than of the ego" in " ".join(out.split())
     Path("models/slow.toml").write_text(SLOW.replace("1.9", "0.1"))
     out = " ".join(harness("run", "check", "slow")[1].split())
-    assert "the card slow that is here states 0.1 s." in out
+    assert "card slow in run.json states 1.9 s (card) for an answer; the one that is here" in out
     Path("models/slow.toml").unlink()
     out = " ".join(harness("run", "check", "slow")[1].split())
-    assert "Its latency of 1.9 s is that of a card in run.json, which is not here." in out
+    assert "states 1.9 s (card) for an answer, and none of that name is here." in out
 
 
 def test_more_errors_than_a_result_can_have_are_a_difference(run: Path, harness: Harness) -> None:
@@ -614,10 +614,13 @@ def test_a_latency_of_a_card_that_only_the_run_states_is_named(run: Path, harnes
     configure(run, model=card, latency={**stated["latency"], **times})
     said = harness("run", "check", run)
     words = " ".join(said[1].split())
-    assert (
-        "of 0.144 s is that of a card in run.json; the card proxy that is here states 0.145 s"
-        in words
-    ), said
+    here = "for an answer; the one that is here states 0.145 s (card)."
+    assert f"The card proxy in run.json states 0.144 s (card) {here}" in words, said
+    paper = {"source": "paper", "inference_s": None, "basis": "none declared"}
+    times = {"source": "paper", "ego_s": 0.145, "helper_s": 0.145, "fusion_s": 0.145}
+    configure(run, model={**card, "latency": paper}, latency={**stated["latency"], **times})
+    words = " ".join(harness("run", "check", run)[1].split())
+    assert f"The card proxy in run.json states no time {here}" in words
 
 
 @pytest.mark.slow

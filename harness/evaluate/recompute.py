@@ -347,10 +347,10 @@ def of_card(run: Run) -> Iterator[str]:
     one that is not here, or of a model whose answers are replayed, the run alone states.
     """
     latency, manifest = run.manifest.latency, run.manifest
-    if latency.source == "card":
+    if manifest.settings.latency in (None, "card"):
         models = [asked_card(run), *(model_of(run, helper) for helper in manifest.helpers)]
-        for name, card in {card.name: card for card in models}.items():
-            yield from _of_card_here(name, card)
+        for card in dict.fromkeys(models):
+            yield from _of_card_here(card)
     replays = [manifest.model, *(helper["model"] for helper in manifest.helpers)]
     _, identity = _model_asked(run)
     several = manifest.model["engine"] == REPLAY and bool(identity.get("helpers"))
@@ -360,21 +360,29 @@ def of_card(run: Run) -> Iterator[str]:
         yield f"Its helpers' latency of {' and '.join(times)} is stated by run.json alone."
 
 
-def _of_card_here(name: str, card: Card) -> Iterator[str]:
+def _of_card_here(card: Card) -> Iterator[str]:
     """Yield a sentence if the card of this name that is here states another time, or none is."""
-    seconds = card.latency.inference_s
-    if card.engine == REPLAY or seconds is None:
+    if card.engine == REPLAY:
         return
-    if name not in cards.names():
-        yield f"Its latency of {seconds:g} s is that of a card in run.json, which is not here."
-        return
-    here_s = cards.load(name).latency.inference_s
-    if here_s != seconds:
+    in_run = _time(card)
+    if card.name in cards.names():
+        here = _time(cards.load(card.name))
+        if here != in_run:
+            yield (
+                f"The card {printable(card.name)} in run.json states {in_run} for an answer; the "
+                f"one that is here states {here}."
+            )
+    elif card.latency.inference_s is not None:
         yield (
-            f"Its latency of {seconds:g} s is that of a card in run.json; the card "
-            f"{printable(name)} that is here states "
-            f"{'none' if here_s is None else f'{here_s:g} s'}."
+            f"The card {printable(card.name)} in run.json states {in_run} for an answer, and none "
+            "of that name is here."
         )
+
+
+def _time(card: Card) -> str:
+    """Return in words the time of an answer that a card states."""
+    seconds = card.latency.inference_s
+    return "no time" if seconds is None else f"{seconds:g} s ({card.latency.source})"
 
 
 def _of_latency(run: Run) -> Iterator[str]:

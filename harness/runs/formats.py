@@ -381,13 +381,16 @@ def _table(record: Mapping[str, Any], in_file: Any) -> Any:
         flat = {**dict.fromkeys(map(_extensions_key, role_agents.settings())), **flat}
     of_extensions = extensions.beside().items()
     by_model = [_extensions_key(name) for name, setting in of_extensions if setting.models]
-    of_ego = _places([record])
-    of_helpers = _places(record.get("helpers"))
+    of_ego = _places(record)
+    helpers = record.get("helpers")
+    of_helpers = [_places(each) for each in helpers] if isinstance(helpers, Sequence) else []
     for name, there in _flat(beside).items():
         typed = flat.get(name, there)
         is_place = name == "model" and typed in of_ego
         if name in by_model and isinstance(typed, str) and isinstance(there, str):
-            is_place = {*typed.split(",")} <= {*of_helpers, *there.split(",")}
+            parts = zip(typed.split(","), there.split(","), of_helpers, strict=False)
+            is_place = all(part == called or part in places for part, called, places in parts)
+            is_place = is_place and typed.count(",") == there.count(",")
         may_be = name in (*TYPED, *by_model) and (is_place or _may_be(typed, there))
         if typed != there and not may_be:
             both = f"{printable(flat[name], 60)}, and beside them it is {printable(there, 60)}"
@@ -437,16 +440,13 @@ def _place(name: str) -> str:
     return beside[key].path(key) if table == EXTENSIONS and key in beside else name
 
 
-def _places(agents: Any) -> list[str]:
-    """Return the weights and adapters of the models of some agents of a record, as typed."""
-    places = []
-    for agent in agents if isinstance(agents, Sequence) else ():
-        card = agent.get("model") if isinstance(agent, Mapping) else None
-        both = (
-            [card.get(key) for key in ("weights", "adapter")] if isinstance(card, Mapping) else []
-        )
-        places += [place for place in both if isinstance(place, str)]
-    return places
+def _places(agent: Any) -> list[str]:
+    """Return the weights and the adapter of the model of an agent of a record, as typed."""
+    card = agent.get("model") if isinstance(agent, Mapping) else None
+    if not isinstance(card, Mapping):
+        return []
+    both = [card.get("weights"), card.get("adapter")]
+    return [place for place in both if isinstance(place, str)]
 
 
 def _may_be(typed: Any, names: Any) -> bool:
