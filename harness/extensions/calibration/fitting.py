@@ -15,6 +15,7 @@ from harness.core.files import write_whole
 from harness.core.seeds import seeds_text
 from harness.dataset import rebuilt
 from harness.dataset.forest import Forest
+from harness.evaluate.recompute import REPLAY
 from harness.evaluate.texts import refuse_others
 from harness.extensions.calibration.calibrations import (
     COOLEST,
@@ -111,6 +112,8 @@ def calibrate(
         raise UserError(
             f"{name} was driven, and no tree says what follows; give a run of `harness eval`"
         )
+    if manifest.model["engine"] == REPLAY:  # which states neither of the run that it replays
+        raise UserError(f"{name}: it replays another run's answers; give that run")
     if manifest.helpers or manifest.settings.temperature:
         reason = (
             "its helpers have a model of their own"

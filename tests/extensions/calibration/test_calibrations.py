@@ -12,7 +12,7 @@ import pytest
 from evaluating import run, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
-from run_on_disk import damage
+from run_on_disk import configure, damage
 
 from harness.core.errors import UserError
 from harness.core.resources import MARKER
@@ -195,6 +195,16 @@ def test_nothing_is_fitted_on_an_intent_that_no_text_states(
     assert calibrate(run, "L1", two_path, "")[1][0].role == "ego"
     damage(run, answer=lambda row: row.update(intent=(1.0, 0.0, 0.0)))
     with pytest.raises(UserError, match="states another intent than its text says"):
+        calibrate(run, "L1", two_path, "")
+
+
+def test_a_replay_is_refused_since_it_does_not_state_who_was_asked(
+    two_run: Path, two_path: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(two_run, tmp_path / "run"))
+    model = json.loads((run / "run.json").read_text())["model"]
+    configure(run, model={**model, "name": "replay:r", "engine": "replay", "weights": "r"})
+    with pytest.raises(UserError, match="it replays another run's answers; give that run"):
         calibrate(run, "L1", two_path, "")
 
 
