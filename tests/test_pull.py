@@ -14,7 +14,7 @@ from small_hub import COMMIT, serving
 from tiers import some
 
 from harness.backends.card import Card, Latency
-from harness.backends.weights import check_digest
+from harness.backends.weights import check_digest, hub_commit
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes
 
@@ -160,3 +160,14 @@ def test_a_hub_that_is_not_reached_is_one_line_and_nothing_is_written(tmp_path: 
     assert f"cannot fetch {endpoint}/Qwen/Qwen3-4B: " in done.stderr
     assert "copy the weights here and give their path" in done.stderr
     assert not (tmp_path / "home").exists()
+
+
+def test_only_a_folder_of_the_hubs_cache_has_its_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any other that is called so has its files' digests in the identity."""
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    ours = tmp_path / "hub/models--a--b/snapshots" / COMMIT
+    assert hub_commit(ours) == COMMIT
+    for other in (tmp_path / "snapshots" / COMMIT, ours.with_name("best"), ours / "part"):
+        assert hub_commit(other) is None

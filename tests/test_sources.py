@@ -145,14 +145,15 @@ def test_prompts_that_are_gone_are_still_compared(project: Path, harness: Typed)
     typed = (*EVAL, "--dataset", "own/scenes", "--condition", "mine", "--out", "reports/other")
     assert harness(*typed, "--prompt", "other")[0] == 0
     shutil.rmtree("prompts")
-    code, out, _ = harness("compare", "reports/run", "reports/other", "--html", "page.html")
+    both = ("compare", "reports/run", "reports/other", "--html", "page.html", "--verbose")
+    code, out, _ = harness(*both)
     assert code == 0
     assert all(word in out for word in ("[-Mind:-]", "{+Beware:+}"))
     assert all(word in Path("page.html").read_text() for word in ("Mind:", "Beware:"))
     found = compare(pair(Path("reports/run"), Path("reports/other")))
     assert words.prompts(found, 0)[-1] == "  2 more changes: the page of --html has them"
     shutil.rmtree("reports/run/sources")
-    code, out, err = harness("compare", "reports/run", "reports/other", "--html", "page.html")
+    code, out, err = harness(*both)
     assert (code, out) == (2, "")
     assert "page.html is kept: a new page would lack its prompts" in err
     assert harness("compare", "reports/run", "reports/other", "--html", "less.html")[0] == 0

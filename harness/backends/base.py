@@ -282,21 +282,25 @@ class Backend(Protocol):
         ...
 
 
+# What servers state of a model, and the digest of how an adapter is scaled.
+YOUNGER = ("states", "adapter_config_sha256")
+
+
 def same_model(stored: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Return whether stored answers and the open backend are of one model.
 
     `stored` is the identity that an earlier run recorded, and `now` that of the open backend, as
-    `Backend.identity` returns them: what decides answers, by name. What a server states only now is
+    `Backend.identity` returns them: what decides answers, by name. What only now is recorded is
     not compared.
     """
     return canonical_json(_as_stored(now, stored)) == canonical_json(stored)
 
 
 def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an identity without what servers state, if the stored one lacks that;
+    """Return an identity without what older runs did not record, if the stored one lacks that;
     the helpers' as well.
     """
-    identity = {key: value for key, value in now.items() if key != "states" or key in stored}
+    identity = {key: value for key, value in now.items() if key not in YOUNGER or key in stored}
     if "answers" in stored:
         identity.setdefault("answers", 1)  # of an engine from outside that states none
     helpers, stored_helpers = identity.get("helpers"), stored.get("helpers")

@@ -5,6 +5,7 @@ Nothing else in the program downloads anything.
 
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -224,9 +225,12 @@ def _download(card: Card) -> None:
 def hub_commit(folder: Path) -> str | None:
     """Return the commit that a folder of the hub's cache holds; None for any other folder.
 
-    The hub is the server of public models from which weights are downloaded.
+    The hub is the server of public models from which weights are downloaded. A folder of another
+    place that is called so has its files' digests in the identity instead.
     """
-    return folder.name if folder.parent.name == "snapshots" else None
+    is_commit = re.fullmatch(r"[0-9a-f]{40}", folder.name) is not None
+    in_cache = folder.resolve().is_relative_to(_hub_cache().resolve())
+    return folder.name if is_commit and in_cache and folder.parent.name == "snapshots" else None
 
 
 def fetching(card: Card) -> str:

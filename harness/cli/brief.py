@@ -41,6 +41,7 @@ def show(
 
     echo_title(run.manifest, run.manifest.variant, scenes)
     echo_text(questions(run))
+    is_warned = echo_warnings(run)
     is_balanced = headline.headline_of(run) == headline.BALANCED
     columns: Sequence[Column] = BALANCED if is_balanced else (SUCCESS,)
     rows: dict[str, Mapping[str, Score | None]] = {}
@@ -53,7 +54,7 @@ def show(
     echo_gain(run)
     echo_text(f"n = {n}")
     echo_cost(run)
-    echo_note(run, echo_warnings(run))
+    echo_note(run, is_warned)
 
 
 def echo_title(manifest: "Manifest", variant: "Variant", scenes: str) -> None:

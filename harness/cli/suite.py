@@ -171,6 +171,7 @@ def _show_briefly(done: "SuiteRun", lines: "Sequence[Line]") -> None:
 
     metric, beside = headline_of(done), done.conditions[:MOST_INTERVALS]
     brief.echo_title(done.manifest, done.variant, f"suite {printable(done.name)}")
+    brief.echo_warnings(done)
     rows = []
     for line in lines:
         cells = [_cell(line.cells[condition].success) for condition in beside]
@@ -189,7 +190,6 @@ def _show_briefly(done: "SuiteRun", lines: "Sequence[Line]") -> None:
     seeds = amount(len(done.manifest.seeds), "channel seed")
     echo_text(f"n = {layouts} episodes × {seeds}; all tables and notes: --verbose")
     brief.echo_cost(done)
-    brief.echo_warnings(done)
 
 
 def _matrix(head: str, what: str, conditions: "Sequence[str]", lines: "Sequence[Line]") -> None:

@@ -312,7 +312,7 @@ def test_no_p_is_printed_as_zero_and_json_keeps_the_number(
     latency = told["conditions"][1]["metrics"]["latency_proxy_ms"]
     assert 0 < latency["p"] < latency["p_holm"] <= latency["p"] * 6 < 1e-9
     printed = [
-        harness("compare", *runs, *form)[1]
+        harness("compare", *runs, "--verbose", *form)[1]
         for form in ((), ("--markdown",), ("--html", "page.html"))
     ]
     for text in (*printed[:2], unescape(Path("page.html").read_text())):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 from warnings import catch_warnings, simplefilter
 
-from harness.backends.adapters import TENSORS, find_adapter, merge
+from harness.backends.adapters import CONFIG, TENSORS, find_adapter, merge
 from harness.backends.card import Card, Dtype
 from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.engine import Session
@@ -241,6 +241,7 @@ class TransformersEngine:
             identity["gguf_sha256"] = self._gguf_sha256
         if self.adapter:
             identity["adapter_sha256"] = sha256_file(self.adapter / TENSORS)
+            identity["adapter_config_sha256"] = sha256_file(self.adapter / CONFIG)
         if self.chat.system:
             identity["system"] = self.chat.system
         return identity

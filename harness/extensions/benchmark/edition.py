@@ -21,6 +21,7 @@ from harness.evaluate import resolve
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import card_here
+from harness.evaluate.recompute import REPLAY
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs import formats, pinned
@@ -181,6 +182,8 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             yield f"it has {amount(world.episodes, 'layout')} that were selected, and all count"
         elif world.name in others:
             yield f"another is of {printable(world.name, 40)}, too"
+        if m.model["engine"] == REPLAY:
+            yield "its answers are replayed, and it does not state how they were asked"
         if m.helpers:
             yield "its helpers are of other models, and one model answers for all"
         if changed := [key for key, value in _agent(m).items() if value != agent[key]]:

@@ -254,6 +254,7 @@ HOSTILE: dict[str, tuple[Change, str]] = {
         "none of its prompts"),
     "another latency": (with_run(latency_source="card"), "its latency: card, not paper"),
     "an engine that nobody has": (with_model(engine="evil"), "evil"),
+    "a replay": (with_model(engine="replay", weights="r"), "its answers are replayed"),
     "answers that are missing": (drop, "holds no answer for"),
     "a model to open": (another_card, "holds no answer for"),
     "broken answers": (lambda files: files.update({"small/answers.jsonl": b"{}\n"}), "is broken"),

@@ -284,7 +284,7 @@ def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_
     code, said, _ = harness("dataset", "check", tmp_path / "set")
     assert (code, "2 of 2 episodes are lost before the ego's first action" in said) == (0, True)
     code, said, _ = harness(
-        "eval", "--model", "full-view", "--dataset", tmp_path / "set", "--out", "run"
+        "eval", "--model", "full-view", "--dataset", tmp_path / "set", "--out", "run", "--verbose"
     )
     assert code == 0
     lost = "2 of 2 episodes are lost before the ego's first action"
@@ -301,7 +301,9 @@ def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_
         "--workers",
         "1",
     )
-    code, said, err = harness(*drive_it, "--first-seed", "0", "--seeds", "0", "--out", "driven")
+    code, said, err = harness(
+        *drive_it, "--first-seed", "0", "--seeds", "0", "--verbose", "--out", "driven"
+    )
     assert code == 0, err
     assert lost in " ".join(said.split())
 

@@ -21,7 +21,7 @@ from teaching import SEED, drawn_by
 from typer.testing import CliRunner
 
 from harness.backends import adapters, cards
-from harness.backends.base import Request
+from harness.backends.base import Request, same_model
 from harness.backends.card import Card
 from harness.backends.registry import missing
 from harness.backends.registry import open_backend as _open
@@ -134,6 +134,9 @@ def test_an_adapter_is_one_model_on_every_engine(llama: Card, tmp_path: Path) ->
     assert np.abs(plain.next_log_probs(QUESTIONS, rows) - expected).max() > 0.1
     assert len(here.identity()["adapter_sha256"]) == len(there.identity()["adapter_sha256"]) == 64
     assert "adapter_sha256" not in plain.identity()
+    assert len(here.identity()["adapter_config_sha256"]) == 64, "which says how it is scaled"
+    older = {k: v for k, v in here.identity().items() if k != "adapter_config_sha256"}
+    assert same_model(older, here.identity())
 
 
 @pytest.mark.parametrize("engine", ["transformers", "llama-cpp"])

@@ -392,7 +392,7 @@ def test_typed_it_says_what_moves_most_in_eighty_columns(
 ) -> None:
     control = named_point("6g:loss=0,messages=blind")
     run(spec_of(small, limit=2, points=(control, SIXG), seeds=(0,)), tmp_path / "run")
-    code, out, _ = harness("study", "attribute", "run", "--sample", "10")
+    code, out, _ = harness("study", "attribute", "run", "--sample", "10", "--verbose")
     assert code == 0
     assert max(map(len, out.splitlines())) <= 80
     assert out.splitlines()[1].startswith(("The ", "What moves answers most is not clear: "))
