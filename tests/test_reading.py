@@ -234,7 +234,6 @@ EXCEPT = {
     "core/files.py": "the reader itself",
     "backends/counters.py": "counters of the kernel, below /sys",
     "backends/packages.py": "an archive that the reader has opened",
-    "extensions/benchmark/results.py": "an archive that the reader has opened",
     "extensions/learn/training/model.py": "safetensors maps weights that training has just written",
     "report/library.py": "the charting library of an installed package",
     "cli/init.py": "the project that ships",
