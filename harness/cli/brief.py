@@ -83,7 +83,7 @@ def echo_gain(run: "Run | SuiteRun") -> None:
 
     best, base = compared(run)
     if base:
-        change, _, _ = judged(*gain(run, best, base)).partition(", but")
+        change = judged(*gain(run, best, base), bounded=False)
         echo_text(f"{printable(best)} over {printable(base)}: {change}")
 
 
@@ -114,6 +114,7 @@ def echo_warnings(run: "Run | SuiteRun") -> bool:
 def echo_note(run: "Run", is_warned: bool) -> None:
     """Print the first note on a run's numbers, unless there was a warning; and how many more."""
     from harness.report.findings import Kind, findings
+    from harness.report.words import first_note
 
     limits = findings(run, Kind.LIMIT)
     if not limits:
@@ -123,5 +124,4 @@ def echo_note(run: "Run", is_warned: bool) -> None:
     if is_warned:
         echo_text(rest)
     else:
-        first, _, _ = limits[0].sentence.partition(". ")
-        echo_text(f"note: {first.rstrip('.')} {rest}")
+        echo_text(f"{first_note(limits[0].sentence)} {rest}")

@@ -21,6 +21,7 @@ from harness.runs.settings import OUTPUT, DriveSettings, Settings, changed
 
 if TYPE_CHECKING:
     from harness.evaluate.lifecycle import Evaluated
+    from harness.runs.folder import Run
     from harness.runs.records import ClosedLoop
 
 ALL = "all"
@@ -148,7 +149,8 @@ def command(
             then=draw,
             follows=follows,
         )
-    tell(done, as_json, quiet, verbose)
+    run = read(where)
+    tell(done, run, as_json, quiet, verbose)
     if silent:
         return
     if videos:
@@ -158,7 +160,7 @@ def command(
     elif save_video:
         typer.echo(f"no episode failed under {printable(spec.points[-1].name)}: no video")
     typer.echo(f"wrote {printable(page)}")
-    after_run(read(where))
+    after_run(run)
 
 
 def deciding(scenario: str, agents: str) -> str:
@@ -191,15 +193,14 @@ def deciding(scenario: str, agents: str) -> str:
     return f"{scenario}{',' if ':' in scenario else ':'}{SHARE}={share}"
 
 
-def tell(done: "Evaluated", as_json: bool, quiet: bool, verbose: bool = False) -> None:
+def tell(done: "Evaluated", run: "Run", as_json: bool, quiet: bool, verbose: bool = False) -> None:
     """Print a driven run's results in few lines, or as JSON if `as_json`; nothing if `quiet`.
 
-    `done` is the run, as it was just evaluated in the simulator; `verbose` prints all tables.
+    `done` is the run, as it was just evaluated in the simulator, and `run` as it was read again;
+    `verbose` prints all tables.
     """
-    from harness.runs.folder import read
-
     if as_json:
-        echo_json(as_mapping(read(done.out)))
+        echo_json(as_mapping(run))
     if as_json or quiet:
         return
     world = cast("ClosedLoop", done.manifest.world)
@@ -210,7 +211,7 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool, verbose: bool = False) -
     )
     scenes = f"closed loop · {world.title}"
     if not verbose:
-        brief.show(read(done.out), scenes, n)
+        brief.show(run, scenes, n)
         return
     notes = (
         f"n = {n};\n"
@@ -220,4 +221,4 @@ def tell(done: "Evaluated", as_json: bool, quiet: bool, verbose: bool = False) -
     )
     several = any(score.metric == "arrived_rate" for score in done.scores)
     columns = tuple(TIME_OUT if several and each == LATE else each for each in COLUMNS)
-    show(done, scenes, columns, notes)
+    show(done, run, scenes, columns, notes)

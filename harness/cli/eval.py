@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from harness.dataset.load import Dataset
     from harness.evaluate.lifecycle import Evaluated
     from harness.evaluate.spec import Spec
+    from harness.runs.folder import Run
 
 SUCCESS = Column("success % [95 % CI]", headline.SUCCESS, interval=True)
 GAINS = {  # by headline metric
@@ -110,29 +111,32 @@ def command(
             suite.evaluate(named_suite, specs, datasets, out, evaluated, quiet, as_json, verbose)
             return
         done, page = evaluated(specs[0], out or default_out(specs[0]))
+    run = read(done.out)
     if as_json:
-        echo_json(as_mapping(read(done.out)))
+        echo_json(as_mapping(run))
     if not silent:
         selected = sources[0].choice is not None
-        _show(done, walked(datasets[0], done), len(specs[0].seeds), selected, verbose)
+        _show(done, run, walked(datasets[0], done), len(specs[0].seeds), selected, verbose)
         typer.echo(f"wrote {printable(page)}")
-        after_run(read(done.out))
+        after_run(run)
 
 
-def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool, verbose: bool) -> None:
+def _show(
+    done: "Evaluated", run: "Run", dataset: "Dataset", seeds: int, selected: bool, verbose: bool
+) -> None:
     """Print a run's result beside the references that need no model, in few lines or all.
 
-    `selected` is whether its episodes are some of the dataset's.
+    `done` is the run as it was just evaluated, and `run` as it was read again; `selected` is
+    whether its episodes are some of the dataset's.
     """
     from harness.report.references import BESIDE, in_trees, label, meaning
-    from harness.runs.folder import read
 
     episodes = dataset.manifest.episodes if selected else len(dataset.episodes)
     layout_seeds = seeds_text(dataset.manifest.seed, episodes)
     n = f"{crossed(len(dataset.episodes), seeds)}; {'of ' * selected}{layout_seeds}"
     every_reference = in_trees(dataset)
     if not verbose:
-        brief.show(read(done.out), dataset.name, n, every_reference)
+        brief.show(run, dataset.name, n, every_reference)
         return
     references = {name: every_reference[name] for name in BESIDE if name in every_reference}
     gain = GAINS[headline.headline_of(done)]
@@ -145,7 +149,7 @@ def _show(done: "Evaluated", dataset: "Dataset", seeds: int, selected: bool, ver
         *(meaning(name) for name in references),
     ]
     rows = {label(name, dataset.scenario): scores for name, scores in references.items()}
-    show(done, dataset.name, columns, notes, rows)
+    show(done, run, dataset.name, columns, notes, rows)
 
 
 def _refuse_language_models(specs: "Sequence[Spec]", who: "Workers", workers: str) -> None:

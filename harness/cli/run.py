@@ -260,6 +260,7 @@ def as_mapping(run: "Run") -> dict[str, Any]:
 
 def show(
     done: "Evaluated",
+    run: "Run",
     scenes: str,
     columns: Sequence[Column],
     notes: Sequence[str],
@@ -272,13 +273,13 @@ def show(
 
     Args:
         done: the run as it was just evaluated.
+        run: the same, as it was read from its folder.
         scenes: a phrase on its scenes.
         columns: the table's columns; a run with balanced success has a table of that first.
         notes: sentences to print below.
         beside: rows of references without a model: scores by name and metric; None for none.
     """
     from harness.report.findings import FIRST, LAST, Kind, findings
-    from harness.runs.folder import read
 
     manifest = done.manifest
     figures = {(s.condition, s.metric): s for s in done.scores if s.interval != "seed means"}
@@ -288,7 +289,6 @@ def show(
     text.print(f"{model} · prompt {prompt} · {manifest.answer} · {scenes}")
     if manifest.helpers:
         text.print(f"helpers: {printable(manifest.variant.helpers)}")
-    run = read(done.out)
     for finding in findings(run, *FIRST):
         text.print(finding.sentence)
     rows: dict[str, Mapping[str, Score | None]] = {}

@@ -191,11 +191,12 @@ def merge(
         return
     from harness.cli.report import write
     from harness.evaluate.run import merge
+    from harness.runs import folder
 
     done = merge(folders, out)
     with work.going_on(out):
         page = write([out], quiet=silent)
     work.tidy(out)
-    drive.tell(done, as_json, quiet)
+    drive.tell(done, folder.read(out), as_json, quiet)
     if not silent:
         typer.echo(f"wrote {printable(page)}")

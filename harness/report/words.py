@@ -114,20 +114,29 @@ def questions(run: Run) -> str:
     return f"asked: {', '.join(parts)}"
 
 
+def first_note(sentences: str) -> str:
+    """Return the first of a note's sentences as the beginning of a line, without its full stop."""
+    first, _, _ = sentences.partition(". ")
+    return f"note: {first.rstrip('.')}"
+
+
 def shown_change(change: Estimate) -> str:
     """Return a difference of success and its interval as text: `+7.7 [+3.1, +12.4] points`."""
     return f"{shown_estimate(change, POINTS, '+')} points"
 
 
-def judged(change: Estimate, p: float) -> str:
+def judged(change: Estimate, p: float, bounded: bool = True) -> str:
     """Return a difference of success as text that says whether it is clear (`p` is at most 0.05).
 
-    If it is not clear, the text says how large the difference can be by its interval.
+    If it is not clear, the text says how large the difference can be by its interval, unless
+    `bounded` is false.
     """
     text = shown_change(change)
     if math.isnan(change.low):
         return f"{text}, too few episodes for an interval"
-    unclear = f"not clear, but within {within(change.low, change.high)}"
+    unclear = "not clear"
+    if bounded:
+        unclear += f", but within {within(change.low, change.high)}"
     return f"{text}, {'a clear difference' if p <= LEVEL else unclear}"
 
 

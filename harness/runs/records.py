@@ -192,6 +192,11 @@ class Answer(Struct, frozen=True, kw_only=True):
         return " ".join(value) if column == "faults" else value
 
     @property
+    def likeliest(self) -> int | None:
+        """Return the place of its likeliest action, of equals the first; None if it failed."""
+        return self.intent.index(max(self.intent)) if self.intent else None
+
+    @property
     def id(self) -> str:
         """Return the id of its request: the scene's id, a slash, and the answer's key there."""
         return f"{self.scene}/{self.key}"

@@ -240,14 +240,8 @@ def _held(answers: Sequence[tuple[Answer, Answer]]) -> AnswersHeld:
         for a, b in same
         if (a.raw, a.verdict) != (b.raw, b.verdict)
     )
-    leaning = sum((_leaning(a), a.verdict) != (_leaning(b), b.verdict) for a, b in others)
+    leaning = sum((a.likeliest, a.verdict) != (b.likeliest, b.verdict) for a, b in others)
     return AnswersHeld(len(same), len(others), leaning, changed)
-
-
-def _leaning(answer: Answer) -> int | None:
-    """Return the place of an answer's likeliest action, of equals the first; None if it failed."""
-    intent = answer.intent
-    return intent.index(max(intent)) if intent else None
 
 
 def _question(answer: Answer) -> tuple[str, str | None]:

@@ -57,12 +57,9 @@ def render(comparison: Comparison, verdicts: Sequence[Verdict], most: int, place
         for (name, side), action in zip(sides.items(), (flip.a, flip.b), strict=True):
             answers = side.run.answers_by_scene.get(flip.scene, ())
             ego = next((answer for answer in answers if answer.role == "ego"), None)
-            leaning = ""
-            if ego and ego.intent:
-                leaning = side.run.actions[ego.intent.index(max(ego.intent))]
-            turned = (
-                f"; with what it heard, it took {action}" if leaning not in ("", action) else ""
-            )
+            place, turned = ego.likeliest if ego else None, ""
+            if place is not None and side.run.actions[place] != action:
+                turned = f"; with what it heard, it took {action}"
             raw = printable(ego.raw if ego else "nothing", RAW)
             yield name, raw, turned, link(side, flip.scene, condition, flip.seeds[0])
 

@@ -26,6 +26,7 @@ from harness.report.compare.difference import (
 from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Side, where
 from harness.report.findings import Kind
+from harness.report.words import first_note
 from harness.runs.headline import IN_WORDS, SUCCESS
 
 WIDTH = 80
@@ -78,7 +79,7 @@ def _brief_lines(comparison: Comparison, verdicts: Sequence[Verdict]) -> Iterato
         numbers = f"{row.a:>6}{row.b:>6}{row.change:>7} {row.interval:>17}{row.p:>8}"
         yield f"{label:<22}{numbers}{gained:>8}{lost:>5}"
     yield (
-        f"p: Holm's, of {words.primaries(comparison)} differences; gained, lost: of "
+        f"p: Holm's, of {len(words.corrected(comparison))} differences; gained, lost: of "
         f"{len(pair.episodes) * len(pair.seeds)} episodes × seeds"
     )
     for condition in comparison.conditions[-1:]:
@@ -86,12 +87,10 @@ def _brief_lines(comparison: Comparison, verdicts: Sequence[Verdict]) -> Iterato
         if episodes := ways.get("lost"):
             yield f"lost under {printable(condition.condition)}: {episodes}"
     yield f"answers: {words.answers_held(comparison.held)}"
-    warnings = words.caveats(pair, (Kind.VOID, Kind.CAVEAT))
-    yield from warnings
-    notes = [note for note in words.caveats(pair) if note not in warnings]
+    yield from words.caveats(pair, (Kind.VOID, Kind.CAVEAT))
+    notes = words.caveats(pair, (Kind.LIMIT,))
     if notes:
-        first, _, _ = notes[0].partition(". ")
-        yield f"note: {first.rstrip('.')} ({len(notes) - 1} more: --verbose)"
+        yield f"{first_note(notes[0])} ({len(notes) - 1} more: --verbose)"
     for verdict in verdicts:
         yield words.judged(verdict)
 

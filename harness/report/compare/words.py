@@ -332,10 +332,10 @@ def adjusted(c: InCondition) -> Iterator[str]:
             )
 
 
-def primaries(comparison: Comparison) -> int:
-    """Return how many differences are corrected for multiple testing, those of primary metrics."""
-    tested = [d for c in comparison.conditions for d in c.differences]
-    return sum(d.p_corrected is not None for d in tested)
+def corrected(comparison: Comparison) -> list[float]:
+    """Return the p-values that are corrected for multiple testing, those of primary metrics."""
+    differences = [d for c in comparison.conditions for d in c.differences]
+    return [d.p_corrected for d in differences if d.p_corrected is not None]
 
 
 def many(comparison: Comparison) -> str:
@@ -346,7 +346,7 @@ def many(comparison: Comparison) -> str:
     tested = [d for c in comparison.conditions for d in c.differences if d.p_value is not None]
     if not tested:
         return "no difference has a p: too few episodes, or none of them changed"
-    p_values = [d.p_corrected for d in tested if d.p_corrected is not None]
+    p_values = corrected(comparison)
     exploratory = len(tested) - len(p_values)
     hints = sum(not d.primary and (d.p_value or 0.0) <= LEVEL for d in tested)
     return (
