@@ -1,6 +1,6 @@
 """Define `Claims`: what helpers claim about themselves, as far as an ego can check it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -8,6 +8,28 @@ from typing import Any
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Measure how far places are from the lanes, of decisions that are on roads of their own."""
+
+    # of each road: takes places, (..., 2) m from the centroid of its conflict zone, and returns the
+    # distance of each to the middle of the nearest lane, m, (...)
+    from_road_m: Sequence[Callable[[Floats], Floats]]
+    road: Ints  # number of the road of each decision, (...)
+
+    def __call__(self, xy_m: Floats) -> Floats:
+        """Return the distances, m, (...), of places (..., 2); decisions are the leading axes."""
+        inner = (1,) * (xy_m.ndim - 1 - self.road.ndim)
+        road = np.broadcast_to(self.road.reshape(self.road.shape + inner), xy_m.shape[:-1])
+        metres = np.full(xy_m.shape[:-1], np.nan)
+        for number in np.unique(road).tolist():
+            metres[road == number] = self.from_road_m[number](xy_m[road == number])
+        return metres
+
+    def take(self, at: Any) -> "Maps":
+        return Maps(self.from_road_m, np.asarray(self.road[at]))
 
 
 @dataclass(frozen=True)
@@ -47,13 +69,14 @@ class Claims:
 
         `at` is an array of indices or a mask.
         """
+        maps = self.from_road_m
         return Claims(
             self.xy_m[at],
             self.speed_mps[at],
             self.time_s[at],
             self.error_m[at],
             self.sensed_m[at],
-            self.from_road_m,
+            maps.take(at) if isinstance(maps, Maps) else maps,
         )
 
     def of_helpers(self, places: Ints) -> "Claims":

@@ -10,7 +10,7 @@ import json
 import re
 import shlex
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from io import BytesIO
@@ -46,6 +46,7 @@ from harness.dataset.schema import (
 from harness.dataset.verify import level_name, read_manifest, tree_name
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
+from harness.world.families import keep
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 from harness.world.scenario_of_package import is_ours
@@ -149,10 +150,13 @@ def build(
     elif scenario.world:
         scenario.world.examine(scenario, seed)
     with work.working(out, start or work.WorkStart(settings=config, shard=part)) as place:
+        own_files = _write_own_files(scenario, out)
         _freeze_missing(scenario, place, seed, own_episodes, workers, progress)
         if shard:
             return config
-        manifest = _write_dataset(scenario, out, place, config, workers, progress, audits, more)
+        manifest = _write_dataset(
+            scenario, out, place, config, own_files, workers, progress, audits, more
+        )
         work.tidy(out)
     return manifest
 
@@ -175,6 +179,9 @@ def _settings(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:
     }
     if scenario.world and (config := scenario.world.configuration(scenario)):
         settings["environment"] = config
+    for key, text in (("source", scenario.source), ("licence", scenario.licence)):
+        if text:
+            settings[key] = text
     return settings
 
 
@@ -216,9 +223,18 @@ def merge(
                 work.same(out, whole.settings, stopped.settings)
             with work.working(out, whole) as place:
                 shards.collect(parts, place)
+        keep(config["scenario"], folders[0])
         scenario = scenarios.of_manifest(config["scenario"], config["parameters"])
         count, seed = config["episodes"], config["seed"]
         return build(scenario, out, count, seed, workers, progress, audits, more)
+
+
+def _write_own_files(scenario: Scenario, out: Path) -> dict[str, str]:
+    """Write what a scenario is made from into the dataset's folder; return each file's digest."""
+    files = scenario.world.files(scenario) if scenario.world else {}
+    for name, data in files.items():
+        write_whole(out / name, data)
+    return {name: sha256_bytes(data) for name, data in files.items()}
 
 
 def _freeze_missing(
@@ -263,12 +279,16 @@ def _write_dataset(
     out: Path,
     place: Path,
     config: dict[str, Any],
+    own_files: Mapping[str, str],
     workers: Workers,
     progress: Callable[[int], None],
     audits: bool,
     more: Callable[[int], None],
 ) -> dict[str, Any]:
-    """Write all files of a dataset from the layouts in `place`; return its manifest."""
+    """Write all files of a dataset from the layouts in `place`; return its manifest.
+
+    `own_files` has the digest of each file of the scenario's own, which is written already.
+    """
     name, episodes, seed = out.absolute().name, config["episodes"], config["seed"]
     texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
@@ -291,7 +311,7 @@ def _write_dataset(
         "name": name,
         **config,
         "nodes": sum(len(level) for tree in trees for level in tree.levels),
-        "files": {file: sha256_bytes(data) for file, data in files.items()},
+        "files": {**own_files, **{file: sha256_bytes(data) for file, data in files.items()}},
         "trees_sha256": [sha256_bytes(text) for text in texts],
     }
     for file, data in files.items():
@@ -305,12 +325,13 @@ def _freeze_layouts(scenario: Scenario, seed: int, episodes: Sequence[int]) -> l
     frozen = freeze(scenario, {episode: seed + episode for episode in episodes})
     trees, files = [], []
     for episode, (levels, scenes) in zip(episodes, frozen, strict=True):
+        kind = record_type(scenario.at(seed + episode))
         texts = []
         for level in scenes:
             lines = [canonical_json(msgspec.to_builtins(record)) + "\n" for record in level]
             texts.append("".join(lines).encode())
         for line in b"".join(texts).splitlines():  # a record that breaks its own form is a bug
-            msgspec.json.decode(line, type=record_type(scenario))
+            msgspec.json.decode(line, type=kind)
         digests = [sha256_bytes(text) for text in texts]
         tree = Tree(episode, seed + episode, scenes[0][0].danger, levels, digests)
         data = BytesIO()
@@ -393,6 +414,15 @@ def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
     return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"
 
 
+def _origin(config: dict[str, Any]) -> str:
+    """Return the card's paragraph on traffic that comes from elsewhere; empty for the harness's."""
+    source, licence = config.get("source"), config.get("licence")
+    if not source and not licence:
+        return ""
+    terms = printable(licence or "not stated")
+    return f"Traffic from {printable(source or 'a source not stated')}; licence: {terms}.\n\n"
+
+
 def _readme(
     name: str, command: str, config: dict[str, Any], forest: Forest, findings: Sequence[str]
 ) -> str:
@@ -417,7 +447,7 @@ ended as in the trees.
 
 {audit_text}
 
-| who decides | success, % of {seeds} layouts |
+{_origin(config)}| who decides | success, % of {seeds} layouts |
 |---|---|
 | the best policy | {rate:.1f} |
 {drivers}

@@ -30,6 +30,7 @@ TAGS = (
     "benchmark",
 )
 PAPER = "https://arxiv.org/abs/2604.22852"
+SIMULATED = "The scenes are simulated: no recording of a real road, vehicle or person is in them."
 UNSTATED = "Not stated: whoever built the dataset decides. Write it here and above."
 LICENCE = "https://www.apache.org/licenses/LICENSE-2.0"
 # rows at which the hub's sizes end
@@ -97,11 +98,27 @@ def readme(name: str, tables: Sequence[Table]) -> str:
         columns=_lines(_row(f"`{c.name}`", f"`{c.kind}`", c.meaning) for c in COLUMNS),
         references=_lines(_references(tables)),
         limits=_lines(f"- {limit}" for limit in limits(tables)),
-        licence=f"[Apache-2.0]({LICENCE})." if released else UNSTATED,
+        licence=f"[Apache-2.0]({LICENCE})." if released else _licence(tables),
+        origin=_origin(tables),
         version=__version__,
         paper=PAPER,
         sources=_lines(f"- `{t.name}`, manifest sha256 `{t.dataset_sha256}`" for t in tables),
     )
+
+
+def _licence(tables: Sequence[Table]) -> str:
+    """Return what datasets state of the terms of their traffic; a line that asks for it if none."""
+    licences = {t.name: t.manifest.licence for t in tables if t.manifest.licence}
+    lines = _lines(f"- `{name}`: {_code(licence)}" for name, licence in licences.items())
+    return lines or UNSTATED
+
+
+def _origin(tables: Sequence[Table]) -> str:
+    """Return where the traffic of datasets comes from, as far as they state it."""
+    sources = {t.name: t.manifest.source for t in tables if t.manifest.source}
+    if not sources:
+        return SIMULATED
+    return _lines(f"- Traffic of `{name}`: {_code(source)}" for name, source in sources.items())
 
 
 def _front_matter(name: str, tables: Sequence[Table]) -> dict[str, Any]:
@@ -168,9 +185,11 @@ def limits(tables: Sequence[Table]) -> Iterator[str]:
         f"An action acts {lags} ms after the moment of its decision, whoever decides. The trees do "
         "not say what becomes of a slower model."
     )
+    elsewhere = any(t.manifest.source for t in tables)
+    made = "Consequences" if elsewhere else "Scenes, traffic and drivers"
     yield (
-        "Scenes, traffic and drivers are of one simulator, and texts are English: nothing here "
-        "shows that a model is safe on a road."
+        f"{made} are of one simulator, and texts are English: nothing here shows that a model is "
+        "safe on a road."
     )
 
 
@@ -343,8 +362,10 @@ ego sees; `uniform` draws every action with the same probability.
 
 {licence}
 
-The scenes are simulated: no recording of a real road, vehicle or person is in them. `harness dataset
-export` of SwarmDrive Harness {version} wrote this folder, after the [SwarmDrive paper]({paper}), from:
+{origin}
+
+`harness dataset export` of SwarmDrive Harness {version} wrote this folder, after the
+[SwarmDrive paper]({paper}), from:
 
 {sources}
 """  # noqa: E501

@@ -46,6 +46,9 @@ def freeze(scenario: Scenario, seeds: Mapping[int, int]) -> list[Frozen]:
     point that decisions can lead to. `seeds` has the seed that draws a layout, by the number of its
     episode.
     """
+    if scenario.layouts is not None:
+        alone = [freeze(scenario.at(seed), {episode: seed}) for episode, seed in seeds.items()]
+        return [frozen for [frozen] in alone]
     level = [(episode, World.start(scenario, seed)) for episode, seed in seeds.items()]
     trees = {episode: Frozen([], []) for episode in seeds}
     facts = dict(scenario.road().facts)

@@ -56,8 +56,8 @@ class Scene:
     record: Record  # state and scene graphs, as a dataset has them
     # results computed from the scene, by name, kept so that they are computed once
     notes: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
-    # the scenario as the vehicle that decides here plays it, with itself as the ego; None where
-    # that is the scenario's own ego
+    # the scenario as it is here: as the vehicle that decides plays it, with itself as the ego, and
+    # on this layout's road; None where that is the scenario's own ego, and its only road
     seat: Scenario | None = None
     agent: int = 0  # index of who decides among the vehicles that can be asked; the ego has 0
     several: bool = False  # whether vehicles beside the ego can decide in this scenario
@@ -257,12 +257,18 @@ class Dataset:
         if missing:
             with opened(self.path) as file:
                 for (number, step), places in missing.items():
+                    seat = self._seat(number)
                     for record in self._records(file, self.trees.read(number), step, places):
-                        self._scenes[record.scene] = Scene(record)
+                        self._scenes[record.scene] = Scene(record, seat=seat)
         scenes = [self._scenes[name] for name in ids]
         for name in list(islice(self._scenes, max(0, len(self._scenes) - SCENES_KEPT))):
             del self._scenes[name]
         return scenes
+
+    def _seat(self, number: int) -> Scenario | None:
+        """Return the scenario as an episode's layout has it; None if all have one road."""
+        scenario = self.scenario
+        return None if scenario.layouts is None else scenario.at(self.manifest.seed + number)
 
     def __contains__(self, name: str) -> bool:
         try:

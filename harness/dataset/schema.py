@@ -143,7 +143,8 @@ class Manifest(Closed, frozen=True):
     """`manifest.json`: what a dataset was built from,
     and the sha256 of every file and of every tree.
 
-    Of an environment it holds the whole configuration.
+    Of an environment it holds the whole configuration, and of traffic from elsewhere the source
+    and its licence.
     """
 
     format: Literal["swarmdrive-dataset/2"]
@@ -159,6 +160,8 @@ class Manifest(Closed, frozen=True):
     files: dict[FileName, Sha256]
     trees_sha256: list[Sha256]
     environment: dict[str, Any] | None = None
+    source: Annotated[str, Meta(max_length=1000)] = ""
+    licence: Annotated[str, Meta(max_length=1000)] = ""
 
 
 def plain_type(scenario: Scenario) -> type[Record]:
@@ -170,8 +173,11 @@ def plain_type(scenario: Scenario) -> type[Record]:
 def record_type(scenario: Scenario) -> type[Record]:
     """Return `Record` with only the names allowed that the scenario's road has.
 
-    These are the names of its approaches, routes, sectors and facts.
+    These are the names of its approaches, routes, sectors and facts; any names where each layout
+    has a road of its own.
     """
+    if scenario.layouts is not None:
+        return plain_type(scenario)
     road = scenario.road()
     approach = _choice(approach for approach, _ in road.paths)
     route = _choice(route for _, route in road.paths)

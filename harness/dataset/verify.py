@@ -30,6 +30,7 @@ from harness.dataset.schema import (
 )
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
+from harness.world.families import keep
 from harness.world.parameters import LATER
 from harness.world.scenario import Scenario
 from harness.world.state import Snapshot
@@ -62,6 +63,7 @@ def read_manifest(path: Path) -> tuple[Manifest, str]:
             f"{printable(file)} cannot be read ({printable(error)}); build the dataset again"
         ) from None
     try:
+        keep(manifest.scenario, path)
         scenario = scenarios.get(manifest.scenario)
     except UserError as error:
         raise UserError(f"{printable(file)}: {error}") from None
@@ -321,7 +323,8 @@ def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, 
     `manifest` is the dataset's, which the record must fit, and `name` is the scene id that it
     should have.
     """
-    scenario = scenarios.get(manifest.scenario)
+    whole, episode = scenarios.get(manifest.scenario), name.partition("-")[0]
+    scenario = whole if whole.layouts is None else whole.at(manifest.seed + int(episode))
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
     try:
         record = msgspec.json.decode(line, type=kind)

@@ -9,12 +9,12 @@ from functools import lru_cache
 import numpy as np
 import shapely
 
-from harness.coordination.claims import Claims
+from harness.coordination.claims import Claims, Maps
 from harness.core.arrays import Floats
 from harness.dataset.load import Scene
 from harness.world.beacons import state_by_beacon
 from harness.world.road import Road
-from harness.world.scenario import Scenario
+from harness.world.scenario import LAYOUTS_KEPT, Scenario
 
 NEGLIGIBLE_M = 0.01  # how far a simplified line of the map may be off
 
@@ -26,12 +26,13 @@ def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
     where a scene has fewer helpers than another. `scenario` is that of the scenes. Rules that fuse
     messages and rate trust, and attacks, use them.
     """
-    road, p = scenario.road(), scenario.parameters
+    p = scenario.parameters
+    by_scene = [scenario.at(scene.state.episode_seed) for scene in scenes]
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     xy_m = np.full((n, 1 + helpers, 2), np.nan)
     speed_mps, sensed_m = np.full((2, n, helpers), np.nan)
     for i, scene in enumerate(scenes):
-        places, speeds, sensed = _claims(road, scene)
+        places, speeds, sensed = _claims(by_scene[i].road(), scene)
         xy_m[i, : len(places)], speed_mps[i, : len(speeds)], sensed_m[i, : len(sensed)] = (
             places,
             speeds,
@@ -39,7 +40,16 @@ def claims(scenario: Scenario, scenes: Sequence[Scene]) -> Claims:
         )
     time_s = np.array([scene.state.time_s for scene in scenes])
     error_m = np.full(n, 0.0 if p.perfect_knowledge else p.beacon_noise_m)
-    return Claims(xy_m, speed_mps, time_s, error_m, sensed_m, _map(scenario))
+    return Claims(xy_m, speed_mps, time_s, error_m, sensed_m, _maps(scenario, by_scene))
+
+
+def _maps(scenario: Scenario, by_scene: Sequence[Scenario]) -> Callable[[Floats], Floats]:
+    """Return the map, or those of the roads of n decisions, whose scenarios are `by_scene`."""
+    if scenario.layouts is None:
+        return _map(scenario)
+    numbers = {each: number for number, each in enumerate(dict.fromkeys(by_scene))}
+    road = np.array([numbers[each] for each in by_scene], dtype=int)
+    return Maps([_map(each) for each in numbers], road)
 
 
 def _claims(road: Road, scene: Scene) -> tuple[Floats, Floats, Floats]:
@@ -69,7 +79,7 @@ def _claims(road: Road, scene: Scene) -> tuple[Floats, Floats, Floats]:
     return notes
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=LAYOUTS_KEPT)
 def _map(scenario: Scenario) -> Callable[[Floats], Floats]:
     """Return the function from places (..., 2) to metres to the nearest path.
 

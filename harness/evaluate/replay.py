@@ -41,7 +41,7 @@ class ReplayedEpisode:
 
     @cached_property
     def scenario(self) -> Scenario:
-        return self.manifest.scenario
+        return self.manifest.scenario.at(self.layout_seed)
 
 
 def played(run: Run, episode: int, condition: str, seed: int) -> ReplayedEpisode:
@@ -78,8 +78,7 @@ def _together(run: Run, names: Sequence[str]) -> list[Scene]:
     starts = [run.decisions.scenes[name].start for name in names]
     decisions = [run.decisions.records(start, start + 1)[0] for start in starts]
     episodes = [played(run, d.episode, d.condition, d.seed) for d in decisions]
-    scenario = episodes[0].scenario
-    worlds = [World.start(scenario, episode.layout_seed) for episode in episodes]
+    worlds = [World.start(episode.scenario, episode.layout_seed) for episode in episodes]
     due_frames = [due_frame(world, d) for world, d in zip(worlds, decisions, strict=True)]
     acts = []
     for episode, last in zip(episodes, due_frames, strict=True):

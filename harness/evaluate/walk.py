@@ -173,7 +173,10 @@ class SceneWorld:
 
     def site(self, antennas: Collection[Antenna]) -> Site:
         decision_points = [(scene.state, scene.viewers) for scene in self.scenes]
-        return site(decision_points, antennas, self.scenario.road().zone_m)
+        zones_m = [
+            self.scenario.at(scene.state.episode_seed).road().zone_m for scene in self.scenes
+        ]
+        return site(decision_points, antennas, zones_m)
 
     def outlook(self) -> Outlook:
         return outlook(self.scenario, self.scenes)

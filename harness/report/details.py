@@ -28,7 +28,13 @@ from harness.evaluate.fusion import messages_of, source_of
 from harness.evaluate.sharing import as_asked
 from harness.parsing.parse import spans
 from harness.prompts.versions import Prompt
-from harness.report.drawing.geometry import conflict_points, north_up, spots, view_of
+from harness.report.drawing.geometry import (
+    conflict_points,
+    drawn_ground,
+    north_up,
+    spots,
+    view_of,
+)
 from harness.report.library import packed, picture
 from harness.report.remarks import LeftOut
 from harness.report.runs import Runs
@@ -448,7 +454,9 @@ def _world(
             "conflicts": _conflicts(*crossed),
             "views": views,
         }
+    ground = {"ground": drawn_ground(scenario)} if scenario.layout_seed is not None else {}
     return {
+        **ground,
         "time_s": round(state.time_s, 3),
         "vehicles": [_vehicle(vehicle, danger) for vehicle in state.vehicles],
         "buildings": [

@@ -26,7 +26,7 @@ from harness.report.constancy import tile
 from harness.report.decisions import Decisions
 from harness.report.details import Part, Prompts, prompts_of
 from harness.report.drawing import colours
-from harness.report.drawing.geometry import VIEW_M, ground_of
+from harness.report.drawing.geometry import drawn_ground
 from harness.report.findings import LAST, Kind, findings, of_runs
 from harness.report.panels import panels
 from harness.report.remarks import sentences
@@ -222,17 +222,11 @@ def _packed(
 
 def _about(runs: Runs, charts: Sequence[Any]) -> dict[str, Any]:
     """Return what the page's script has to know of the runs, besides the decisions."""
-    surface = ground_of(runs.scenario)
     return {
         "names": runs.names,
         "runs": [_settings(run) for run in runs.runs],
         "meanings": {str(member): member.meaning for member in (*Status, *Repair)},
-        "ground": {
-            "view_m": VIEW_M,
-            "outlines": [outline.round(2).tolist() for outline in surface.outlines],
-            "marks": [mark.tolist() for mark in surface.marks],
-            "stops": [stop.tolist() for stop in surface.stops],
-        },
+        "ground": drawn_ground(runs.scenario),
         "charts": {chart.id: chart.spec for chart in charts},
         "actions": _actions(runs),
         "policies": policies(runs.actions),

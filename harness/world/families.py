@@ -4,6 +4,7 @@ An extension adds them (`adds={"families": ...}`), each with a reader of such na
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from harness.core.errors import UserError, printable
@@ -62,6 +63,15 @@ class Family(Protocol):
         """
         ...
 
+    def kept_in(self, name: str, folder: Path) -> None:
+        """Take note that the folder of a dataset may hold what a scenario of it is made from.
+
+        It is called with the `name` that the dataset states before `scenario` is, also for the
+        datasets of strangers: what lies in `folder` may be used only if it has the digest that the
+        name states. Worker processes must find it, too.
+        """
+        ...
+
 
 FAMILIES = Shipped[Family]("swarmdrive.families", Family, {})  # of none but extensions that ship
 
@@ -80,3 +90,12 @@ def family_of(text: str) -> Family | None:
     if owner := owner_of_plugin("families", name):
         raise UserError(f"scenario {printable(text, 80)} is {part_of(owner)}")
     return None
+
+
+def keep(text: str, folder: Path) -> None:
+    """Let the family of a scenario know the folder of a dataset that states the scenario's name.
+
+    `text` is that name; of scenarios that are no family's nothing is kept.
+    """
+    if family := family_of(text):
+        family.kept_in(text, folder)

@@ -62,3 +62,12 @@ class OwnWorld(World):
         environment's settings.
         """
         return None
+
+    @classmethod
+    def files(cls, scenario: Scenario) -> Mapping[str, bytes]:
+        """Return what a dataset of `scenario` must hold so that the scenario can be made from it.
+
+        It is the content of each file by its name, such as the traffic that was recorded; a reader
+        of scenario names finds them in the dataset's folder (`Family.kept_in`). Empty for nothing.
+        """
+        return {}

@@ -3,7 +3,8 @@ Other code takes a scenario as an argument.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import InitVar, dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
@@ -14,6 +15,7 @@ from harness.world.parameters import SETTABLE, Parameters
 from harness.world.road import PathKey, Road
 from harness.world.state import Building, Kind, Part
 
+LAYOUTS_KEPT = 64  # scenarios of single layouts that stay in memory, each with its road
 KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
 
@@ -156,6 +158,12 @@ class Scenario:
     # the class of its worlds, an `OwnWorld`, if they are played elsewhere; None for the harness's
     # own simulator
     world: type[Any] | None = None
+    # returns the scenario as the layout of a seed, its argument, has it: with that layout's road,
+    # goal and words; only of worlds that are played elsewhere. None if all layouts have one road
+    layouts: Callable[[int], "Scenario"] | None = None
+    layout_seed: int | None = None  # seed of the only layout that has this road; None for all
+    source: str = ""  # where its traffic comes from, for a dataset's card; empty for the harness's
+    licence: str = ""  # terms of that source, for the card; empty for the harness's own
     # spelling of 0.2, until 0.5.0: what starts an episode of such a world; takes the scenario and
     # the layout seed
     start: InitVar[Callable[["Scenario", int], Any] | None] = None
@@ -176,6 +184,13 @@ class Scenario:
         """
         return self.world is not None
 
+    def at(self, seed: int) -> "Scenario":
+        """Return the scenario as the layout of a seed has it, with that layout's road.
+
+        It is the scenario itself unless layouts have roads of their own (`layouts`).
+        """
+        return self if self.layouts is None else _at(self, seed)
+
     @property
     def prompt_words(self) -> dict[str, str]:
         """Return texts for prompts by name: `words`, and `speeds`, the target speeds in m/s.
@@ -190,7 +205,14 @@ class Scenario:
         return self.description.strip().splitlines()[0].partition(": ")[2]
 
     def __hash__(self) -> int:
-        return hash((self.name, self.parameters))
+        return hash((self.name, self.parameters, self.layout_seed))
+
+
+@lru_cache(maxsize=LAYOUTS_KEPT)
+def _at(scenario: Scenario, seed: int) -> Scenario:
+    assert scenario.layouts is not None
+    of_layout = scenario.layouts(seed)
+    return replace(of_layout, parameters=scenario.parameters, layouts=None, layout_seed=seed)
 
 
 def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:

@@ -22,14 +22,15 @@ Place = tuple[float, float]
 def site(
     points: Sequence[tuple[WorldState, Sequence[str]]],
     antennas: Collection[Antenna] = (),
-    zone_m: Place = (0.0, 0.0),
+    zones_m: Sequence[Place] = (),
 ) -> Site:
     """Return where the ego and its helpers are in n states, and what is between them.
 
     Arrays of the result are (n, ...). Each of the n `points` is a state with the ids of its ego and
     helpers, the ego first. Antennas are at vehicle centres; if a building and a vehicle both block
     a link, the building counts. `antennas` are on no vehicle, and add links to the ego and helpers;
-    their positions are relative to `zone_m`, the centre of the conflict zone, m.
+    their positions are relative to the point's entry in `zones_m`, the centre of the conflict zone
+    of its road, m. It is needed where there are antennas.
     """
     states = [state for state, _ in points]
     viewers: list[list[VehicleState]] = []
@@ -40,8 +41,7 @@ def site(
     among = _site(list(zip(states, egos, helpers, strict=True)))
     of_antennas = {}
     for antenna in antennas:
-        place_m = zone_m[0] + antenna.x_m, zone_m[1] + antenna.y_m
-        places_m = [place_m] * len(points)
+        places_m = [(x_m + antenna.x_m, y_m + antenna.y_m) for x_m, y_m in zones_m]
         links = _site(list(zip(states, places_m, viewers, strict=True)))
         of_antennas[antenna] = replace(links, first_m=antenna.height_m)
     return replace(among, antennas=of_antennas)

@@ -81,7 +81,8 @@ class World:
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
-        return (scenario.world or World).begun(scenario, seed)
+        of_layout = scenario.at(seed)
+        return (of_layout.world or World).begun(of_layout, seed)
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "World":
@@ -162,7 +163,8 @@ class World:
         No outcome is decided in it, and what was counted until then starts at 0. The class is that
         of the scenario's worlds.
         """
-        return (scenario.world or World).resumed(scenario, state, snapshot)
+        of_layout = scenario.at(state.episode_seed)
+        return (of_layout.world or World).resumed(of_layout, state, snapshot)
 
     @classmethod
     def resumed(cls, scenario: Scenario, state: WorldState, snapshot: Any) -> "World":

@@ -74,5 +74,8 @@ class Environments:
         variable = environment.IMPORTS
         return f"commands that read it import {module_name}, if you set {variable}={module_name}"
 
+    def kept_in(self, name: str, folder: Path) -> None:
+        pass  # a name has all that an environment is made from
+
 
 ENVIRONMENTS = Environments()

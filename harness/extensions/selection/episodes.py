@@ -65,10 +65,13 @@ class Episodes(Selection):
                 f"--danger {printable(self.danger)}: where a layout's danger comes from is known "
                 "of a dataset's; leave it out"
             )
-        sectors = tuple(dataset.scenario.road().sectors)
-        if self.danger not in (*sectors, NONE):
-            raise unknown("--danger", str(self.danger), (*sectors, NONE))
-        return {tree.episode: tree.danger.sector or NONE for tree in dataset.trees}
+        dangers = {tree.episode: tree.danger.sector or NONE for tree in dataset.trees}
+        whole = dataset.scenario
+        sectors = dangers.values() if whole.layouts is not None else whole.road().sectors
+        allowed = tuple(dict.fromkeys((*sectors, NONE)))
+        if self.danger not in allowed:
+            raise unknown("--danger", str(self.danger), allowed)
+        return dangers
 
 
 SELECTION = Episodes()

@@ -5,6 +5,7 @@ The frame of `harness.world.road` has south instead, so every position is flippe
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -53,6 +54,20 @@ def ground_of(scenario: Scenario) -> Ground:
     east and to the north of the scenario's origin.
     """
     return scenario.road().ground_within(VIEW_M + BEYOND_M)
+
+
+def drawn_ground(scenario: Scenario) -> dict[str, Any]:
+    """Return the ground of a scenario's road as a page's script draws it: lists of points, m.
+
+    Points are to the east and to the north of the scenario's origin, up to `view_m` on each side.
+    """
+    surface = ground_of(scenario)
+    return {
+        "view_m": VIEW_M,
+        "outlines": [outline.round(2).tolist() for outline in surface.outlines],
+        "marks": [mark.tolist() for mark in surface.marks],
+        "stops": [stop.tolist() for stop in surface.stops],
+    }
 
 
 def shape_of(scenario: Scenario) -> float:

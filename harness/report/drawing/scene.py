@@ -61,7 +61,8 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     graph = scene.graphs[viewer]
     seen = {*graph.seen, viewer}
 
-    scenario, state = scenarios.get(scene.state.scenario), scene.state
+    state = scene.state
+    scenario = scenarios.get(state.scenario).at(state.episode_seed)
     road, shape = scenario.road(), shape_of(scenario)
     held = spots(state, road.zone_m, graph, (scene.record.danger.vehicle, *scene.viewers))
     view = view_of(held, shape)

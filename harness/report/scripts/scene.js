@@ -46,7 +46,9 @@ function shadows(world, eye, far) {
 
 // `zoom` is all, or the west and south ends of a square and its side; else what the messages need is shown.
 // `agents` are those that decide in the same step: each with its id, what it decided and its page.
-function birdsEye(world, ground, viewer, messages, zoom, agents) {
+// `common` is the ground of all scenes; one whose layout has a road of its own brings its own.
+function birdsEye(world, common, viewer, messages, zoom, agents) {
+  const ground = world.ground ?? common;
   const eye = world.vehicles.find((v) => v.id === viewer), sees = world.viewers[viewer];
   const seen = new Set([viewer, ...sees.seen]), most = ground.view_m;
   const ego = world.vehicles.find((v) => v.part === "ego") ?? eye;

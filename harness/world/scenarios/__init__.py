@@ -207,15 +207,21 @@ def of_manifest(name: str, parameters: Mapping[str, Any]) -> Scenario:
     return replace(scenario, parameters=convert(values, type(scenario.parameters), where))
 
 
-def restore(name: str, parameters: Parameters) -> Scenario:
+def restore(name: str, parameters: Parameters, layout_seed: int | None = None) -> Scenario:
     """Return the scenario that was pickled as this name and these parameters.
 
-    Pickle calls it, since a scenario's functions cannot be pickled.
+    Pickle calls it, since a scenario's functions cannot be pickled. `layout_seed` is that of the
+    layout whose road it has; None if all layouts have one road.
     """
-    return replace(get(name), parameters=parameters)
+    scenario = replace(get(name), parameters=parameters)
+    return scenario if layout_seed is None else scenario.at(layout_seed)
 
 
-copyreg.pickle(Scenario, lambda scenario: (restore, (scenario.name, scenario.parameters)))
+def _pickled(scenario: Scenario) -> tuple[Any, tuple[Any, ...]]:
+    return restore, (scenario.name, scenario.parameters, scenario.layout_seed)
+
+
+copyreg.pickle(Scenario, _pickled)
 
 
 @cache  # called for every answer of the proxy

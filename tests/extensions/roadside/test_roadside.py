@@ -393,13 +393,13 @@ def test_a_unit_above_the_crossing_sees_round_the_corner_and_past_no_truck():
     ego, helper, truck = car("v1", -25, 0), car("v2", 0, 25), car("v9", 10, 0, "truck")
     state = WorldState("any", 0, 0, 0.0, 8.0, (ego, helper, truck), (corner,))
     beside = Antenna(30.0, 0.0, 5.0)
-    links = site([(state, ["v1", "v2"])], [ABOVE, beside], zone_m=(0.0, 0.0))
+    links = site([(state, ["v1", "v2"])], [ABOVE, beside], zones_m=[(0.0, 0.0)])
     assert links.sight.tolist() == [[BUILDING]]
     assert links.antennas[ABOVE].sight.tolist() == [[CLEAR, CLEAR]]
     assert links.antennas[beside].sight.tolist() == [[VEHICLE, CLEAR]]
     assert links.antennas[beside].blocker_m.tolist() == [[3.6, 0.0]]
     assert links.antennas[ABOVE].distance_m.tolist() == [[25, 25]]
-    assert site([(state, ["v1"])], [beside], zone_m=(-30.0, 0.0)).antennas[
+    assert site([(state, ["v1"])], [beside], zones_m=[(-30.0, 0.0)]).antennas[
         beside
     ].distance_m.tolist() == [[25]]
     assert links.antennas[beside].first_m == 5.0

@@ -68,11 +68,17 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
             raise UserError(
                 'reward="regret" needs values; give then="local-view", or reward="success"'
             )
+        if observation == "arrays" and source.scenario.layouts is not None:
+            raise UserError(
+                "the layouts here have roads of their own, and vectors need one road; give "
+                'observation="text"'
+            )
         self.source, self.ask, self.actions = source, ask, source.scenario.actions
         self.viewer, self.reward, self._text = viewer, reward, observation == "text"
         scene = source.begin(source.seeds[0]).scene
+        road = source.scenario.at(scene.state.episode_seed).road()
         graph = scene.graphs[asking.viewer_of(scene, viewer, 0.0)]
-        self.numbers = tuple(name for name, _ in numbers(graph, source.scenario.road()))
+        self.numbers = tuple(name for name, _ in numbers(graph, road))
         count = len(self.actions)
         self.action_space = (
             spaces.Box(0.0, 1.0, (count,)) if distributions else spaces.Discrete(count)

@@ -114,12 +114,12 @@ def mirrored(spec: Spec, scene: Scene, graph: SceneGraph) -> SceneGraph:
 
     A twin is the question put another way, to test whether the answer stays, mirrored. A scene
     graph is what the asked vehicle knows of the scene. It is unchanged if the scenario of the
-    evaluation `spec` may not be mirrored, or its road lacks a mirrored path. `scene` is not read.
+    evaluation `spec` may not be mirrored, or the road of `scene` lacks a mirrored path.
     """
     if spec.scenario.one_sided is not None:
         return graph
     twin = swapped(graph)
-    paths = spec.scenario.road().paths
+    paths = spec.scenario_of(scene).road().paths
     return twin if all((c.sector, c.route) in paths for c in twin.conflicts) else graph
 
 
