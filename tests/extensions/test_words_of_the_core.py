@@ -71,6 +71,7 @@ ORDINARY = {
     "read-outs": "of a policy from a model's probabilities",
     "repeats": "a verb, and evaluations alike",
     "risk": "an answer's level, and errors by confidence",
+    "roads": "what lanes are on",
     "roadside": "what the paper's 6G may have beside the road, a second path",
     "rounds": "of messages on a channel, and of numbers",
     "sample": "what is drawn of many",

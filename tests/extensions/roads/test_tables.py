@@ -1,0 +1,190 @@
+"""Recordings: what is written is read, and what cannot be is refused in one line."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from harness.core.errors import UserError
+from harness.extensions.roads import tables
+from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track
+
+SHA = "0" * 64
+
+
+def straight(key: str, x_m: float, speed_mps: float, y_m: float = 0.0, **changed: Any) -> Track:
+    """Return a car that drives to the east for three seconds, a pose a second."""
+    time_s = np.arange(4.0)
+    poses = np.stack([x_m + speed_mps * time_s, *np.full((2, 4), 0.0), np.full(4, speed_mps)], 1)
+    poses[:, 1] = y_m
+    return replace(Track(key, "car", 5.0, 2.0, time_s, poses), **changed)
+
+
+def road(**changed: Any) -> Scene:
+    """Return a road of two lanes of one direction, with two cars, one parked, and a house."""
+    west, east = np.array([[0.0, 0.0], [100.0, 0.0]]), np.array([[0.0, 4.0], [100.0, 4.0]])
+    lanes = {
+        "1": Lane("1", west, 4.0, 13.9, (), "2", None),
+        "2": Lane("2", east, 4.0, None, (), None, "1"),
+    }
+    tracks = {"a": straight("a", 0.0, 10.0), "b": straight("b", 50.0, 0.0, 4.0)}
+    house = House("h", np.array([[10.0, 10.0], [20.0, 10.0], [20.0, 20.0]]))
+    return replace(Scene("s", "s.xml", SHA, 1.0, False, tracks, lanes, (house,)), **changed)
+
+
+def written(folder: Path, *scenes: Scene, moments: Any = ()) -> tables.Recording:
+    return tables.write(folder, "mine", "drawn", "mine", 80.0, scenes, moments, {"rule": "none"})
+
+
+def test_a_track_between_its_poses() -> None:
+    turning = np.array([[0.0, 0.0, 3.0, 1.0], [2.0, 4.0, -3.0, 3.0]])
+    track = Track("a", "car", 5.0, 2.0, np.array([1.0, 2.0]), turning)
+    assert np.allclose(track.at(1.25), [0.5, 1.0, 3.0 + (2 * np.pi - 6) / 4, 1.5])
+    assert track.at(0.9) is None
+    assert track.at(2.1) is None
+    assert np.allclose(track.at(2.0), turning[1])
+    assert [straight("a", 0, 10).still, straight("a", 0, 0).still] == [False, True]
+
+
+def test_a_recording_is_read_as_it_was_written(tmp_path: Path) -> None:
+    scene, moment = road(), Moment("s", "a", 1.0, "b", 2.5, "report")
+    empty = replace(scene, name="t", houses=())
+    recording = written(tmp_path, scene, empty, moments=[moment])
+    assert recording.moments == (moment,)
+    assert (recording.name, recording.source, recording.licence) == ("mine", "drawn", "mine")
+    assert (recording.scene("s").begin_s, recording.scene("s").end_s) == (0, 3)
+    for source in (scene, empty):
+        same(recording.scene(source.name), source)
+    with pytest.raises(UserError, match="no scene nowhere"):
+        recording.scene("nowhere")
+
+
+def same(read: Scene, scene: Scene) -> None:
+    assert (read.name, read.file, read.sha256, read.step_s, read.lights) == (
+        *(scene.name, scene.file, scene.sha256, scene.step_s, scene.lights),
+    )
+    for kind in ("tracks", "lanes"):
+        things, others = getattr(read, kind), getattr(scene, kind)
+        assert list(things) == sorted(others)
+        for key, thing in things.items():
+            for name, value in vars(others[key]).items():
+                assert np.array_equal(vars(thing)[name], value), name
+    for house, other in zip(read.houses, scene.houses, strict=True):
+        assert house.id == other.id
+        assert np.array_equal(house.outline, other.outline)
+
+
+NAMES = st.text(min_size=1, max_size=5)
+NUMBERS = st.floats(-1e6, 1e6)
+
+
+@st.composite
+def drawn(draw: Callable[..., Any]) -> Scene:
+    """Draw a scene: tracks far from each other, any ids, any number of poses."""
+    tracks = {}
+    for place, key in enumerate(draw(st.lists(NAMES, min_size=1, max_size=4, unique=True))):
+        n = draw(st.integers(1, 5))
+        poses = np.array(draw(st.lists(NUMBERS, min_size=4 * n, max_size=4 * n))).reshape(n, 4)
+        poses[:, 0], poses[:, 3] = place * 100.0, poses[:, 3] / 1e5
+        kind = draw(st.sampled_from(tables.KINDS))
+        begin_s = draw(st.floats(-1e3, 1e3))
+        tracks[key] = Track(key, kind, 4.0, 2.0, begin_s + np.arange(n) / 10, poses)
+    lanes = {}
+    names = draw(st.lists(NAMES, min_size=2, max_size=4, unique=True))
+    for key in names:
+        points = np.cumsum(draw(st.lists(st.floats(1, 9), min_size=4, max_size=8)))
+        line = points[: len(points) // 2 * 2].reshape(-1, 2)
+        others = [other for other in names if other != key]
+        beside = draw(st.sampled_from([None, *others]))
+        limit = draw(st.none() | st.floats(1, 50))
+        lanes[key] = Lane(key, line, 3.5, limit, tuple(others[:2]), beside, None)
+    return Scene("s", "f", SHA, 0.1, draw(st.booleans()), tracks, lanes)
+
+
+@settings(max_examples=20)
+@given(drawn())
+def test_any_scene_is_read_as_it_was_written(tmp_path_factory: Any, scene: Scene) -> None:
+    same(written(tmp_path_factory.mktemp("r"), scene).scene("s"), scene)
+
+
+def poses(**changed: float) -> dict[str, Track]:
+    track = straight("a", 0.0, 10.0)
+    for name, value in changed.items():
+        track.poses[1, tables.POSES.index(name)] = value
+    return {"a": track}
+
+
+LINE = np.array([[0.0, 0.0], [9.0, 0.0]])
+WRONG: dict[str, dict[str, Any]] = {
+    "a time or pose is no number": {"tracks": poses(x_m=np.nan)},
+    "is more than 1e+08 m from": {"tracks": poses(y_m=1e9)},
+    "a speed is above 120 m/s": {"tracks": poses(speed_mps=500)},
+    "time does not rise after 0 s": {"tracks": {"a": straight("a", 0, 1, time_s=np.zeros(4))}},
+    "kind 'tram'; allowed: car, van": {"tracks": {"a": straight("a", 0, 1, kind="tram")}},
+    "length_m 0; allowed: 0.1 to 60": {"tracks": {"a": straight("a", 0, 1, length_m=0.0)}},
+    "b appears at 0 s where a is already": {
+        "tracks": {"a": straight("a", 0, 1), "b": straight("b", 3, 1)}
+    },
+    "nobody moves or stands there": {"tracks": {}},
+    "it has no lanes": {"lanes": {}},
+    "lane 1 has no length": {"lanes": {"1": Lane("1", 0 * LINE, 4, None, (), None, None)}},
+    "lane 1: width_m 0": {"lanes": {"1": Lane("1", LINE, 0, None, (), None, None)}},
+    "lane 1 names lane 9": {"lanes": {"1": Lane("1", LINE, 4, None, ("9",), None, None)}},
+    "building h has no outline": {"houses": (House("h", LINE),)},
+    "a step of 0 s": {"step_s": 0.0},
+}
+
+
+@pytest.mark.parametrize("words", WRONG)
+def test_a_scene_that_cannot_be_is_refused_in_one_line(words: str) -> None:
+    with pytest.raises(UserError) as refusal:
+        tables.checked(road(**WRONG[words]))
+    assert words in str(refusal.value)
+    assert "scene s of s.xml" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+EDITS = {
+    "step_s": ('"step_s":1.0', '"step_s":"x"'),
+    "name ../x; allowed": ('"name":"mine"', '"name":"../x"'),
+    "is no JSON": ("}", ""),
+    "two scenes have one name": (
+        '"scenes":[{',
+        '"scenes":[{"begin_s":0,"end_s":0,"file":"f","lanes":1,"lights":false,"name":"s","sha256":"'
+        + SHA
+        + '","step_s":1,"tracks":1},{',
+    ),
+    "a moment is of scene nowhere": (
+        '"moments":[',
+        '"moments":[{"scene":"nowhere","vehicle":"a","time_s":0,"hidden":null,"conflict_s":null,"purpose":"report"}',
+    ),
+    "speeds_mps do not rise": ('"speeds_mps":[0.0', '"speeds_mps":[9.0'),
+    "scene s states 9 tracks": ('"tracks":2', '"tracks":9'),
+}
+
+
+@pytest.mark.parametrize("words", EDITS)
+def test_a_recording_that_was_edited_is_refused(words: str, tmp_path: Path) -> None:
+    written(tmp_path, road())
+    facts = tmp_path / "recording.json"
+    old, new = EDITS[words]
+    assert old in facts.read_text()
+    facts.write_text(facts.read_text().replace(old, new))
+    with pytest.raises(UserError) as refusal:
+        list(tables.read(tmp_path).scenes())
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_folder_with_other_tables_is_refused(tmp_path: Path) -> None:
+    written(tmp_path, road())
+    (tmp_path / "lanes.parquet").write_bytes((tmp_path / "buildings.parquet").read_bytes())
+    with pytest.raises(UserError, match=r"lanes\.parquet: its digest is"):
+        tables.read(tmp_path).scene("s")
+    with pytest.raises(UserError, match="is no recording"):
+        tables.read(tmp_path / "nowhere")
