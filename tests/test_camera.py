@@ -30,7 +30,7 @@ from harness.world.perception.camera import (
 from harness.world.perception.graph import scene_graph
 from harness.world.perception.rays import sweep
 from harness.world.perception.sensors import HALF_FIELD_RAD, LEAST_RAYS, detect
-from harness.world.state import VehicleState, WorldState
+from harness.world.state import HEIGHTS_M, SIZES_M, VehicleState, WorldState
 
 DATASETS = sorted(path.parent.name for path in Path(folder("datasets")).glob("*/manifest.json"))
 WIDTH, HEIGHT = SIZE_PX
@@ -130,6 +130,15 @@ def test_a_car_is_where_and_as_large_as_a_pinhole_shows_it():
     assert top == pytest.approx(horizon - FOCAL_PX * (1.5 - EYE_M) / 20, abs=1)
 
 
+@pytest.mark.parametrize("kind", ["bicycle", "motorcycle", "pedestrian"])
+def test_who_is_narrow_is_as_large_as_a_pinhole_shows_it(kind: str) -> None:
+    length, width = SIZES_M[kind]
+    of = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", 8 + length / 2, kind=kind))
+    [(left, top, right, bottom)] = of.boxes()["v2"]
+    assert right - left == pytest.approx(FOCAL_PX * width / 8, abs=1)
+    assert bottom - top == pytest.approx(FOCAL_PX * HEIGHTS_M[kind] / 8, abs=1)
+
+
 def test_what_is_behind_is_in_the_lower_half():
     of = seen_by_the_first(vehicle("v1", 0.0), vehicle("v2", -20.0))
     [(_, top, _, _)] = of.boxes()["v2"]
@@ -170,6 +179,16 @@ def test_lamps_show_what_a_vehicle_does():
     assert not len(columns_of(ahead(), AMBER))
     assert columns_of(ahead(route="left"), AMBER).max() < WIDTH / 2
     assert columns_of(ahead(route="right"), AMBER).min() > WIDTH / 2
+
+
+def test_a_motorcycle_has_lamps_and_a_bicycle_and_a_pedestrian_signal_nothing():
+    def lit(kind: str, braking: bool) -> list[bool]:
+        there = vehicle("v2", 8.0, kind=kind, braking=braking, route="left")
+        of = seen_by_the_first(vehicle("v1", 0.0), there)
+        return [len(columns_of(of, colour)) > 0 for colour in (BRAKE_LAMP, AMBER)]
+
+    assert lit("motorcycle", braking=True) == [True, True]
+    assert lit("bicycle", braking=False) == lit("pedestrian", braking=False) == [False, False]
 
 
 def reported(ambient: str, *others: VehicleState) -> dict[str, bool]:

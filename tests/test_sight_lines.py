@@ -22,6 +22,7 @@ def state(*vehicles: VehicleState, buildings: tuple[Building, ...] = ()) -> Worl
 
 
 EGO = vehicle("v1", 0, 0)
+NARROW = ("bicycle", "motorcycle", "pedestrian")
 
 
 def test_a_truck_between_two_vehicles_hides_them_a_wall_more_so_and_what_is_beside_the_line_does_not():
@@ -38,6 +39,13 @@ def test_a_truck_between_two_vehicles_hides_them_a_wall_more_so_and_what_is_besi
     assert links.distance_m[0].tolist() == [40, 30]
     assert np.isnan(links.distance_m[1, 1]), "no second helper there"
     assert links.take([2, 0]).xy_m[1, 2].tolist() == [-30, 0]
+
+
+def test_who_is_narrow_blocks_no_radio():
+    ahead = vehicle("v2", 40, 0)
+    riders = [vehicle(f"v{n}", 10 * n - 20, 0, kind=k) for n, k in enumerate(NARROW, 3)]
+    links = site([(state(EGO, ahead, *riders), ["v1", "v2"])])
+    assert (links.sight.tolist(), links.blocker_m.tolist()) == ([[CLEAR]], [[0]])
 
 
 def test_streets_cross_where_the_lines_along_the_headings_do():

@@ -7,7 +7,7 @@ from msgspec import UNSET, Meta, Struct
 
 from harness.core.seeds import LAST_EPISODE, LAST_SEED
 
-Kind = Literal["car", "van", "truck"]
+Kind = Literal["car", "van", "truck", "bicycle", "motorcycle", "pedestrian"]  # of road users
 Part = Literal["ego", "helper", "other"]
 Side = Literal["own", "left", "right"]  # of the ego's ways, from the one that it is on
 # No metre, second or share comes near these bounds, and infinity and huge integers do not pass

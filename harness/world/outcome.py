@@ -118,7 +118,8 @@ def outline(v: VehicleState) -> Polygon:
 def striker(ego: VehicleState, other: VehicleState) -> str:
     """Return whose front bumper hit the other vehicle: `ego`, `other`, `both` or `neither`.
 
-    The states are those at the moment of the collision.
+    The front is its first metre, at most a quarter of its length. The states are those at the
+    moment of the collision.
     """
     contact = nearest_points(outline(ego), outline(other))[0]
     overlap = outline(ego).intersection(outline(other))
@@ -129,7 +130,7 @@ def striker(ego: VehicleState, other: VehicleState) -> str:
         ahead = (contact.x - v.x_m) * np.cos(v.heading_rad) + (contact.y - v.y_m) * np.sin(
             v.heading_rad
         )
-        if ahead > v.length_m / 2 - 1.0:
+        if ahead > v.length_m / 2 - min(1.0, v.length_m / 4):
             strikers.append(name)
     return "both" if len(strikers) == 2 else strikers[0] if strikers else "neither"
 

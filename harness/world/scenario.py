@@ -62,7 +62,8 @@ class Spawn:
     """
 
     id: str  # `v1`, `v2`, …
-    kind: Kind  # class of vehicle: `car`, `van` or `truck`
+    # `car`, `van`, `truck`, `bicycle`, `motorcycle` or `pedestrian`
+    kind: Kind
     part: Part  # `ego`, `helper` (may be asked for messages) or `other`
     approach: str  # where its path comes from, such as `left`
     route: str  # what its path does, such as `straight`

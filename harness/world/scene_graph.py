@@ -45,7 +45,7 @@ class Node(Closed, frozen=True):
     """Describe a vehicle that the viewer's sensors report, or that it knows only by beacons."""
 
     id: VehicleId
-    type: Literal["vehicle", "car", "van", "truck"]
+    type: Literal["vehicle", Kind]
     forward_m: Number
     left_m: Number
     heading_deg: WholeNumber | Number | None

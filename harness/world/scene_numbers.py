@@ -8,7 +8,14 @@ from harness.world.road import Road
 from harness.world.scene_graph import SceneGraph
 
 INDICATORS = {"off": 0.0, "left": 1.0, "right": 2.0}
-BY_SIZE = {"car": 0.0, "van": 0.5, "truck": 1.0}
+BY_SIZE = {
+    "pedestrian": -1.5,
+    "bicycle": -1.0,
+    "motorcycle": -0.5,
+    "car": 0.0,
+    "van": 0.5,
+    "truck": 1.0,
+}
 
 
 def numbers(graph: SceneGraph, road: Road) -> Iterator[tuple[str, float | None]]:

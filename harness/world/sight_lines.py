@@ -11,7 +11,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Antenna, Site
 from harness.world.perception.rays import meetings
-from harness.world.state import HEIGHTS_M, Building, VehicleState, WorldState
+from harness.world.state import BROAD, HEIGHTS_M, Building, VehicleState, WorldState
 
 LEAST_ANGLE_RAD = np.pi / 6  # streets that meet at a smaller angle run side by side, or merge
 
@@ -72,7 +72,9 @@ def _xy(end: VehicleState | Place) -> Place:
 def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tuple[int, float]:
     """Return what stands between two ends, and the height of the tallest vehicle between them."""
     origin, line = np.array(_xy(a)), np.array([_xy(b)]) - _xy(a)
-    vehicles = [v for v in state.vehicles if v not in (a, b)]
+    # TR 37.885 has a loss for cars and trucks alone; others are narrower than the first Fresnel
+    # zone, which at 5.9 GHz is 1 m wide halfway along 20 m.
+    vehicles = [v for v in state.vehicles if v.kind in BROAD and v not in (a, b)]
     obstacles: list[VehicleState | Building] = [*vehicles, *state.buildings]
     corners = [obstacle.corners() for obstacle in obstacles]
     if not corners:

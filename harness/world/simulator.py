@@ -18,7 +18,7 @@ from highway_env.vehicle.kinematics import Vehicle
 
 from harness.world.road import Lane
 from harness.world.scenario import Layout, Scenario, Spawn
-from harness.world.state import SIZES_M, VehicleState
+from harness.world.state import SIZES_M, WITH_LAMPS, VehicleState
 
 NEAR_M = 1e-6  # more than the rounding of a distance; farther apart, highway-env finds no collision
 # never drawn from; highway-env would seed its own by the clock
@@ -83,7 +83,32 @@ class Truck(Traffic):
     LENGTH, WIDTH = SIZES_M["truck"]
 
 
-KINDS = {"car": Traffic, "van": Van, "truck": Truck}
+class Bicycle(Traffic):
+    """Drive a bicycle in traffic, which keeps its route and speed as a car does."""
+
+    LENGTH, WIDTH = SIZES_M["bicycle"]
+
+
+class Motorcycle(Traffic):
+    """Drive a motorcycle in traffic, which keeps its route and speed as a car does."""
+
+    LENGTH, WIDTH = SIZES_M["motorcycle"]
+
+
+class Pedestrian(Traffic):
+    """Move a pedestrian, who keeps route and speed as a car does."""
+
+    LENGTH, WIDTH = SIZES_M["pedestrian"]
+
+
+KINDS = {
+    "car": Traffic,
+    "van": Van,
+    "truck": Truck,
+    "bicycle": Bicycle,
+    "motorcycle": Motorcycle,
+    "pedestrian": Pedestrian,
+}
 
 
 class Ego(_OnRoute, MDPVehicle):  # type: ignore[misc]
@@ -229,7 +254,8 @@ def state_of(
     s = v.spawn
     numbers = (*(v.position - origin_m), v.heading, v.speed)
     x_m, y_m, heading_rad, speed_mps = (round(float(number), DECIMALS) + 0.0 for number in numbers)
-    pose, lit = (x_m, y_m, heading_rad, speed_mps), lamps and bool(v.braking)
+    pose = x_m, y_m, heading_rad, speed_mps
+    lit = lamps and s.kind in WITH_LAMPS and bool(v.braking)
     return VehicleState(
         s.id, s.kind, s.part, *pose, s.approach, s.route, bool(v.crashed), lit, s.radio
     )

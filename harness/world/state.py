@@ -14,13 +14,27 @@ from harness.world.fields import Closed, Count, Number, Seed, VehicleId
 from harness.world.fields import Kind as Kind
 from harness.world.fields import Part as Part
 
-# Length and width; a van has those of SUMO's delivery van.
+# Length and width; a van has those of SUMO's delivery van, and who is no car, van or truck has
+# length, width and height of SUMO's class of that name
+# (https://sumo.dlr.de/docs/Vehicle_Type_Parameter_Defaults.html).
 SIZES_M: dict[str, tuple[float, float]] = {
     "car": (5.0, 2.0),
     "van": (6.5, 2.16),
     "truck": (10.0, 2.6),
+    "bicycle": (1.6, 0.65),
+    "motorcycle": (2.2, 0.9),
+    "pedestrian": (0.215, 0.478),
 }
-HEIGHTS_M = {"car": 1.5, "van": 2.5, "truck": 3.6}
+HEIGHTS_M = {
+    "car": 1.5,
+    "van": 2.5,
+    "truck": 3.6,
+    "bicycle": 1.7,
+    "motorcycle": 1.5,
+    "pedestrian": 1.719,
+}
+BROAD = ("car", "van", "truck")  # kinds that have the sensors of a helper, and block radio
+WITH_LAMPS = (*BROAD, "motorcycle")  # kinds that have turn indicators and brake lamps
 
 
 def indicator(route: str) -> str:
@@ -32,10 +46,13 @@ def indicator(route: str) -> str:
 
 
 class VehicleState(Closed, frozen=True, omit_defaults=True):
-    """Describe one vehicle at one moment, in the frame of `harness.world.road` (y to the south)."""
+    """Describe one road user at one moment, in the frame of `harness.world.road` (y to the south).
+
+    Bicycles, motorcycles and pedestrians are among the vehicles, too.
+    """
 
     id: VehicleId  # `v1`, `v2`, … by spawn order; the ego is `v1`
-    kind: Kind  # class of vehicle, which fixes its size
+    kind: Kind  # kind of road user, which fixes its size
     part: Part  # `ego`, `helper` (takes part in cooperation) or `other`
     x_m: Number  # position of the centre, m to the east
     y_m: Number  # position of the centre, m to the south
@@ -48,18 +65,18 @@ class VehicleState(Closed, frozen=True, omit_defaults=True):
     radio: bool = False  # whether one that does not help sends beacons
 
     @property
-    def indicator(self) -> str:
-        """Return what the turn indicator shows: `left`, `right` or `off`."""
-        return indicator(self.route)
+    def indicator(self) -> str | None:
+        """Return what the turn indicator shows: `left`, `right` or `off`; None if it has none."""
+        return indicator(self.route) if self.kind in WITH_LAMPS else None
 
     @property
     def length_m(self) -> float:
-        """Return the length from bumper to bumper, m, which the class of vehicle fixes."""
+        """Return the length from front to rear, m, which the kind fixes."""
         return SIZES_M[self.kind][0]
 
     @property
     def width_m(self) -> float:
-        """Return the width from side to side, m, which the class of vehicle fixes."""
+        """Return the width from side to side, m, which the kind fixes."""
         return SIZES_M[self.kind][1]
 
     def corners(self) -> NDArray[np.float64]:

@@ -2,6 +2,8 @@
 and under highway-env.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import one_way_crossing
 import pytest
@@ -38,6 +40,18 @@ def test_together_is_as_alone(scenario):
 def test_a_few_together_are_as_alone(name):
     """Straight lanes and a circle, and traffic that comes to a stop."""
     drive_apart_and_together(scenarios.get(name), worlds=3)
+
+
+@pytest.mark.parametrize("kind", ["bicycle", "motorcycle", "pedestrian"])
+def test_narrow_traffic_moves_together_as_alone(kind):
+    crossing = one_way_crossing.SCENARIO
+
+    def layout(seed, parameters):
+        drawn = crossing.layout(seed, parameters)
+        spawns = [replace(s, kind=kind) if s.part == "other" else s for s in drawn.spawns]
+        return replace(drawn, spawns=tuple(spawns))
+
+    drive_apart_and_together(replace(crossing, layout=layout), worlds=4)
 
 
 def drive_apart_and_together(scenario, worlds):

@@ -4,6 +4,7 @@ import math
 from typing import get_args
 
 import pytest
+from msgspec.structs import replace
 
 from harness.world.outcome import RATINGS, Outcome, Result, fault, outline, rating, striker
 from harness.world.scenarios.occluded_intersection import SCENARIO, Parameters
@@ -45,6 +46,15 @@ def test_who_hit_whom(hit):
 
 def test_nobody_strikes_in_a_side_swipe():
     assert striker(EGO, car(3.9, 0.0, NORTH)) == "neither"
+
+
+@pytest.mark.parametrize("kind", ["bicycle", "motorcycle", "pedestrian"])
+def test_who_is_short_strikes_with_its_front_alone(kind):
+    """It crosses before the ego, whose front bumper lies at -2.5 m, or runs into its left side."""
+    crosses = replace(car(2.0, -2.6, EAST, "left"), kind=kind)
+    comes = replace(car(1.0, 0.0, EAST, "left"), kind=kind)
+    comes = replace(comes, x_m=1.05 - comes.length_m / 2)
+    assert (striker(EGO, crosses), striker(EGO, comes)) == ("ego", "other")
 
 
 @pytest.mark.parametrize("hit", [h for h in HITS if "back" not in h])

@@ -119,6 +119,23 @@ def test_only_the_camera_knows_the_kind_and_the_indicator():
     assert (far.kind, far.indicator) == (None, None)
 
 
+@pytest.mark.parametrize(
+    ("kind", "signals"), [("bicycle", None), ("motorcycle", "left"), ("pedestrian", None)]
+)
+def test_a_narrow_road_user_is_seen_in_the_open_as_what_it_is(kind, signals):
+    near = seen(scene(ahead(40.0, heading=EAST, kind=kind, route="left")))["v5"]
+    assert (near.kind, near.indicator) == (kind, signals)
+
+
+@pytest.mark.parametrize(("kind", "hides"), [("truck", True), ("bicycle", False)])
+def test_a_bicycle_hides_what_a_bicycle_hides(kind, hides):
+    """Behind it, seen from the side, a car of 5 m and a pedestrian."""
+    between, behind = other(2.0, 40.0, heading=EAST, kind=kind), other(2.0, 30.0, heading=EAST)
+    assert ("v5" in seen(scene(replace(between, id="v6"), behind))) != hides
+    walker = replace(behind, kind="pedestrian")
+    assert "v5" not in seen(scene(replace(between, id="v6"), walker))
+
+
 def test_only_the_lidar_knows_a_heading():
     assert seen(scene(ahead(70.0)))["v5"].heading_rad is not None
     assert seen(scene(ahead(100.0)))["v5"].heading_rad is None

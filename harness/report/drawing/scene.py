@@ -132,7 +132,7 @@ def _vehicle(
     axes.add_artist(artists.body(vehicle, look, hidden)).set_zorder(3)
     along = north_up(np.array([np.cos(vehicle.heading_rad), np.sin(vehicle.heading_rad)]))
     nose = centre + along * vehicle.length_m / 2
-    wings = corners[:2] - along * 1.2
+    wings = corners[:2] - along * min(1.2, vehicle.length_m / 4)
     colour = "white" if look == "ego" and not hidden else INK
     axes.plot(*np.vstack([wings[0], nose, wings[1]]).T, color=colour, linewidth=0.8, zorder=3)
     if vehicle.speed_mps > 0.5:

@@ -235,7 +235,7 @@ class DecisionPage {
       world, ground, this.viewer, this.chosen?.messages ?? [], this.params.get("zoom"), this.together);
     const save = (kind) => small(`Save as ${kind.toUpperCase()}`, () => saved(drawing, id, kind));
     return h("div", { class: "picture" },
-      drawing, h("p", { class: "quiet" }, `${said}. `, KEY, this.together.length ? KEY_OF_AGENTS : ""), save("svg"), " ", save("png"));
+      drawing, h("p", { class: "quiet" }, `${said}. `, keyOf(world), this.together.length ? KEY_OF_AGENTS : ""), save("svg"), " ", save("png"));
   }
 
   cameras() {

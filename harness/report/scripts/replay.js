@@ -112,7 +112,7 @@ class Replay {
           h("dl", {}, facts.map(([name, text]) => [h("dt", {}, name), h("dd", {}, text)])),
           own && [h("small", {}, "the answer as it came"), h("pre", {}, own.raw)],
           h("a", { href: strips.cell(n, at, most, most.run, most.condition).getAttribute("href") }, "All of this decision"),
-          world && h("p", { class: "quiet" }, KEY))),
+          world && h("p", { class: "quiet" }, keyOf(world)))),
     ]);
   }
 }

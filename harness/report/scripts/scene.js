@@ -112,7 +112,8 @@ function birdsEye(world, common, viewer, messages, zoom, agents) {
     const arrived = !fate ? "" : fate.delivered ? `, ${number(fate.arrival_ms, 0, "ms")}${fate.on_time ? "" : " late"}` : ", lost";
     const said = fate?.attacker ? `${arrived}, attacks` : arrived;
     const action = agents.find((each) => each.id === v.id)?.decision.action;
-    label(`${v.id} ${number(v.speed, 0, "m/s")}${action ? ` ${action}` : ""}${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
+    const kind = NARROW.includes(v.kind) ? ` ${v.kind}` : "";
+    label(`${v.id}${kind} ${number(v.speed, 0, "m/s")}${action ? ` ${action}` : ""}${v.crashed ? ", crashed" : ""}${said}`, v.x, -v.y, v.width / 2 + 1, v.part);
   }
   for (const c of sees.conflicts) label(both(c), c.x, -c.y, 1.6, "crossing");
   const bar = side > 100 ? 20 : 10, [left, foot] = [west + side * 0.03, view[3] - side * 0.03];
@@ -123,8 +124,11 @@ function birdsEye(world, common, viewer, messages, zoom, agents) {
   return [picture, told];
 }
 
+const NARROW = ["bicycle", "motorcycle", "pedestrian"];
 const KEY = "Purple: the ego. Light: helpers. Pink with a ring: the dangerous vehicle. Dashed, and all that is shaded: hidden from the "
   + "viewer. Arrow: the way in 1 s. ×: where paths cross, and when each vehicle is there. Thick lines: replies to the ego.";
+const KEY_OF_NARROW = " Bicycles, motorcycles and pedestrians are named; all are drawn in true size.";
+const keyOf = (world) => KEY + (world.vehicles.some((v) => NARROW.includes(v.kind)) ? KEY_OF_NARROW : "");
 const KEY_OF_AGENTS = " Purple is who decides here; at each agent is what it decides in this step. Click another to see its decision.";
 const LOOKS = [
   "fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linejoin", "vector-effect", "opacity", "font-family",

@@ -26,7 +26,7 @@ from harness.world.perception.rays import meetings, turned
 from harness.world.perception.sensors import HALF_FIELD_RAD, detect
 from harness.world.road import NORTH
 from harness.world.scenario import Scenario
-from harness.world.state import HEIGHTS_M, VehicleState, WorldState
+from harness.world.state import BROAD, HEIGHTS_M, VehicleState, WorldState
 
 Places = NDArray[np.int16]
 Lit = NDArray[np.bool_]
@@ -48,6 +48,7 @@ GRASS, ASPHALT, PAINT = (106, 128, 82), (92, 94, 98), (236, 236, 230)
 WALL, BRICK = (182, 166, 142), (150, 132, 108)
 ROWS, COLUMNS = 32, 48  # resolution of the paint on a wall
 GLASS, TYRE, PLATE = (38, 48, 60), (28, 28, 30), (226, 226, 220)
+SKIN, TROUSERS, HELMET = (198, 152, 124), (58, 62, 84), (40, 40, 44)
 HEADLAMP, AMBER = (250, 246, 222), (255, 170, 20)
 REAR_LAMP, BRAKE_LAMP = (128, 22, 26), (255, 36, 32)
 # No coat has the colour of a lamp.
@@ -237,12 +238,33 @@ def _vehicle(state: WorldState, v: VehicleState) -> Box:
 
 
 @lru_cache(maxsize=256)
-def _vehicle_walls(kind: str, coat: Colour, indicator: str, braking: bool) -> tuple[Pixels, Lit]:
+def _vehicle_walls(
+    kind: str, coat: Colour, indicator: str | None, braking: bool
+) -> tuple[Pixels, Lit]:
     """Paint the walls of a vehicle from the road up;
     return them and which parts are shining lamps.
     """
     walls = np.empty((4, ROWS, COLUMNS, 3), dtype=np.uint8)
     walls[:] = coat
+    if kind in BROAD:
+        _paint_body(walls, kind)
+    else:
+        _paint_person(walls, kind)
+    walls[:, : max(1, ROWS // 16)] = TYRE  # its shadow
+    dark = walls.copy()
+    if kind != "pedestrian":
+        _paint_lamps(walls, BRAKE_LAMP if braking else REAR_LAMP, kind in BROAD)
+    if indicator in ("left", "right"):
+        # the front wall begins at the left, the rear one at the right
+        to_right = indicator == "right"
+        _paint(walls[FRONT], (0.44, 0.58, 0.0, 0.16), AMBER, to_right)
+        _paint(walls[REAR], (0.50, 0.64, 0.0, 0.16), AMBER, not to_right)
+        _paint(walls[RIGHT if to_right else LEFT], (0.30, 0.45, 0.0, 0.08), AMBER, not to_right)
+    return walls, (walls != dark).any(axis=-1)
+
+
+def _paint_body(walls: Pixels, kind: str) -> None:
+    """Paint the windows and wheels of a car, van or truck."""
     low, high = {"car": (0.55, 0.92), "van": (0.52, 0.86), "truck": (0.45, 0.72)}[kind]
     # of the length, from the front, that has windows
     cab = {"car": 0.80, "van": 0.28, "truck": 0.20}[kind]
@@ -253,20 +275,28 @@ def _vehicle_walls(kind: str, coat: Colour, indicator: str, braking: bool) -> tu
         _paint(wall, side, GLASS, mirrored)
         for at in (0.10, 0.74):
             _paint(wall, (0.0, 0.30 if kind == "car" else 0.22, at, at + 0.16), TYRE, mirrored)
-    walls[:, : max(1, ROWS // 16)] = TYRE  # its shadow
-    dark = walls.copy()
+
+
+def _paint_person(walls: Pixels, kind: str) -> None:
+    """Paint a pedestrian, or who rides a bicycle or motorcycle, in a coat, and the wheels."""
+    for wall in walls:
+        _paint(wall, (0.0, 0.46, 0.0, 1.0), TROUSERS)
+        _paint(wall, (0.84, 1.0, 0.25, 0.75), HELMET if kind == "motorcycle" else SKIN)
+    if kind == "pedestrian":
+        return
+    for wall in (walls[FRONT], walls[REAR]):
+        _paint(wall, (0.0, 0.40, 0.40, 0.60), TYRE)
+    for wall in (walls[RIGHT], walls[LEFT]):
+        for start in (0.0, 0.60):
+            _paint(wall, (0.0, 0.40, start, start + 0.40), TYRE)
+
+
+def _paint_lamps(walls: Pixels, rear: Colour, pair: bool) -> None:
+    """Paint the lamps ahead, and those behind in the colour `rear`: a pair of each, or one."""
+    ahead, behind = ((0.04, 0.20), (0.02, 0.20)) if pair else ((0.40, 0.50), (0.40, 0.50))
     for mirrored in (False, True):
-        _paint(walls[FRONT], (0.30, 0.44, 0.04, 0.20), HEADLAMP, mirrored)
-        _paint(
-            walls[REAR], (0.30, 0.50, 0.02, 0.20), BRAKE_LAMP if braking else REAR_LAMP, mirrored
-        )
-    if indicator != "off":
-        # the front wall begins at the left, the rear one at the right
-        to_right = indicator == "right"
-        _paint(walls[FRONT], (0.44, 0.58, 0.0, 0.16), AMBER, to_right)
-        _paint(walls[REAR], (0.50, 0.64, 0.0, 0.16), AMBER, not to_right)
-        _paint(walls[RIGHT if to_right else LEFT], (0.30, 0.45, 0.0, 0.08), AMBER, not to_right)
-    return walls, (walls != dark).any(axis=-1)
+        _paint(walls[FRONT], (0.30, 0.44, *ahead), HEADLAMP, mirrored)
+        _paint(walls[REAR], (0.30, 0.50, *behind), rear, mirrored)
 
 
 def _building(name: str, corners: Floats) -> Box:

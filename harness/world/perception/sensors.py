@@ -3,10 +3,11 @@
 LiDAR: all round, 80 m; position to 0.1 m on each axis, heading to 2°, speed from tracking to 0.8
 m/s. Radar: 60° to either side of the front and of the rear, 150 m; range to 0.4 m, bearing to 1°,
 range rate to 0.15 m/s, and tracking with it gives speed to 0.2 m/s. Camera: 60° to either side of
-the front and of the rear, 60 m by day and else as `harness.world.ambient` says; class and turn
-indicator. It never adds to a position, because the LiDAR sees all that it sees and places it
-better. Noise is Gaussian with those standard deviations (declared for this harness, typical of
-automotive data sheets, no particular product), keyed by episode, step, viewer and object.
+the front and of the rear, 60 m by day and else as `harness.world.ambient` says; kind and turn
+indicator, which bicycles and pedestrians do not have. It never adds to a position, because the
+LiDAR sees all that it sees and places it better. Noise is Gaussian with those standard deviations
+(declared for this harness, typical of automotive data sheets, no particular product), keyed by
+episode, step, viewer and object.
 """
 
 from collections.abc import Collection, Sequence
@@ -20,11 +21,13 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.world.ambient import Ambient, sun_rad
 from harness.world.parameters import Parameters
 from harness.world.perception.rays import Look, Surfaces, cast, rays_on, surfaces, turned
-from harness.world.state import Kind, VehicleState, WorldState
+from harness.world.state import BROAD, Kind, VehicleState, WorldState
 
 LIDAR_RANGE_M, RADAR_RANGE_M = 80.0, 150.0
 HALF_FIELD_RAD = np.radians(60.0)
-LEAST_RAYS = 3  # rays on an object below which no sensor reports it
+# Rays on an object below which no sensor reports it. A bicycle, motorcycle or pedestrian is so
+# narrow that one ray shows much of it, and several layers of a LiDAR meet it one above the other.
+LEAST_RAYS, LEAST_ON_NARROW = 3, 1
 # Standard deviations: the LiDAR's position on each axis, the radar's range.
 LIDAR_NOISE_M, RADAR_NOISE_M = 0.1, 0.4
 BEARING_NOISE_RAD = np.radians(1.0)  # of the radar
@@ -44,8 +47,8 @@ class Detection(Struct, frozen=True):
 
     id: str  # the object's id (association across vehicles is assumed to be perfect)
     sensors: tuple[str, ...]  # those of `camera`, `lidar` and `radar` that reported it
-    kind: Kind | None  # class from the camera; None without one
-    # turn indicator from the camera: `left`, `right` or `off`; None without one
+    kind: Kind | None  # kind of road user, from the camera; None without one
+    # turn indicator from the camera: `left`, `right` or `off`; None without camera or indicator
     indicator: str | None
     x_m: float  # estimated position of the centre, m to the east of the road's origin
     y_m: float  # estimated position of the centre, m to the south
@@ -80,11 +83,12 @@ def reports(
     nearby: list[list[VehicleState]] = []
     for state, viewer in looks:
         nearby.append([v for v in state.vehicles if v.id != viewer.id])
+    least = _least_rays(around, nearby)
     detection_of: dict[tuple[int, int], Detection | None] = {}
 
     def reported(count: Ints) -> dict[tuple[int, int], Detection]:
         """Return what sensors report where so many rays end on each surface, (n,)."""
-        enough = around.by_viewer(np.where(around.vehicle, count, 0)) >= LEAST_RAYS
+        enough = around.by_viewer(np.where(around.vehicle, count, 0)) >= least
         viewers, places = np.nonzero(enough)
         pairs = list(zip(viewers.tolist(), places.tolist(), strict=True))
         new = [pair for pair in pairs if pair not in detection_of]
@@ -120,6 +124,19 @@ def reports(
             # reported.
             return {pair: d for pair, d in then.items() if pair in now}
         before, solid, now = solid, after, then
+
+
+def _least_rays(around: Surfaces, nearby: Sequence[Sequence[VehicleState]]) -> Ints:
+    """Return the rays from which each viewer's surface is reported, (v, k), as `by_viewer` has it.
+
+    `nearby` are the vehicles around each viewer.
+    """
+    least = np.full(around.by_viewer(around.vehicle).shape, LEAST_RAYS)
+    for n, vehicles in enumerate(nearby):
+        for place, v in enumerate(vehicles):
+            if v.kind not in BROAD:
+                least[n, place] = LEAST_ON_NARROW
+    return least
 
 
 def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
