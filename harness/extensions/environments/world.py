@@ -11,7 +11,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from harness.world.parameters import DIALS
 from harness.world.road import PathKey
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.simulator import DECIMALS, LAMPS_MPS2
-from harness.world.state import SIZES_M, ActionsTaken, Building, Kind, Part
+from harness.world.state import BROAD, SIZES_M, ActionsTaken, Building, Kind, Part
 from harness.world.world import Target
 
 MOST_BUILDINGS, MOST_VEHICLES = 9, 99  # limits of the ids in a record
@@ -91,8 +91,9 @@ class EnvironmentWorld(OwnWorld):
         nearest = sorted(
             traffic, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego))
         )
-        for n, v in enumerate(nearest):
-            world._enter(v, "helper" if n < p.helpers else "other")
+        helpers = [v for v in nearest if _kind(v) in BROAD][: p.helpers]
+        for v in nearest:
+            world._enter(v, "helper" if v in helpers else "other")
         poses = beacons.lead_in(p, world._in_road_frame(world._poses()))
         world._broadcast(poses, 1 - len(poses))
         return world
@@ -281,8 +282,11 @@ def _reads_observations(env: Any) -> bool:
 
 
 def _kind(v: Any) -> Kind:
-    """Return the kind whose size is nearest to the vehicle's."""
-    kinds: tuple[Kind, ...] = ("car", "van", "truck")
+    """Return the kind that a vehicle says it is, by its `kind`, else the one of nearest size."""
+    kinds: tuple[Kind, ...] = get_args(Kind)
+    word = getattr(v, "kind", None)
+    if isinstance(word, str) and word in kinds:
+        return word
     return min(
         kinds, key=lambda kind: abs(SIZES_M[kind][0] - v.LENGTH) + abs(SIZES_M[kind][1] - v.WIDTH)
     )

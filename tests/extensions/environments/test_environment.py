@@ -7,6 +7,7 @@ import threading
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import gymnasium
 import msgspec
@@ -14,11 +15,13 @@ import numpy as np
 import pytest
 from evaluating import scenes_of
 from highway_env.envs import HighwayEnv, MergeEnv
+from highway_env.road.lane import StraightLane
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from highway_env.vehicle.objects import Obstacle
-from my_roads import Breakdown
+from matplotlib.patches import Polygon
+from my_roads import Breakdown, Truck
 
 from harness.core.errors import UserError
 from harness.dataset.build import build
@@ -27,7 +30,9 @@ from harness.dataset.verify import check
 from harness.extensions.environments.environment import named, reset
 from harness.extensions.environments.examination import examine
 from harness.extensions.environments.place import CAREFUL_FIRST
-from harness.extensions.environments.world import EnvironmentWorld
+from harness.extensions.environments.world import EnvironmentWorld, _kind
+from harness.prompts import versions as prompts
+from harness.report.drawing.artists import body
 from harness.report.drawing.scene import draw
 from harness.runs import formats
 from harness.runs.folder import read
@@ -35,7 +40,7 @@ from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.reference import drive
-from harness.world.state import ActionsTaken, WorldState
+from harness.world.state import SIZES_M, ActionsTaken, WorldState
 from harness.world.world import World
 
 OWN = "env:my_roads:breakdown-v0"
@@ -109,6 +114,40 @@ class Fading(Breakdown):
         return result
 
 
+class Van(IDMVehicle):
+    LENGTH, WIDTH = 6.0, 2.1
+
+
+class Bicycle(IDMVehicle):
+    LENGTH, WIDTH = 1.8, 0.6
+
+
+class Motorcycle(IDMVehicle):
+    kind = "motorcycle"  # as long as a car, so it says what it is
+
+
+class Pedestrian(Vehicle):
+    LENGTH, WIDTH = 0.3, 0.5
+
+
+class Street(Breakdown):
+    """A crossing for pedestrians, and one road user of each kind."""
+
+    def _reset(self):
+        super()._reset()
+        crossing = StraightLane([60, 14], [60, -8], width=3)
+        self.road.network.add_lane("south", "north", crossing)
+        heading = crossing.heading_at(0)
+        self.road.vehicles[1:] = [
+            IDMVehicle(self.road, [90.0, 4.0], 0, 12),
+            Van(self.road, [8.0, 0.0], 0, 12),
+            Truck(self.road, [84.0, 0.0], 0, 12),
+            Bicycle(self.road, [48.0, 4.0], 0, 5),
+            Motorcycle(self.road, [34.0, 0.0], 0, 12),
+            Pedestrian(self.road, [60.0, 10.0], heading, 1.4),
+        ]
+
+
 class Vanishing(Breakdown):
     """Its ego is taken off the road after a second."""
 
@@ -179,7 +218,7 @@ EGOS = {
     GhostEgo: "is a Through, which hits nothing; leave it collidable and solid",
     AbsentEgo: "is not on the road; append self.vehicle to self.road.vehicles",
 }
-for kind in (Without, Roadless, Crashed, Haunted, Fading, Vanishing, *EGOS):
+for kind in (Without, Roadless, Crashed, Haunted, Fading, Street, Vanishing, *EGOS):
     gymnasium.register(f"{kind.__name__.lower()}-v0", entry_point=kind)
 
 
@@ -422,6 +461,62 @@ def test_the_state_says_who_is_where_and_helpers_are_the_nearest():
     gaps = [np.hypot(v.x_m - state.ego.x_m, v.y_m - state.ego.y_m) for v in state.vehicles]
     assert gaps == sorted(gaps)
     assert {v.route for v in state.vehicles} == {"to b lane 1", "to b lane 2"}
+
+
+@pytest.mark.slow
+def test_bicycles_motorcycles_and_pedestrians_stay_what_they_are(tmp_path):
+    """By a `kind` of their own, else by size: in states, graphs, prompts and pictures."""
+    scenario = scenarios.get("env:street-v0:decisions=1")
+    build(scenario, tmp_path / "street", 1, 0, 1, lambda done: None)
+    assert check(tmp_path / "street") == []
+    scene = scenes_of(load(tmp_path / "street"))[0]
+    kinds = {v.id: v.kind for v in scene.state.vehicles}
+    assert kinds == {
+        "v1": "car", "v2": "van", "v3": "motorcycle", "v4": "bicycle", "v5": "pedestrian",
+        "v6": "truck", "v7": "car",
+    }  # fmt: skip
+    assert [v.id for v in scene.state.helpers] == ["v2", "v6", "v7"], "who has sensors"
+
+    truth = truth_graph(scenario, scene.state)
+    assert {"v1": "car", **{node.id: node.type for node in truth.nodes}} == kinds
+    assert json.loads(msgspec.json.encode(truth))["nodes"][2]["type"] == "bicycle"
+    walks = next(conflict for conflict in truth.conflicts if conflict.vehicle == "v5")
+    assert (walks.kind, walks.sector, walks.other.arc_m) == ("crossing", "south", 6.0)
+    near = msgspec.structs.replace(truth, nodes=truth.nodes[1:4])
+    *_, user = prompts.load("v4").render(near, scenario.actions, (), scenario.prompt_words)
+    for line in ("v3 motorcycle 14 4 12 ", "v4 bicycle 28 0 5 ", "v5 pedestrian 40 -6 1 "):
+        assert f"\n{line}" in user["content"]
+
+    svg = io.BytesIO()
+    draw(scene, svg, "svg")
+    for name, kind in kinds.items():
+        assert f">{name} {kind}</" in svg.getvalue().decode()
+    for v in scene.state.vehicles:
+        outline = cast("Polygon", body(v, v.part, hidden=False)).get_xy()
+        sides_m = np.hypot(*np.diff(outline, axis=0).T)
+        np.testing.assert_allclose(sorted({*sides_m.round(6)}), sorted(SIZES_M[v.kind]))
+
+
+class Named(Vehicle):
+    def __init__(self, kind, length=5.0, width=2.0):
+        self.kind, self.LENGTH, self.WIDTH = kind, length, width
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "kind"),
+    [
+        (Named("pedestrian"), "pedestrian"),
+        (Named("tank"), "car"),  # a kind that nobody knows
+        (Named(["truck"]), "car"),
+        (Named(None, 1.7, 0.6), "bicycle"),
+        (Named(None, 2.2, 1.0), "motorcycle"),
+        (Named(None, 0.5, 0.5), "pedestrian"),
+        (Named(None, 4.2, 1.7), "car"),
+        (Named(None, 18.0, 2.5), "truck"),
+    ],
+)
+def test_a_vehicle_says_its_kind_or_its_size_does(vehicle, kind):
+    assert _kind(vehicle) == kind
 
 
 @pytest.mark.exhaustive
