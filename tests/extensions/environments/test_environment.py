@@ -19,7 +19,7 @@ from highway_env.road.lane import StraightLane
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
-from highway_env.vehicle.objects import Obstacle
+from highway_env.vehicle.objects import Landmark, Obstacle
 from matplotlib.patches import Polygon
 from my_roads import Breakdown, Truck
 
@@ -112,6 +112,34 @@ class Fading(Breakdown):
         result = super().step(action)
         next(v for v in self.road.vehicles[1:] if v.collidable).collidable = False
         return result
+
+
+class Arriving(Breakdown):
+    """Onto an empty road comes, after a second, a car, behind two that are passed through."""
+
+    def _reset(self):
+        super()._reset()
+        del self.road.vehicles[1:]
+
+    def step(self, action):
+        result = super().step(action)
+        if self.steps == self.config["simulation_frequency"]:
+            ahead_m = self.vehicle.position[0] + np.array([10, 14, 40])
+            ghost, thin, car = (Vehicle(self.road, [x_m, 4.0], 0, 10) for x_m in ahead_m)
+            ghost.collidable = thin.solid = False
+            self.road.vehicles += [ghost, thin, car]
+        return result
+
+
+class Littered(Breakdown):
+    """An obstacle stands beside the road; a landmark and two obstacles hit nobody."""
+
+    def _reset(self):
+        super()._reset()
+        self.road.objects += [Obstacle(self.road, [x_m, -6.0]) for x_m in (30, 34, 38)]
+        self.road.objects.append(Landmark(self.road, [26.0, -6.0]))
+        _, ghost, thin, _ = self.road.objects
+        ghost.collidable = thin.solid = False
 
 
 class Van(IDMVehicle):
@@ -218,7 +246,9 @@ EGOS = {
     GhostEgo: "is a Through, which hits nothing; leave it collidable and solid",
     AbsentEgo: "is not on the road; append self.vehicle to self.road.vehicles",
 }
-for kind in (Without, Roadless, Crashed, Haunted, Fading, Street, Vanishing, *EGOS):
+for kind in (
+    Without, Roadless, Crashed, Haunted, Fading, Arriving, Littered, Street, Vanishing, *EGOS,
+):  # fmt: skip
     gymnasium.register(f"{kind.__name__.lower()}-v0", entry_point=kind)
 
 
@@ -255,6 +285,26 @@ def test_what_collides_with_nothing_hides_nothing_and_helps_nobody(tmp_path):
         scene_graph(each, state, "v1") for each, state in zip((own, haunted), seen, strict=True)
     ]
     assert graphs[0].sectors == graphs[1].sectors
+
+
+def test_what_enters_later_and_collides_with_nothing_is_nowhere():
+    scenario = scenarios.get("env:arriving-v0:decisions=2")
+    world = EnvironmentWorld.begun(scenario, 0)
+    world.advance(world.frame + world.period)
+    state = world.state()
+    [ego, car] = state.vehicles
+    assert car.x_m - ego.x_m == pytest.approx(40.0, abs=0.1)
+    graph = scene_graph(scenario, state, "v1")
+    assert (graph.seen, graph.sectors[1].by) == ((car.id,), (car.id,))
+    assert len(world.env.road.vehicles) == 4
+
+
+def test_of_objects_only_what_can_be_hit_is_a_building():
+    state = World.start(scenarios.get("env:littered-v0:decisions=2"), 0).state()
+    [building] = state.buildings
+    ego_x_m = state.ego.x_m - 20  # it starts 20 m along
+    assert building.east_m - ego_x_m == pytest.approx(31.0)
+    assert building.west_m - ego_x_m == pytest.approx(29.0)
 
 
 @pytest.mark.exhaustive
