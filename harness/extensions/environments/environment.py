@@ -5,12 +5,15 @@ The name is `env:` and the id that gymnasium knows, and for a changed configurat
 and the changes as JSON. So the name alone is enough to create the same environment again.
 """
 
+import importlib
 import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -93,26 +96,41 @@ def _id_and_changes(name: str) -> tuple[str, str]:
     return env_id, changes
 
 
-def _only_allowed(name: str, env_id: str, changed: Mapping[str, Any]) -> None:
-    """Raise UserError if a name would import a module that is neither highway-env's nor allowed.
+def _only_allowed(name: str, module: str) -> None:
+    """Raise UserError if a module that a name would import is neither highway-env's nor allowed."""
+    if not any(f"{module}.".startswith(f"{package}.") for package in (OWN_PACKAGE, *_allowed())):
+        raise UserError(
+            f"{label(name)} would import the module {printable(module, 40)}; if you trust it, "
+            f"set {IMPORTS}={printable(module.partition('.')[0], 40)} in your environment"
+        )
 
-    gymnasium imports what stands before the colon of an id; highway-env imports classes that its
-    configuration names by their path.
+
+@contextmanager
+def guarded(name: str, env: Any) -> Iterator[None]:
+    """Enter a context for the code of an environment, in which its name imports only what it may.
+
+    highway-env imports classes that a configuration names by their path. In this context it raises
+    UserError for one of a module that is neither highway-env's nor allowed, unless the unchanged
+    configuration of `env` has a path into the same module. `name` is the environment's scenario
+    name.
     """
-    of_id = env_id.rpartition(":")[0]
-    paths = (text.rpartition(".")[0] for text in _texts(changed) if "." in text)
-    for module in filter(None, (of_id, *paths)):
-        if not any(
-            f"{module}.".startswith(f"{package}.") for package in (OWN_PACKAGE, *_allowed())
-        ):
-            raise UserError(
-                f"{label(name)} would import the module {printable(module, 40)}; if you trust it, "
-                f"set {IMPORTS}={printable(module.partition('.')[0], 40)} in your environment"
-            )
+    from highway_env import utils
+
+    def import_allowed(module: str) -> ModuleType:
+        if module not in env.own_modules:
+            _only_allowed(name, module)
+        return importlib.import_module(module)
+
+    # through this name every copy of `class_from_path` imports
+    utils.importlib = SimpleNamespace(import_module=import_allowed)
+    try:
+        yield
+    finally:
+        utils.importlib = importlib
 
 
 def _texts(value: Any) -> Iterator[str]:
-    """Yield all texts among the values of a JSON value."""
+    """Yield all texts among the values of a configuration."""
     rest = [value]
     while rest:
         value = rest.pop()
@@ -132,7 +150,7 @@ def reset(name: str, seed: int) -> Any:
     env = _create(name)
     _constants().restore()
     try:
-        with watched(label(name)), strangers(label(name)):
+        with watched(label(name)), strangers(label(name)), guarded(name, env):
             env.reset(seed=seed)
     except UserError:
         raise
@@ -182,7 +200,8 @@ def _create(name: str) -> Any:
     highway_env._register_highway_envs()
     env_id, changes = _id_and_changes(name)
     changed = _changed(name, changes or "{}")
-    _only_allowed(name, env_id, changed)
+    if module := module_of(name):
+        _only_allowed(name, module)
     if not re.search(r"-v\d+$", env_id):
         raise UserError(f"{label(name)}: give its version too, as in merge-v0")
     _constants().restore()
@@ -207,6 +226,7 @@ def _create(name: str) -> Any:
             f"{label(name)} is a {type(env).__name__}, no environment of highway-env; its class "
             "must be a subclass of highway_env's AbstractEnv"
         )
+    env.own_modules = frozenset(text.rpartition(".")[0] for text in _texts(env.config))
     for key, value in changed.items():
         if key not in env.config:
             raise unknown(f"config key of {label(name)}", key, env.config)

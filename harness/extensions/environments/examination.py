@@ -5,7 +5,14 @@ before a dataset is built or an episode is driven.
 from collections.abc import Sequence
 
 from harness.core.errors import UserError
-from harness.extensions.environments.environment import label, meta_actions, numbered, raised, reset
+from harness.extensions.environments.environment import (
+    guarded,
+    label,
+    meta_actions,
+    numbered,
+    raised,
+    reset,
+)
 from harness.extensions.environments.world import EnvironmentWorld
 from harness.world.scenario import Scenario
 
@@ -53,7 +60,10 @@ def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Plac
     kind = meta_actions(scenario.name, env)
     for action in actions:
         try:
-            *_, terminated, _, _ = env.step(numbered(env, kind, action))
+            with guarded(scenario.name, env):
+                *_, terminated, _, _ = env.step(numbered(env, kind, action))
+        except UserError:
+            raise
         except Exception as error:
             raise UserError(f"{label(scenario.name)}: its step() fails: {raised(error)}") from None
         places.append(_places(env))

@@ -19,6 +19,7 @@ from harness.core.errors import UserError
 from harness.extensions.environments.environment import (
     Constants,
     config,
+    guarded,
     hittable,
     label,
     lane_of,
@@ -184,9 +185,10 @@ class EnvironmentWorld(OwnWorld):
         return target
 
     def advance(self, until_frame: int) -> None:
-        while self.frame < until_frame and not self.outcome.ended:
-            self._drive(min(until_frame, (self.frame // self.period + 1) * self.period))
-            self._recast()
+        with guarded(self.scenario.name, self.env):
+            while self.frame < until_frame and not self.outcome.ended:
+                self._drive(min(until_frame, (self.frame // self.period + 1) * self.period))
+                self._recast()
 
     def _drive(self, until_frame: int) -> None:
         """Simulate until a frame within this period."""

@@ -3,6 +3,7 @@
 import html
 import io
 import json
+import sys
 import threading
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,6 +17,7 @@ import pytest
 from evaluating import scenes_of
 from highway_env.envs import HighwayEnv, MergeEnv
 from highway_env.road.lane import StraightLane
+from highway_env.utils import class_from_path
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
@@ -863,11 +865,9 @@ def test_the_page_shows_the_environment_of_these_tests():
         ("env:my_roads:breakdown-v0", "my_roads"),
         ("env:my_roads.inner:breakdown-v0", "my_roads.inner"),
         ("env:os.path:breakdown-v0", "os.path"),
-        (named("merge-v0", {"observation": {"type": "my_roads.Seen"}}), "my_roads"),
-        (named("merge-v0", {"action": {"kinds": [{"type": "my-roads.Action"}]}}), "my-roads"),
-        (
-            named("merge-v0", {"other_vehicles_type": "highway_environment.Car"}),
-            "highway_environment",
+        *(
+            (named("merge-v0", {"other_vehicles_type": f"{module}.Car"}), module)
+            for module in ("my_roads", "my_roads.inner", "my-roads", "highway_environment")
         ),
     ],
 )
@@ -887,6 +887,39 @@ def test_a_name_that_would_import_a_module_is_refused_unless_it_is_listed(
     except (UserError, ValueError) as error:
         said = str(error)
     assert not said if name == OWN else "would import" not in said
+
+
+class Street(Breakdown):
+    """Names a street by a number, a file by its path, and a class of its own by its path."""
+
+    @classmethod
+    def default_config(cls):
+        own = {
+            "street": "1.0",
+            "map": "a/b.c.xml",
+            "breaks": "my_roads.Truck",
+            "late": "my_roads.Truck",
+        }
+        return super().default_config() | own
+
+    def step(self, action):
+        class_from_path(self.config["late" if self.time else "breaks"])
+        return super().step(action)
+
+
+gymnasium.register("street-v0", entry_point=Street)
+
+
+def test_a_text_with_a_dot_is_a_module_only_where_it_is_imported(monkeypatch):
+    monkeypatch.delenv("SWARMDRIVE_IMPORTS")
+    changes = {"street": "1.5", "map": "../no.such/map.net.xml", "breaks": "my_roads.Truck"}
+    examine(scenarios.get(named("street-v0", changes)), 0)
+    hostile = scenarios.get(named("street-v0", {"late": "antigravity.Car"}))
+    with pytest.raises(UserError, match="would import the module antigravity"):
+        examine(hostile, 0)
+    with pytest.raises(UserError, match="would import the module antigravity"):
+        World.start(hostile, 0).advance(31)
+    assert "antigravity" not in sys.modules
 
 
 def test_classes_of_highway_env_need_no_listing(monkeypatch):
