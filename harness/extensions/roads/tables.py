@@ -137,6 +137,8 @@ class Scene:
     tracks: Mapping[str, Track]
     lanes: Mapping[str, Lane]
     houses: tuple[House, ...] = ()
+    # how many things a reader left out, by the reason; no table keeps it
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def begin_s(self) -> float:
