@@ -6,6 +6,7 @@ import pytest
 from harness.core.errors import UserError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws
 from harness.radio.fading import Trips
+from harness.world.scenario import Names
 from harness.world.sight_lines import corner, site
 from harness.world.state import Building, VehicleState, WorldState
 
@@ -46,6 +47,18 @@ def test_who_is_narrow_blocks_no_radio():
     riders = [vehicle(f"v{n}", 10 * n - 20, 0, kind=k) for n, k in enumerate(NARROW, 3)]
     links = site([(state(EGO, ahead, *riders), ["v1", "v2"])])
     assert (links.sight.tolist(), links.blocker_m.tolist()) == ([[CLEAR]], [[0]])
+
+
+def test_vehicles_have_the_names_and_the_clock_of_their_traffics_source():
+    ahead = vehicle("v2", 40, 0)
+    points = [(state(EGO, ahead), ["v1", "v2"]), (state(EGO), ["v1"])]
+    links = site(points, names=[Names(60.5, {"v1": "car.7", "v2": "bus"}), None])
+    assert links.names.tolist() == [["car.7", "bus"], ["", ""]]
+    assert links.time_s.tolist() == pytest.approx([60.5, np.nan], nan_ok=True)
+    assert links.take([0]).of_helpers(np.array([[0, 0]])).names.tolist() == [
+        ["car.7", "bus", "bus"]
+    ]
+    assert site(points).names is None
 
 
 def test_streets_cross_where_the_lines_along_the_headings_do():

@@ -173,10 +173,9 @@ class SceneWorld:
 
     def site(self, antennas: Collection[Antenna]) -> Site:
         decision_points = [(scene.state, scene.viewers) for scene in self.scenes]
-        zones_m = [
-            self.scenario.at(scene.state.episode_seed).road().zone_m for scene in self.scenes
-        ]
-        return site(decision_points, antennas, zones_m)
+        layouts = [self.scenario.at(scene.state.episode_seed) for scene in self.scenes]
+        zones_m = [layout.road().zone_m for layout in layouts]
+        return site(decision_points, antennas, zones_m, [layout.names for layout in layouts])
 
     def outlook(self) -> Outlook:
         return outlook(self.scenario, self.scenes)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkab
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, Texts
 from harness.core.errors import UserError
 from harness.radio.fading import Trips
 
@@ -55,6 +55,11 @@ class Site:
     # the sites of antennas on no vehicle, by antenna: each site has the antenna in the ego's place,
     # then the ego and the helpers, so its `xy_m` is `(..., 2+H, 2)`
     antennas: Mapping[Antenna, "Site"] = field(default_factory=dict)
+    # what the source of the traffic calls each vehicle, `(..., 1+H)`, empty for one without a name;
+    # None where the scenario's vehicles have no names but those of this harness
+    names: Texts | None = None
+    # what the clock of that source shows, s, `(...)`; None without names
+    time_s: Floats | None = None
 
     @property
     def distance_m(self) -> Floats:
@@ -81,6 +86,8 @@ class Site:
             self.corner_m[at],
             self.first_m,
             antennas,
+            None if self.names is None else self.names[at],
+            None if self.time_s is None else self.time_s[at],
         )
 
     def select(self, links: slice) -> "Site":
@@ -89,7 +96,10 @@ class Site:
             [self.xy_m[..., :1, :], self.xy_m[..., 1:, :][..., links, :]], axis=-2
         )
         sight, blocker_m = self.sight[..., links], self.blocker_m[..., links]
-        return Site(xy_m, sight, blocker_m, self.corner_m[..., links, :], self.first_m)
+        corner_m, names = self.corner_m[..., links, :], self.names
+        if names is not None:
+            names = np.concatenate([names[..., :1], names[..., 1:][..., links]], axis=-1)
+        return Site(xy_m, sight, blocker_m, corner_m, self.first_m, names=names, time_s=self.time_s)
 
     def of_helpers(self, places: Ints) -> "Site":
         """Return the site with other helpers: in each of n decisions those that `places` names.
@@ -104,6 +114,8 @@ class Site:
             np.take_along_axis(self.corner_m, places[..., None], axis=-2),
             self.first_m,
             {antenna: site.of_helpers(with_ego) for antenna, site in self.antennas.items()},
+            None if self.names is None else np.take_along_axis(self.names, with_ego, axis=-1),
+            self.time_s,
         )
 
 

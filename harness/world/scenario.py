@@ -5,7 +5,7 @@ Other code takes a scenario as an argument.
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import InitVar, dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from warnings import warn
 
 from harness.core import noise
@@ -107,6 +107,13 @@ class Layout:
         return cls(tuple(order), tuple(buildings), danger, danger_id if danger else None)
 
 
+class Names(NamedTuple):
+    """Say what the source of a layout's traffic calls its vehicles, and what its clock shows."""
+
+    begin_s: float  # what that clock shows at the start of the episode, s
+    by_id: Mapping[str, str]  # the name there of each vehicle, by its id here, such as `v2`
+
+
 @dataclass(frozen=True)
 class Seat:
     """Describe the scenario as an agent other than the ego plays it: with that agent as the ego.
@@ -163,6 +170,8 @@ class Scenario:
     # goal and words; only of worlds that are played elsewhere. None if all layouts have one road
     layouts: Callable[[int], "Scenario"] | None = None
     layout_seed: int | None = None  # seed of the only layout that has this road; None for all
+    # what the source of this layout's traffic calls its vehicles; None if there is no such source
+    names: Names | None = None
     source: str = ""  # where its traffic comes from, for a dataset's card; empty for the harness's
     licence: str = ""  # terms of that source, for the card; empty for the harness's own
     # spelling of 0.2, until 0.5.0: what starts an episode of such a world; takes the scenario and

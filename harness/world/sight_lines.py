@@ -2,6 +2,7 @@
 distances, and obstacles between antennas.
 """
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import compress
@@ -11,8 +12,10 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Antenna, Site
 from harness.world.perception.rays import meetings
+from harness.world.scenario import Names
 from harness.world.state import BROAD, HEIGHTS_M, Building, VehicleState, WorldState
 
+NO_NAMES = Names(math.nan, {})
 LEAST_ANGLE_RAD = np.pi / 6  # streets that meet at a smaller angle run side by side, or merge
 
 
@@ -23,6 +26,7 @@ def site(
     points: Sequence[tuple[WorldState, Sequence[str]]],
     antennas: Collection[Antenna] = (),
     zones_m: Sequence[Place] = (),
+    names: Sequence[Names | None] = (),
 ) -> Site:
     """Return where the ego and its helpers are in n states, and what is between them.
 
@@ -30,7 +34,8 @@ def site(
     helpers, the ego first. Antennas are at vehicle centres; if a building and a vehicle both block
     a link, the building counts. `antennas` are on no vehicle, and add links to the ego and helpers;
     their positions are relative to the point's entry in `zones_m`, the centre of the conflict zone
-    of its road, m. It is needed where there are antennas.
+    of its road, m. It is needed where there are antennas. `names` has for each point what the
+    source of its traffic calls vehicles, and is empty where no point has such a source.
     """
     states = [state for state, _ in points]
     viewers: list[list[VehicleState]] = []
@@ -44,7 +49,23 @@ def site(
         places_m = [(x_m + antenna.x_m, y_m + antenna.y_m) for x_m, y_m in zones_m]
         links = _site(list(zip(states, places_m, viewers, strict=True)))
         of_antennas[antenna] = replace(links, first_m=antenna.height_m)
-    return replace(among, antennas=of_antennas)
+    among = replace(among, antennas=of_antennas)
+    return _named(among, points, names) if any(names) else among
+
+
+def _named(
+    among: Site,
+    points: Sequence[tuple[WorldState, Sequence[str]]],
+    names: Sequence[Names | None],
+) -> Site:
+    """Return the site with the vehicles' names, and the time, in the source of their traffic."""
+    called, times_s = [], []
+    for (state, ids), names_here in zip(points, names, strict=True):
+        begin_s, by_id = names_here or NO_NAMES
+        absent = 1 + among.sight.shape[-1] - len(ids)
+        called.append([*(by_id.get(id_, "") for id_ in ids), *[""] * absent])
+        times_s.append(begin_s + state.time_s)
+    return replace(among, names=np.array(called, dtype=str), time_s=np.array(times_s))
 
 
 def _site(

@@ -264,8 +264,9 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
     intents = replace(stored.whole(scenes), outlook=outlook(scenario, scenes))
     if point.physical:
         places = [(scene.state, scene.viewers) for scene in scenes]
-        zones_m = [scenario.at(scene.state.episode_seed).road().zone_m for scene in scenes]
-        intents = replace(intents, site=site(places, point.antennas, zones_m))
+        layouts = [scenario.at(scene.state.episode_seed) for scene in scenes]
+        zones_m, names = [at.road().zone_m for at in layouts], [at.names for at in layouts]
+        intents = replace(intents, site=site(places, point.antennas, zones_m, names))
     seed, node = (index.ravel() for index in np.indices(shape))
     steps, width = scenario.parameters.decisions, intents.range_m.shape[1]
     draws = channel_draws(
