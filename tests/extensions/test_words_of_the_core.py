@@ -82,6 +82,7 @@ ORDINARY = {
     "text": "what is read and written",
     "trace": "of a matrix",
     "tracker": "of a process's resources, and what may delete a folder",
+    "transmissions": "messages that are sent",
     "trust": "how far a rule, or a loader of weights, trusts what it is given",
     "verify": "the check of a dataset",
     "view": "what a vehicle sees",

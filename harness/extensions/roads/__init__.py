@@ -4,4 +4,7 @@ from harness.core.extensions import Extension
 
 _HERE = "harness.extensions.roads"
 
-EXTENSION = Extension(name="roads")
+EXTENSION = Extension(
+    name="roads",
+    adds={"channel_models": {"transmissions": f"{_HERE}.transmissions:from_profile"}},
+)
