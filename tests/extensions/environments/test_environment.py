@@ -889,7 +889,7 @@ def test_a_name_that_would_import_a_module_is_refused_unless_it_is_listed(
     assert not said if name == OWN else "would import" not in said
 
 
-class Street(Breakdown):
+class Imports(Breakdown):
     """Names a street by a number, a file by its path, and a class of its own by its path."""
 
     @classmethod
@@ -907,14 +907,14 @@ class Street(Breakdown):
         return super().step(action)
 
 
-gymnasium.register("street-v0", entry_point=Street)
+gymnasium.register("imports-v0", entry_point=Imports)
 
 
 def test_a_text_with_a_dot_is_a_module_only_where_it_is_imported(monkeypatch):
     monkeypatch.delenv("SWARMDRIVE_IMPORTS")
     changes = {"street": "1.5", "map": "../no.such/map.net.xml", "breaks": "my_roads.Truck"}
-    examine(scenarios.get(named("street-v0", changes)), 0)
-    hostile = scenarios.get(named("street-v0", {"late": "antigravity.Car"}))
+    examine(scenarios.get(named("imports-v0", changes)), 0)
+    hostile = scenarios.get(named("imports-v0", {"late": "antigravity.Car"}))
     with pytest.raises(UserError, match="would import the module antigravity"):
         examine(hostile, 0)
     with pytest.raises(UserError, match="would import the module antigravity"):
