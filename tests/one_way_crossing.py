@@ -3,6 +3,7 @@
 The ego goes north. In every other episode a car from the west meets it; a helper has just passed.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -93,4 +94,8 @@ SCENARIO = Scenario(
     cleared=cleared,
     words={"task": "cross a one-way street"},
     prompt="v2",
+)
+# Its layouts are cut from recordings, two from each.
+RECORDED = replace(
+    SCENARIO, name="one-way-recorded", cluster=lambda seed: f"recording {(seed + 1) // 2}"
 )

@@ -1,8 +1,10 @@
 """Scores of intents, and confidence intervals of means, shares and differences.
 
 A score has one value per decision; an interval turns values into an `Estimate`. Steps of one
-episode are not independent trials, so intervals are over episodes or over seeds.
-`benchmarks/intervals.py` measures how often they cover the true value.
+episode are not independent trials, so intervals are over episodes or over seeds. Neither are the
+episodes of layouts that are cut from one thing, such as a recording of traffic: these are a
+*cluster*, and clusters take the place of episodes (Liang and Zeger 1986). `benchmarks/intervals.py`
+measures how often intervals cover the true value.
 """
 
 import math
@@ -18,6 +20,7 @@ LEAST_MASS = 1e-4  # least probability that is counted of safe actions
 ALIKE = 4.0  # episodes, over all parts of a mean, by which each part varies as all do
 # differing units, up to which an interval counts on rarer and heavier ones than were seen
 FEW = 6.0
+FEWEST = 10  # clusters that a bootstrap resamples: of fewer, its interval is far too narrow
 # a smaller sum of squares is rounding only; relative to the mean where that is above 1
 ROUNDING = 1e-18
 
@@ -117,12 +120,32 @@ def known_mean(values: Floats, axis: int) -> Floats:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
+def cluster_numbers(names: Sequence[str | None]) -> Ints | None:
+    """Return the number from 0 of each episode's cluster, (E,); None if no two have the same.
+
+    `names` has the name of each episode's cluster; one without is a cluster of its own.
+    """
+    numbers: dict[object, int] = {}
+    keys = [(place if name is None else name) for place, name in enumerate(names)]
+    each = [numbers.setdefault(key, len(numbers)) for key in keys]
+    return None if len(numbers) == len(each) else np.array(each, dtype=np.int64)
+
+
+def too_few(clusters: Ints | None) -> bool:
+    """Return whether episodes are of fewer than `FEWEST` clusters, too few for a bootstrap.
+
+    `clusters`, (E,), has the number of each episode's cluster; None if each is its own.
+    """
+    return clusters is not None and len(np.unique(clusters)) < FEWEST
+
+
 def rate_interval(values: Floats, episodes: Ints | None = None) -> Estimate:
     """Return the mean of n shares from 0 to 1, with Wilson's 95 % interval of the effective size.
 
     `values` are `(n,)`, NaN left out. `episodes`, `(n,)`, has the number of each value's episode;
     by default each value has one of its own. Values of one episode correlate, so the effective size
-    is smaller than n by the variance between episodes.
+    is smaller than n by the variance between episodes; it is 1 for a single episode. Numbers of
+    clusters of episodes do the same.
     """
     is_known = ~np.isnan(values)
     n, n_excluded = int(is_known.sum()), int((~is_known).sum())
@@ -172,7 +195,9 @@ def seed_rate_interval(values: Floats) -> Estimate:
     )
 
 
-def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate:
+def paired_difference(
+    parts: Sequence[Floats], level: float = LEVEL, clusters: Sequence[Ints] | None = None
+) -> Estimate:
     """Return the unweighted mean of the strata's mean differences, with an interval over episodes.
 
     Strata are groups of episodes, such as those with a danger (a vehicle in the ego's way) and
@@ -184,38 +209,51 @@ def paired_difference(parts: Sequence[Floats], level: float = LEVEL) -> Estimate
     weight goes from the largest possible to the usual one by exp(-k / `FEW`). The ends are NaN if a
     stratum has only one episode.
 
+    Of clusters the totals vary in place of episodes, over all strata at once, and two clusters that
+    differ are added. The ends are NaN if there is only one cluster.
+
     Args:
         parts: for each stratum the differences of its E episodes, from -1 to 1, (E,); NaN is left
             out.
         level: of confidence, from 0 to 1.
+        clusters: for each stratum the number of each episode's cluster, (E,), the same in all
+            strata; None if each episode is a cluster of its own.
     """
-    return paired_reach(parts, _normal(level))
+    return paired_reach(parts, _normal(level), clusters)
 
 
-def paired_reach(parts: Sequence[Floats], errors: float) -> Estimate:
+def paired_reach(
+    parts: Sequence[Floats], errors: float, clusters: Sequence[Ints] | None = None
+) -> Estimate:
     """Return the mean over strata of paired differences, with ends so many standard errors away.
 
     It is `paired_difference` with another interval. `parts` has for each stratum (group of
     episodes) the differences of its E episodes, from -1 to 1, (E,); `errors` is the number of
-    standard errors from the mean to either end, such as 1.96.
+    standard errors from the mean to either end, such as 1.96. `clusters` has for each the number of
+    each episode's cluster, (E,); None if each is its own.
     """
-    value, error = _paired_error(parts)
+    value, error = _paired_error(parts, clusters)
     n = sum(int((~np.isnan(part)).sum()) for part in parts)
     half = errors * error
     low, high = float(np.maximum(value - half, -1.0)), float(np.minimum(value + half, 1.0))
     return Estimate(value, low, high, n, sum(map(len, parts)) - n)
 
 
-def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
+def _paired_error(
+    parts: Sequence[Floats], clusters: Sequence[Ints] | None = None
+) -> tuple[float, float]:
     """Return the mean of `paired_difference` and its standard error; NaN where it is not known."""
     known_parts = [part[~np.isnan(part)] for part in parts]
     sizes = np.array([len(part) for part in known_parts])
     if sizes.min() == 0:
         return math.nan, math.nan
     value = float(np.mean([part.mean() for part in known_parts]))
+    weights = 1 / (len(parts) * sizes)  # of an episode in each part
+    if clusters is not None:
+        numbers = [of_part[~np.isnan(part)] for of_part, part in zip(clusters, parts, strict=True)]
+        return value, _clustered_error(known_parts, np.repeat(weights, sizes), numbers)
     if sizes.min() == 1:
         return value, math.nan
-    weights = 1 / (len(parts) * sizes)  # of an episode in each part
     more = ALIKE / len(parts) if len(parts) > 1 else 0.0
     own_variances = np.array([part.var(ddof=1) for part in known_parts])
     of_all = float(np.mean(np.concatenate(known_parts) ** 2))
@@ -223,11 +261,35 @@ def _paired_error(parts: Sequence[Floats]) -> tuple[float, float]:
     effects = np.concatenate(
         [part * weight for part, weight in zip(known_parts, weights, strict=True)]
     )
+    added = _of_two_more(effects, float(weights.max()))
+    return value, math.sqrt(float(np.sum(weights**2 * sizes * variances)) + added)
+
+
+def _clustered_error(parts: Sequence[Floats], weights: Floats, clusters: Sequence[Ints]) -> float:
+    """Return the standard error of the mean of parts' means over C clusters; NaN for one cluster.
+
+    `weights` are those of all parts' episodes in the mean, one part after another, (E,).
+    """
+    place: Ints = np.unique(np.concatenate(clusters), return_inverse=True)[1]
+    count = int(place.max()) + 1
+    if count < 2:
+        return math.nan
+    deviations = np.concatenate([part - part.mean() for part in parts])
+    effects: Floats = np.bincount(place, weights=np.concatenate(parts) * weights).astype(float)
+    totals = np.bincount(place, weights=deviations * weights)
+    variance = count / (count - 1) * float(np.sum(totals**2))
+    heaviest = float(np.bincount(place, weights=weights).max())
+    return math.sqrt(variance + _of_two_more(effects, heaviest))
+
+
+def _of_two_more(effects: Floats, heaviest: float) -> float:
+    """Return the variance that two more units which differ add to a mean, one each way.
+
+    `effects` are what each unit adds to the mean, (n,), and `heaviest` is the greatest weight.
+    """
     differing = effects[effects != 0]
     usual = float(np.mean(differing**2)) if len(differing) else 0.0
-    heaviest = float(weights.max()) ** 2
-    added = 2 * (usual + (heaviest - usual) * math.exp(-len(differing) / FEW))
-    return value, math.sqrt(float(np.sum(weights**2 * sizes * variances)) + added)
+    return 2 * (usual + (heaviest**2 - usual) * math.exp(-len(differing) / FEW))
 
 
 def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
@@ -265,45 +327,57 @@ def rate_difference(a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
     return Estimate(value, low, high, n, n_excluded)
 
 
-def mean_of(estimates: Sequence[Estimate]) -> Estimate:
+def mean_of(estimates: Sequence[Estimate], together: bool = False) -> Estimate:
     """Return the unweighted mean of independent estimates, with an interval combined from theirs.
 
     The distances of the ends from the values are combined as the root of their sum of squares
     ("MOVER": Zou and Donner 2008), so the level of confidence is that of the estimates. The
     estimates are taken as all there are, not as a sample of more. NaN where any estimate is.
+    `together` is for estimates that are not independent, as of the same clusters: the distances are
+    averaged, which is widest, as if all were off the same way.
     """
     value = np.array([estimate.value for estimate in estimates])
     low = np.array([estimate.low for estimate in estimates])
     high = np.array([estimate.high for estimate in estimates])
     mean = float(np.mean(value))
-    below, above = (math.hypot(*(value - end)) / len(value) for end in (low, high))
+    below, above = (_combined(np.abs(value - end), together) for end in (low, high))
     n, n_excluded = sum(e.n for e in estimates), sum(e.n_excluded for e in estimates)
     return Estimate(mean, mean - below, mean + above, n, n_excluded)
 
 
-def resampled(draws: np.random.Generator, n: int, times: int) -> Ints:
+def _combined(distances: Floats, together: bool) -> float:
+    """Return how far the end of a mean's interval is away, from the distances of what it is of."""
+    total = float(distances.sum()) if together else math.hypot(*distances)
+    return total / len(distances)
+
+
+def resampled(draws: np.random.Generator, n: int, times: int, clusters: Ints | None = None) -> Ints:
     """Return how often each of n units is in `times` bootstrap resamples, `(1 + times, n)`.
 
     The first row is all ones: the units themselves. Each other one counts n draws with replacement.
+    With `clusters`, the number from 0 of each unit's cluster, (n,), clusters are drawn in place of
+    units, as many as there are: all units of one count alike.
     """
+    if clusters is not None:
+        return resampled(draws, int(clusters.max()) + 1, times)[:, clusters]
     return np.vstack(
         [np.ones((1, n), dtype=np.int64), draws.multinomial(n, np.full(n, 1 / n), times)]
     )
 
 
-def resampled_estimate(values: Floats, n: int) -> Estimate:
+def resampled_estimate(values: Floats, n: int, clusters: Ints | None = None) -> Estimate:
     """Return a statistic of n units with the 95 % percentile interval of its bootstrap.
 
     A unit is what is drawn with replacement, such as an episode. `values`, `(1 + times,)`, has the
     statistic of the units themselves, then that of each resample, in the order of `resampled`. NaN
-    resamples are left out; if the first is NaN, there is no interval.
+    resamples are left out; if the first is NaN, there is no interval, nor if `clusters`, (n,), has
+    the numbers of fewer than `FEWEST` clusters of the units.
     """
     resamples = values[1:][~np.isnan(values[1:])]
     if np.isnan(values[0]):
         return Estimate(math.nan, math.nan, math.nan, 0, n)
-    low, high = (
-        np.percentile(resamples, (2.5, 97.5)).tolist() if len(resamples) else (math.nan, math.nan)
-    )
+    has_ends = len(resamples) > 0 and not too_few(clusters)
+    low, high = np.percentile(resamples, (2.5, 97.5)).tolist() if has_ends else (math.nan, math.nan)
     return Estimate(float(values[0]), low, high, n, 0)
 
 

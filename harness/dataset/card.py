@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 
 from harness import __version__
-from harness.core.figures import interval_of
+from harness.core.figures import amount, interval_of
 from harness.core.seeds import Purpose, seeds_text
 from harness.core.statistics import Estimate
 from harness.dataset.columns import COLUMNS, Column
@@ -57,6 +57,7 @@ class Table:
     # success of each policy that needs no model, by its name: the mean over layouts, start
     # situations
     references: Mapping[str, Estimate]
+    recordings: int | None = None  # how many its layouts are cut from; None if each is drawn alone
 
     @property
     def name(self) -> str:
@@ -282,7 +283,10 @@ def _references(tables: Sequence[Table]) -> Iterator[str]:
     yield _row(*["---"] * (2 + len(names)))
     for t in tables:
         cells = (interval_of(t.references[name]) if name in t.references else "" for name in names)
-        yield _row(f"`{t.name}`", t.manifest.episodes, *cells)
+        n = str(t.manifest.episodes)
+        if t.recordings is not None:
+            n = f"{n} of {amount(t.recordings, 'recording')}"
+        yield _row(f"`{t.name}`", n, *cells)
 
 
 def hub_size(rows: int) -> str:

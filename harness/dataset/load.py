@@ -15,12 +15,13 @@ import msgspec
 import numpy as np
 from msgspec import structs
 
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable, sayable, unknown
 from harness.core.files import text_of
 from harness.core.memory import uncollected
 from harness.core.resources import entries, folder
 from harness.core.resources import find as beside
+from harness.core.statistics import cluster_numbers
 from harness.dataset.forest import Forest
 from harness.dataset.schema import Manifest, Record, Tree, plain_type
 from harness.dataset.verify import (
@@ -194,6 +195,14 @@ class Dataset:
         A danger is a vehicle that would meet an ego which keeps its speed.
         """
         return np.array([tree.danger.sector is not None for tree in self.trees])
+
+    @property
+    def clusters(self) -> Ints | None:
+        """Return the number from 0 of each episode's cluster, (E,); None if each is of its own.
+
+        A cluster is what layouts are cut from, such as a recording of traffic.
+        """
+        return cluster_numbers([self.scenario.cluster_of(seed) for seed in self.seeds])
 
     @property
     def lost(self) -> int:

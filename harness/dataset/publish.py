@@ -88,7 +88,9 @@ def _table(
             writer.write_table(pa.Table.from_pylist(rows, SCHEMA))
             count += len(rows)
             progress(len(layouts.episodes))
-    references = {key: rate_interval(success) for key, success in data.reference_success().items()}
+    clusters, references = data.clusters, {}
+    for key, success in data.reference_success().items():
+        references[key] = rate_interval(success, clusters)
     return Table(
         data.manifest,
         data.sha256,
@@ -100,6 +102,7 @@ def _table(
         sha256_file(file, "rows"),
         file.stat().st_size,
         references,
+        None if clusters is None else int(clusters.max()) + 1,
     )
 
 

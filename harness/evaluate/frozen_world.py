@@ -155,6 +155,7 @@ class _Layout(NamedTuple):
     earliest_s: float  # when the goal can be reached; inf for never
     reference_s: float  # when the full-view driver reaches it; inf for never
     radios: Mapping[str, Any]  # its columns of witnesses and radios
+    cluster: str | None  # what it is cut from, such as a recording; None for one of its own
 
 
 class FrozenWorld(SceneWorld):
@@ -302,6 +303,7 @@ class FrozenWorld(SceneWorld):
                 earliest_s=earliest,
                 reference_s=reference,
                 radios=radios(self.scenario, seed, danger),
+                cluster=self.scenario.cluster_of(seed),
             )
             for number, seed, danger, earliest, reference in zip(
                 forest.episodes.tolist(),
@@ -356,5 +358,6 @@ class FrozenWorld(SceneWorld):
             least_gap_m=min([edge.least_gap_m for edge in edges]),
             hard_brakings=sum([edge.hard_brakings for edge in edges]),
             other_crashes=sum([edge.other_crashes for edge in edges]),
+            cluster=layout.cluster,
             **layout.radios,
         )

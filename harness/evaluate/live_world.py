@@ -383,6 +383,7 @@ def _episode(trajectory: Trajectory, course: Course, full_view: Outcome | None) 
         hard_brakings=world.journey.hard_brakings,
         other_crashes=outcome.other_crashes,
         skipped=course.skipped,
+        cluster=world.scenario.cluster_of(world.seed),
         **radios(world.scenario, world.seed, world.layout.danger),
     )
 
@@ -425,4 +426,5 @@ def _swarm(trajectory: Trajectory, course: Course, alone_s: Mapping[int, float])
         most_lost_s=None if most is None else lost_s[most],
         gave_way=most if most is not None and lost_s[most] > 0 else None,
         journeys=msgspec.json.encode(ends_of_agents).decode(),
+        cluster=world.scenario.cluster_of(world.seed),
     )

@@ -6,12 +6,15 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+import numpy as np
+
 from harness.backends.registry import is_from_file, reads_prompts
 from harness.coordination.part_settings import more_parts
 from harness.core.errors import UserError, printable
 from harness.core.figures import PERCENT, amount
 from harness.core.places import text
 from harness.core.plugins import Plugins
+from harness.core.statistics import FEWEST, too_few
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
 from harness.report.apart import said_of
@@ -90,11 +93,39 @@ def unanswered(run: Run) -> Iterator[str]:
 
 
 def few(run: Run) -> Iterator[str]:
-    """Yield a warning on a run of fewer than `FEW` episodes: the interval of success is wide."""
-    n = len(run.grid.episodes)
+    """Yield a warning on a run of fewer than `FEW` episodes: the interval of success is wide.
+
+    Where layouts are cut from recordings, these are counted in place of episodes.
+    """
+    n, unit = len(run.grid.episodes), "episode"
+    if run.clusters is not None:
+        n, unit = len(np.unique(run.clusters)), "recording"
     if n < FEW:
         reach = f"{98 / n**0.5:.0f} points to either side"
-        yield f"Only {amount(n, 'episode')}: the interval of a rate may reach {reach}."
+        yield f"Only {amount(n, unit)}: the interval of a rate may reach {reach}."
+
+
+def clustered(run: Run) -> Iterator[str]:
+    """Yield how many recordings a run's layouts are cut from, which intervals count in their place.
+
+    A layout is one start situation; those of one recording of traffic are alike. It also says which
+    intervals so few do not allow. It yields nothing if each layout is drawn on its own.
+    """
+    clusters = run.clusters
+    if clusters is None:
+        return
+    count = len(np.unique(clusters))
+    lacking = ""
+    if count == 1:
+        lacking = " One does not tell how others differ: only shares have an interval, a wide one."
+    elif too_few(clusters):
+        lacking = (
+            f" With fewer than {FEWEST}, percentiles and figures of calibration have no interval."
+        )
+    yield (
+        f"{amount(len(clusters), 'layout')} of {amount(count, 'recording')}: layouts of one are "
+        f"alike, so intervals count recordings.{lacking}"
+    )
 
 
 def saturated(run: Run) -> Iterator[str]:

@@ -85,6 +85,7 @@ OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
     Kind.LIMIT: [
         each(caveats.causes),
         each(caveats.few),
+        each(caveats.clustered),
         each(caveats.saturated),
         each(caveats.earlier_gains),
         each(caveats.sampled),

@@ -4,13 +4,14 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import comb
 from statistics import median
+from types import MappingProxyType
 
 import numpy as np
 
 from harness.core.arrays import Floats
 from harness.core.figures import some_of
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate
+from harness.core.statistics import Estimate, cluster_numbers
 from harness.report.runs import Runs
 from harness.report.words import score_texts
 from harness.runs.folder import Run
@@ -155,10 +156,11 @@ def _marks(runs: Runs, headline_metric: str) -> dict[str, list[Mark]]:
     for condition in runs.conditions:
         by_condition.append([successes.get(condition, {}) for successes in by_run])
     dangerous = set[int]()
+    episodes = [episode for run in runs.runs for episode in run.episodes]
     if headline_metric == BALANCED:
-        episodes = [episode for run in runs.runs for episode in run.episodes]
         dangerous = {each.episode for each in episodes if each.danger != "none"}
-    return dict(zip(runs.conditions, marked(by_condition, dangerous), strict=True))
+    cluster_of = {each.episode: each.cluster for each in episodes}
+    return dict(zip(runs.conditions, marked(by_condition, dangerous, cluster_of), strict=True))
 
 
 def grids(results: Sequence[Line]) -> list[Grid]:
@@ -207,7 +209,9 @@ def _successes(run: Run) -> dict[str, dict[tuple[int, int], float]]:
 
 
 def marked(
-    conditions: Sequence[Sequence[Successes]], dangerous: Container[int] = ()
+    conditions: Sequence[Sequence[Successes]],
+    dangerous: Container[int] = (),
+    cluster_of: Mapping[int, str | None] = MappingProxyType({}),
 ) -> list[list[Mark]]:
     """Return for each condition the marks of all runs: best, not told from the best, or worse.
 
@@ -219,8 +223,9 @@ def marked(
         conditions: for each condition the success (0 or 1) of each run, by episode's number and
             channel seed; empty for a run that was not made under it.
         dangerous: numbers of the episodes with a danger, if balanced success is compared.
+        cluster_of: what the layouts of episodes are cut from, by their numbers.
     """
-    results = [_behind_best(successes, dangerous) for successes in conditions]
+    results = [_behind_best(successes, dangerous, cluster_of) for successes in conditions]
     p_values = [each.p_value for _, behind in results for each in behind.values()]
     pairs = 0  # of runs under the same condition
     for successes in conditions:
@@ -239,7 +244,7 @@ def marked(
 
 
 def _behind_best(
-    ended: Sequence[Successes], dangerous: Container[int]
+    ended: Sequence[Successes], dangerous: Container[int], cluster_of: Mapping[int, str | None]
 ) -> tuple[int | None, dict[int, Behind]]:
     """Return the best run and the others against it, p not yet corrected;
     None where there is no such run.
@@ -249,21 +254,29 @@ def _behind_best(
     """
     runs = [n for n, successes in enumerate(ended) if successes]
     for best in runs:
-        pairs = {n: _shared(ended[n], ended[best], dangerous) for n in runs if n != best}
+        pairs = {}
+        for n in runs:
+            if n != best:
+                pairs[n] = _shared(ended[n], ended[best], dangerous, cluster_of)
         if pairs and all(a.size and rule.mean(a) <= rule.mean(b) for rule, a, b in pairs.values()):
             return best, {n: _behind(*pair) for n, pair in pairs.items()}
     return None, {}
 
 
 def _shared(
-    first: Successes, second: Successes, dangerous: Container[int]
+    first: Successes,
+    second: Successes,
+    dangerous: Container[int],
+    cluster_of: Mapping[int, str | None],
 ) -> tuple[Success, Floats, Floats]:
     """Return the success rule of the episodes that both runs have, and the successes of each
     run in them, (S, E); (0, 0) where they share none.
     """
     keys = sorted(first.keys() & second.keys())
     episodes = sorted({episode for episode, _ in keys})
-    rule = Success(np.array([episode in dangerous for episode in episodes], dtype=bool))
+    clusters = cluster_numbers([cluster_of.get(episode) for episode in episodes])
+    is_dangerous = np.array([episode in dangerous for episode in episodes], dtype=bool)
+    rule = Success(is_dangerous, clusters)
     if not keys:
         return rule, np.empty((0, 0)), np.empty((0, 0))
     a = np.array([first[key] for key in keys]).reshape(len(episodes), -1).T

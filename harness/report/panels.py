@@ -272,13 +272,17 @@ def reliability(run: Run) -> Table:
     """
     rows: Table = []
     judged_by_condition = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
+    clusters = run.clusters
     for condition, judged in zip(run.conditions, judged_by_condition, strict=True):
         if len(judged.sure) < LEAST:
             continue
         bins = judged.bins()
         for place in np.unique(bins):
             here = bins == place
-            share = rate_interval(judged.right[here], judged.episode[here])
+            units = judged.episode[here]
+            if clusters is not None:
+                units = clusters[units]
+            share = rate_interval(judged.right[here], units)
             rows.append(
                 {
                     "condition": condition,
@@ -312,12 +316,15 @@ def _shares(
     as `name`; bins below 0 are left out.
     """
     conditions = run.decisions.codes("condition", run.conditions)
-    episodes = run.decisions.whole("episode")
+    units = run.decisions.whole("episode")
+    if run.clusters is not None:
+        cluster_of = dict(zip(run.grid.episodes, run.clusters.tolist(), strict=True))
+        units = np.array([cluster_of[episode] for episode in units.tolist()])
     for n, condition in enumerate(run.conditions):
         for place in np.unique(bins[(conditions == n) & (bins >= 0)]):
             here = (conditions == n) & (bins == place) & ~np.isnan(hits)
             if here.any():
-                share = rate_interval(hits[here], episodes[here])
+                share = rate_interval(hits[here], units[here])
                 yield {
                     "condition": condition,
                     name: round(float(value[here].mean()), 4),

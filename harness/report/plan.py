@@ -125,6 +125,12 @@ def from_pilots(pilots: Sequence[Path], detect: float, power: float, layouts: in
     """
     sides = _difference(*pilots) if len(pilots) > 1 else _gains(pilots[0])
     success, n = sides.success, sides.success.dangerous.size
+    if success.clusters is not None:
+        raise UserError(
+            f"{sides.names}: {amount(n, 'layout')} are of "
+            f"{amount(len(np.unique(success.clusters)), 'recording')}, and a plan counts layouts "
+            "that are drawn on their own; give pilots of such"
+        )
     counts = success.resampled(noise.generator("plan"), RESAMPLES)
     rows = []
     for condition, (a, b) in sides.values.items():

@@ -29,12 +29,15 @@ def in_trees(dataset: Dataset) -> dict[str, dict[str, Score]]:
     with and without a danger) and its halves. A danger is a vehicle that would meet an ego which
     keeps its speed.
     """
+    clusters = dataset.clusters
 
     def scores(reference: str, success: Floats) -> dict[str, Score]:
         values = {SUCCESS: success, **by_danger(success, dataset.dangerous)}
         of_reference = {}
         for metric in known_in(values):
-            rate = halved(metric, lambda half: rate_interval(values[half]))
+            rate = halved(
+                metric, lambda half: rate_interval(values[half], clusters), clusters=clusters
+            )
             of_reference[metric] = Score.of(reference, metric, rate, "episodes")
         return of_reference
 

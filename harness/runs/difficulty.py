@@ -115,8 +115,11 @@ class Pool:
         level: float,
     ) -> Estimate | None:
         """Correct each half of its own where success is balanced;
-        one that cannot be stays as it is.
+        one that cannot be stays as it is. Layouts of a cluster, which are no random sample, are not
+        corrected.
         """
+        if success.clusters is not None:
+            return None
         parts, covariates = success.parts, self.known[self.answered]
         pools = [self.known]
         if len(parts) > 1:

@@ -20,11 +20,13 @@ import pyarrow.csv as pacsv
 from msgspec import Struct
 
 from harness.core import work
+from harness.core.arrays import Ints
 from harness.core.config import LONGEST_S
 from harness.core.errors import UserError, printable, sayable
 from harness.core.files import BROKEN, bytes_of, text_of
 from harness.core.formats import SUITE
 from harness.core.memory import uncollected
+from harness.core.statistics import cluster_numbers
 from harness.runs import formats
 from harness.runs.answers import Answered, Answers
 from harness.runs.decisions import Decisions, arrow_file
@@ -99,6 +101,15 @@ class Run:
     @property
     def grid(self) -> Grid:
         return self._placed[0]
+
+    @cached_property
+    def clusters(self) -> Ints | None:
+        """Return the number from 0 of each episode's cluster, (E,); None if each is of its own.
+
+        A cluster is what layouts are cut from, such as a recording of traffic; episodes are in the
+        order of the grid.
+        """
+        return cluster_numbers([e.cluster for e in self.episodes[: len(self.grid.episodes)]])
 
     @cached_property
     def _placed(self) -> tuple[Grid, tuple[Episode, ...]]:

@@ -191,10 +191,22 @@ EPISODE: Mapping[str, Added] = {
     "journeys": Added(
         "2026-11-27", None, "how each agent ended; also missing where only egos decide"
     ),
+    "cluster": Added(
+        "2026-11-30", None, "layouts of one recording; also missing where each is of its own"
+    ),
 }
 
 # Columns that are missing where no episode has a value.
-SPARSE = ("agents", "arrived", "met", "agents_lost_s", "most_lost_s", "gave_way", "journeys")
+SPARSE = (
+    "agents",
+    "arrived",
+    "met",
+    "agents_lost_s",
+    "most_lost_s",
+    "gave_way",
+    "journeys",
+    "cluster",
+)
 
 
 def upgraded(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.core.statistics import Estimate, known_mean, resampled
+from harness.core.statistics import Estimate, known_mean, resampled, too_few
 
 PERCENTILES = (50, 95, 99)
 RESAMPLES, RESAMPLING_SEED = 999, 0
@@ -33,7 +33,7 @@ def percentiles(latency_ms: Floats) -> Floats:
 
 
 def differences(
-    a: Sequence[Decided], b: Sequence[Decided], episodes: int
+    a: Sequence[Decided], b: Sequence[Decided], episodes: int, clusters: Ints | None = None
 ) -> Iterator[tuple[int, float, float, Estimate]]:
     """Yield for each of `PERCENTILES` the percent, its value in run A and in B, and the difference.
 
@@ -42,9 +42,9 @@ def differences(
     `a` and `b` have of each run, for each seed of the channel's random numbers, the index of each
     of n decisions' episodes and its value, (n,) each; a percentile is the mean over seeds. In a
     seed, an episode without values in either run is left out. `episodes` is the number of all
-    episodes.
+    episodes, (E,) `clusters` are resampled in their place if they have some.
     """
-    weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES)
+    weights = resampled(np.random.default_rng(RESAMPLING_SEED), episodes, RESAMPLES, clusters)
     common = [_common(of_a, of_b) for of_a, of_b in zip(a, b, strict=True)]
     n = len(set().union(*(set(of_a[0].tolist()) for of_a, _ in common)))
     if not n:
@@ -53,7 +53,8 @@ def differences(
     of_b = [_percentiles(of_other, weights) for _, of_other in common]
     values_a, values_b = known_mean(np.array(of_a), 0), known_mean(np.array(of_b), 0)
     for percent, x, y in zip(PERCENTILES, values_a, values_b, strict=True):
-        estimate = Estimate(float(y[0] - x[0]), *_ends(y - x, n), n, episodes - n)
+        ends = (math.nan, math.nan) if too_few(clusters) else _ends(y - x, n)
+        estimate = Estimate(float(y[0] - x[0]), *ends, n, episodes - n)
         yield percent, float(x[0]), float(y[0]), estimate
 
 

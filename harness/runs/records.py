@@ -434,6 +434,9 @@ class Episode(Struct, frozen=True, kw_only=True):
     Where several vehicles decide, `agents` is how many, of whom `arrived` reached their goal and
     `met` hit each other; `agents_lost_s` is how much later in sum than alone, `most_lost_s` that of
     the one who lost most, `gave_way`. `journeys` has how each ended, as JSON.
+
+    Layouts that are cut from one thing, such as a recording of traffic, are alike; they have the
+    same `cluster`, and intervals count clusters in place of layouts.
     """
 
     condition: str  # name of the operating point
@@ -488,6 +491,8 @@ class Episode(Struct, frozen=True, kw_only=True):
     gave_way: str | None = None  # id of that one; None if nobody lost time
     # how each of them ended: JSON, a list with the columns of `run.agents` for each
     journeys: str | None = None
+    # what its layout is cut from, such as a recording of traffic; None for a layout of its own
+    cluster: str | None = None
 
 
 class Variant(Struct, frozen=True):

@@ -12,9 +12,9 @@ is right.
 
 Each figure is over all decisions with one optimal action, and none is a mean over episodes. Its
 interval is a bootstrap (Efron and Tibshirani 1993, chapter 13) that resamples whole episodes, since
-decisions of one are not independent. The ends are percentiles of the resampled figures, moved by as
-much as these are off the figure on average: a resample is noisier than the sample, which lifts a
-calibration error.
+decisions of one are not independent, or whole clusters of episodes, where those of one are not. The
+ends are percentiles of the resampled figures, moved by as much as these are off the figure on
+average: a resample is noisier than the sample, which lifts a calibration error.
 """
 
 import math
@@ -25,7 +25,7 @@ import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.noise import generator
-from harness.core.statistics import Estimate, resampled
+from harness.core.statistics import Estimate, resampled, too_few
 
 LEAST_P = 0.005  # least probability of the optimal actions that is counted in a likelihood
 BINS = 15  # of equal mass
@@ -194,7 +194,11 @@ def estimate(judged: Judged, figure: Figure, episodes: int) -> Estimate:
 
 
 def estimates(
-    judged: Judged, figures: Sequence[Figure], episodes: int, older: bool = False
+    judged: Judged,
+    figures: Sequence[Figure],
+    episodes: int,
+    older: bool = False,
+    clusters: Ints | None = None,
 ) -> list[Estimate]:
     """Return several figures of calibration, with intervals from the same bootstrap resamples.
 
@@ -202,32 +206,36 @@ def estimates(
     `calibration_error` and `coverage`; `episodes` is the number of all episodes. With `older` they
     are computed as in the oldest runs (version 1 of `harness.core.versions.FIGURES`): any number of
     episodes is enough, and a figure whose resamples are all alike has an interval of no width.
+    `clusters`, (E,), are resampled in place of episodes, if these have some.
     """
     known_figures = [figure for figure in figures if _is_known(figure, judged, older)]
     values = []
-    for sums in _sums(judged, episodes) if known_figures else ():
+    for sums in _sums(judged, episodes, clusters) if known_figures else ():
         values.append([figure(*sums) for figure in known_figures])
-    results = iter(_estimate(parts, judged, episodes, older) for parts in zip(*values, strict=True))
+    results = iter(
+        _estimate(parts, judged, episodes, older, clusters) for parts in zip(*values, strict=True)
+    )
     return [next(results) if figure in known_figures else _unknown(episodes) for figure in figures]
 
 
 def difference(
-    a: Judged, b: Judged, figure: Figure, episodes: int
+    a: Judged, b: Judged, figure: Figure, episodes: int, clusters: Ints | None = None
 ) -> tuple[float, float, Estimate]:
     """Return a figure of calibration, such as `coverage`, of runs A and B, and B - A.
 
     The difference has an interval. `a` and `b` have how sure and how right the runs' decisions are.
     They are paired by episode: episodes in which either has no decision are left out. All are NaN
     if one is left with fewer than `LEAST` decisions or `LEAST_EPISODES` episodes. `episodes` is the
-    number of all episodes.
+    number of all episodes, (E,) `clusters` are resampled in their place if they have some.
     """
     both = np.intersect1d(a.episode, b.episode)
     a, b = (_of(side, np.isin(side.episode, both)) for side in (a, b))
     if not (_is_known(figure, a) and _is_known(figure, b)):
         return math.nan, math.nan, _unknown(episodes)
-    of_a = np.concatenate([figure(*sums) for sums in _sums(a, episodes)])
-    of_b = np.concatenate([figure(*sums) for sums in _sums(b, episodes)])
-    return float(of_a[0]), float(of_b[0]), _estimate([of_b - of_a], a, episodes)
+    of_a = np.concatenate([figure(*sums) for sums in _sums(a, episodes, clusters)])
+    of_b = np.concatenate([figure(*sums) for sums in _sums(b, episodes, clusters)])
+    change = _estimate([of_b - of_a], a, episodes, clusters=clusters)
+    return float(of_a[0]), float(of_b[0]), change
 
 
 def _of(judged: Judged, which: Bools) -> Judged:
@@ -246,29 +254,38 @@ def _is_known(figure: Figure, judged: Judged, older: bool = False) -> bool:
 
 
 def _estimate(
-    values: Sequence[Floats], judged: Judged, episodes: int, older: bool = False
+    values: Sequence[Floats],
+    judged: Judged,
+    episodes: int,
+    older: bool = False,
+    clusters: Ints | None = None,
 ) -> Estimate:
     """Return a figure, the first of its values, with the interval of the others, its resamples.
 
     Where all are alike, what is not seen in n episodes is in at most 3 / n of others (95 %: Hanley
-    and Lippman-Hand 1983).
+    and Lippman-Hand 1983). There is no interval of too few clusters.
     """
     n = len(np.unique(judged.episode))
     value, *others = np.concatenate(values).tolist()
+    if too_few(clusters):
+        return Estimate(value, math.nan, math.nan, n, episodes - n)
     low, high = value + np.percentile(others, (2.5, 97.5)) - np.mean(others)
     if high - low < SAME and not older:
-        low, high = value - 3 / n, value + 3 / n
+        units = n if clusters is None else len(np.unique(clusters[judged.episode]))
+        low, high = value - 3 / units, value + 3 / units
     return Estimate(value, float(low), float(high), n, episodes - n)
 
 
-def _sums(judged: Judged, episodes: int) -> Iterator[tuple[Floats, Floats, Floats]]:
+def _sums(
+    judged: Judged, episodes: int, clusters: Ints | None
+) -> Iterator[tuple[Floats, Floats, Floats]]:
     """Yield what a `Figure` is of, in parts of some resamples;
     the first is of the decisions as they are.
     """
     order = np.argsort(-judged.sure, kind="stable")
     sure, hits, episode = judged.sure[order], judged.right[order], judged.episode[order]
     starts = np.flatnonzero(np.diff(sure, prepend=np.inf))
-    weights = resampled(generator("reliability", episodes), episodes, RESAMPLES)
+    weights = resampled(generator("reliability", episodes), episodes, RESAMPLES, clusters)
     # resamples that have any decision
     weights = weights[weights[:, np.unique(episode)].any(axis=1)]
     at_once = max(1, AT_ONCE // len(sure))

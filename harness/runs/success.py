@@ -3,7 +3,7 @@
 All that picks, orders or tests by success of single episodes does so here.
 """
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from math import comb
 from typing import Generic, TypeVar
@@ -16,6 +16,7 @@ from harness.core.power import Spread, variance
 from harness.core.statistics import (
     LEVEL,
     Estimate,
+    cluster_numbers,
     known_mean,
     mean_of,
     paired_difference,
@@ -38,10 +39,14 @@ class Success:
 
     A danger is a vehicle that would meet an ego which keeps its speed; `dangerous`, (E,), says
     which episodes have one, none for a plain mean. Balanced success is the mean of two shares: of
-    the successes among episodes with one, and among those without.
+    the successes among episodes with one, and among those without. `clusters`, (E,), has the number
+    of each episode's cluster, such as the recording that its layout is cut from: intervals count
+    these in place of episodes.
     """
 
     dangerous: Bools  # whether each episode has a danger, (E,); all false for a plain mean
+    # number of the cluster of each episode, (E,); None if each is of its own
+    clusters: Ints | None = None
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], headline_metric: str) -> "Success":
@@ -52,11 +57,9 @@ class Success:
         episodes with a danger and without. A danger is a vehicle that would meet an ego which keeps
         its speed.
         """
-        return cls(
-            np.array(
-                [headline_metric == BALANCED and episode.danger != "none" for episode in episodes]
-            )
-        )
+        balanced = headline_metric == BALANCED
+        dangerous = np.array([balanced and episode.danger != "none" for episode in episodes])
+        return cls(dangerous, cluster_numbers([episode.cluster for episode in episodes]))
 
     @property
     def metric(self) -> str:
@@ -78,7 +81,7 @@ class Success:
 
         A danger is a vehicle that would meet an ego which keeps its speed.
         """
-        return Success(np.zeros_like(self.dangerous))
+        return Success(np.zeros_like(self.dangerous), self.clusters)
 
     @property
     def ways(self) -> "tuple[Success, ...]":
@@ -104,7 +107,14 @@ class Success:
         `success` is 1 or 0 (NaN where unknown), (S, E), by S seeds of the channel's random draws
         and E episodes.
         """
-        return self._mean(lambda part: over_episodes(SUCCESS, success[:, part]))
+        clusters = self.clusters
+        estimates = []
+        for part in self.parts:
+            of_part = None if clusters is None else clusters[part]
+            estimates.append(over_episodes(SUCCESS, success[:, part], of_part))
+        if len(estimates) == 1:
+            return estimates[0]
+        return mean_of(estimates, together=clusters is not None)
 
     def difference(self, a: Floats, b: Floats, level: float = LEVEL) -> Estimate:
         """Return the difference in mean success a - b, with an interval of confidence `level`.
@@ -154,9 +164,11 @@ class Success:
         """Return how often each of E episodes counts in bootstrap resamples, (1 + times, E).
 
         There are `times` resamples after a first row, the sample itself. Episodes with a danger (a
-        vehicle that would meet a cruising ego) and without are resampled apart. `draws` is the
-        generator of random numbers.
+        vehicle that would meet a cruising ego) and without are resampled apart, but for clusters,
+        which are resampled whole. `draws` is the generator of random numbers.
         """
+        if self.clusters is not None:
+            return resampled(draws, len(self.dangerous), times, self.clusters)
         counts = np.empty((1 + times, len(self.dangerous)), dtype=np.int64)
         for part in self.parts:
             counts[:, part] = resampled(draws, int(part.sum()), times)
@@ -180,11 +192,6 @@ class Success:
         """
         halves = [self.dangerous, ~self.dangerous]
         return halves if self.metric == BALANCED else [np.ones_like(self.dangerous)]
-
-    def _mean(self, estimate: Callable[[Bools], Estimate]) -> Estimate:
-        parts = self.parts
-        estimates = [estimate(part) for part in parts]
-        return mean_of(estimates) if len(estimates) > 1 else estimates[0]
 
 
 def by_condition(
@@ -264,11 +271,29 @@ def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
     the success a and b of its episodes, (S, E) each, by S seeds of the channel's random draws and E
     episodes. The interval, of confidence `level`, treats all families' episodes together.
     """
-    parts = []
-    for success, a, b in pairs:
+    parts, of_parts = [], []
+    clusters = _apart(pairs)
+    for (success, a, b), numbers in zip(pairs, clusters, strict=True):
         differences = known_mean(a - b, 0)
         parts += [differences[part] for part in success.parts]
-    return paired_difference(parts, level)
+        of_parts += [numbers[part] for part in success.parts]
+    return paired_difference(parts, level, of_parts if _is_clustered(pairs) else None)
+
+
+def _is_clustered(pairs: Pairs) -> bool:
+    return any(success.clusters is not None for success, _, _ in pairs)
+
+
+def _apart(pairs: Pairs) -> list[Ints]:
+    """Return the number of each episode's cluster for each family, (E,); none is in two."""
+    clusters, first = [], 0
+    for success, _, _ in pairs:
+        numbers = success.clusters
+        if numbers is None:
+            numbers = np.arange(len(success.dangerous))
+        clusters.append(first + numbers)
+        first += len(numbers)
+    return clusters
 
 
 def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
@@ -279,8 +304,13 @@ def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
     episodes. `dangerous` chooses the episodes with a danger. A danger is a vehicle that would meet
     an ego which keeps its speed.
     """
-    parts = [known_mean(a - b, 0)[success.dangerous == dangerous] for success, a, b in pairs]
-    return paired_difference(parts)
+    parts, of_parts = [], []
+    clusters = _apart(pairs)
+    for (success, a, b), numbers in zip(pairs, clusters, strict=True):
+        of_half = success.dangerous == dangerous
+        parts.append(known_mean(a - b, 0)[of_half])
+        of_parts.append(numbers[of_half])
+    return paired_difference(parts, clusters=of_parts if _is_clustered(pairs) else None)
 
 
 def p_of_mean(pairs: Pairs) -> float | None:

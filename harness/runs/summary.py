@@ -11,6 +11,7 @@ from msgspec import structs
 from harness.core.arrays import Floats, Ints
 from harness.core.statistics import (
     Estimate,
+    cluster_numbers,
     episode_interval,
     rate_interval,
     seed_interval,
@@ -52,6 +53,8 @@ class Figures:
     judged: Sequence[Judged]
     # the answers, each with the number of its episode
     answers: Sequence[tuple[Answer | AnswerFacts, int]]
+    # what each episode's layout is cut from, such as a recording, (E,); None for one of its own
+    cluster_names: Sequence[str | None]
 
     @classmethod
     def of(
@@ -88,6 +91,7 @@ class Figures:
             np.split(latency_ms[order], starts),
             judged_of(grid, decisions, cells),
             [(answer, episode_of[answer.scene]) for answer in answers],
+            [episode.cluster for episode in episodes[: len(grid.episodes)]],
         )
 
     @classmethod
@@ -109,6 +113,7 @@ class Figures:
             [np.concatenate(each) for each in by_condition],
             [Judged.joined(each, sizes) for each in judged_by_condition],
             list(chain.from_iterable(part.answers for part in parts)),
+            list(chain.from_iterable(part.cluster_names for part in parts)),
         )
 
     def scores(self, older: bool = False) -> list[Score]:
@@ -119,31 +124,43 @@ class Figures:
         and of an interval without width where all resamples are alike.
         """
         names = known_in(self.values)
+        gains = GAINS if BALANCED in names else {SUCCESS: GAIN}
+        clusters = cluster_numbers(self.cluster_names)
+        answers = self.answers
+        if clusters is not None:
+            cluster_of = dict(zip(self.grid.episodes, clusters.tolist(), strict=True))
+            answers = [(answer, cluster_of[episode]) for answer, episode in answers]
         return [
-            *of_conditions(self.grid.conditions, self.values, names),
+            *of_conditions(self.grid.conditions, self.values, names, clusters),
             *of_latencies(self.grid, self.latency_ms),
-            *_of_judged(self.grid, self.judged, older),
-            *_gains(
-                self.grid.conditions, self.values, GAINS if BALANCED in names else {SUCCESS: GAIN}
-            ),
-            *_of_answers(self.answers),
+            *_of_judged(self.grid, self.judged, older, clusters),
+            *_gains(self.grid.conditions, self.values, gains, clusters),
+            *_of_answers(answers),
         ]
 
 
 def of_conditions(
-    conditions: Sequence[str], values: Mapping[str, Floats], names: Sequence[str]
+    conditions: Sequence[str],
+    values: Mapping[str, Floats],
+    names: Sequence[str],
+    clusters: Ints | None = None,
 ) -> Iterator[Score]:
     """Yield the scores of the metrics `names` in each of C conditions.
 
     `values` has each metric's values by its name, (C, S, E), over S channel seeds and E episodes. A
-    metric has one score with an interval over seeds, and one with an interval over episodes.
+    metric has one score with an interval over seeds, and one with an interval over episodes: over
+    their `clusters`, (E,), if they have some.
     """
     for index, condition in enumerate(conditions):
 
         def scores(name: str, index: int = index, condition: str = condition) -> Iterator[Score]:
             seeds = halved(name, lambda each: over_seeds(each, values[each][index]), shared=True)
             yield Score.of(condition, name, seeds, "seed means")
-            episodes = halved(name, lambda each: over_episodes(each, values[each][index]))
+            episodes = halved(
+                name,
+                lambda each: over_episodes(each, values[each][index], clusters),
+                clusters=clusters,
+            )
             yield Score.of(condition, name, episodes, "episodes")
 
         yield from chain.from_iterable(map(scores, names))
@@ -183,18 +200,25 @@ def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
     return [Judged.of(fused[here], optimal[here], episode[here]) for here in rows]
 
 
-def _of_judged(grid: Grid, judged: Sequence[Judged], older: bool) -> Iterator[Score]:
+def _of_judged(
+    grid: Grid, judged: Sequence[Judged], older: bool, clusters: Ints | None
+) -> Iterator[Score]:
     """Yield each condition's figures of all its judged decisions, where there are any."""
     pooled = {metric.name: metric.pooled for metric in METRICS.values() if metric.pooled}
     for condition, decisions in zip(grid.conditions, judged, strict=True):
         if len(decisions.sure):
-            figures = estimates(decisions, list(pooled.values()), len(grid.episodes), older)
+            figures = estimates(
+                decisions, list(pooled.values()), len(grid.episodes), older, clusters
+            )
             for name, figure in zip(pooled, figures, strict=True):
                 yield Score.of(condition, name, in_range(name, figure), "episodes")
 
 
 def _gains(
-    conditions: Sequence[str], values: Mapping[str, Floats], gains: Mapping[str, str]
+    conditions: Sequence[str],
+    values: Mapping[str, Floats],
+    gains: Mapping[str, str],
+    clusters: Ints | None,
 ) -> Iterator[Score]:
     """Yield each condition's gains over `BASELINE`, by the name of what is gained,
     from values (C, S, E).
@@ -211,13 +235,15 @@ def _gains(
             yield Score.of(condition, gain, halved(name, gain_by_seed, shared=True), "seed means")
             parts = entry(name).halves or (name,)
             pairs = [(values[part][n].T, values[part][base].T) for part in parts]
-            yield Score.of(condition, gain, difference(name, pairs), PAIRED)
+            change = difference(name, pairs, clusters=clusters)
+            yield Score.of(condition, gain, change, PAIRED)
 
 
 def _of_answers(answers: Sequence[tuple[Answer | AnswerFacts, int]]) -> Iterator[Score]:
-    """Yield each metric of a role's answers.
+    """Yield each metric of a role's answers, each of which comes with the number of its unit.
 
-    Intervals are over episodes, since the answers of one episode are not independent.
+    Intervals are over units, episodes or their clusters, since the answers of one unit are not
+    independent.
     """
     by_role = {}
     for role in roles():

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.core.parallel import Workers
 from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset
@@ -17,19 +17,21 @@ from harness.world.drivers import DRIVERS
 COMPARED = ("frozen", "closed", "difference", "agreement")
 
 
-def compared(frozen: Floats, closed: Floats) -> dict[str, Estimate]:
+def compared(frozen: Floats, closed: Floats, clusters: Ints | None = None) -> dict[str, Estimate]:
     """Compare success of the same episodes on frozen scenes and in closed loop, (S, E) each.
 
     On frozen scenes a decision tree says what follows an action; in closed loop the simulator does.
     `frozen` and `closed` are 1 for success or 0; the axes are S channel seeds and E episodes. The
     result has, by the names in `COMPARED`, success in both, their difference, and the share of
-    episodes that end alike, each with an interval over episodes.
+    episodes that end alike, each with an interval over episodes, or over their `clusters`, (E,), if
+    they have some.
     """
+    alike = (frozen == closed).astype(float)
     return {
-        "frozen": over_episodes(SUCCESS, frozen),
-        "closed": over_episodes(SUCCESS, closed),
-        "difference": difference(SUCCESS, [(frozen.T, closed.T)]),
-        "agreement": over_episodes("agreement_rate", (frozen == closed).astype(float)),
+        "frozen": over_episodes(SUCCESS, frozen, clusters),
+        "closed": over_episodes(SUCCESS, closed, clusters),
+        "difference": difference(SUCCESS, [(frozen.T, closed.T)], clusters=clusters),
+        "agreement": over_episodes("agreement_rate", alike, clusters),
     }
 
 
@@ -51,5 +53,5 @@ def rank(
     standings = {}
     for driver in DRIVERS:
         closed = np.array([float(of_episode[driver].success) for of_episode in ends])
-        standings[driver] = compared(frozen[driver][None], closed[None])
+        standings[driver] = compared(frozen[driver][None], closed[None], dataset.clusters)
     return standings

@@ -280,13 +280,19 @@ def _estimates(
     source: Source, metrics: Mapping[str, Floats], latency_ms: Floats
 ) -> Iterator[tuple[str, Estimate, str]]:
     over = over_seeds if source.same_episodes else over_own_episodes
+    clusters: Ints | None = getattr(source, "clusters", None)  # sources of packages may lack it
     names = known_in(metrics)
     for name in (*metrics, BALANCED):
         if name not in names:
             continue
         yield name, halved(name, lambda each: over(each, metrics[each]), shared=True), "seed means"
         if source.same_episodes:
-            yield name, halved(name, lambda each: over_episodes(each, metrics[each])), "episodes"
+            estimate = halved(
+                name,
+                lambda each: over_episodes(each, metrics[each], clusters),
+                clusters=clusters,
+            )
+            yield name, estimate, "episodes"
     for percent, values in zip(PERCENTILES, latency_ms.T, strict=True):
         yield f"latency_p{percent}_ms", seed_interval(values), "seed means"
 

@@ -116,6 +116,7 @@ class ReplayedRun:
         self.points = points_of(self.run)
         self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
         self.episodes = len(self.dataset.episodes)
+        self.clusters = self.dataset.clusters
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))
         self._asks, self._models = asks, models
         self._progress = progress
@@ -465,5 +466,5 @@ def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
     It is balanced, the mean over episodes with a danger (a vehicle that the ego would meet) and
     without, if it can be so for all of them, else plain.
     """
-    rules = alike([Success(run.dataset.dangerous) for run in runs])
+    rules = alike([Success(run.dataset.dangerous, run.dataset.clusters) for run in runs])
     return dict(zip(runs, rules, strict=True))

@@ -6,8 +6,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from harness.core.arrays import Ints
 from harness.core.parallel import Workers, spread
-from harness.core.statistics import Estimate, mean_of, rate_interval
+from harness.core.statistics import Estimate, cluster_numbers, mean_of, rate_interval
 from harness.world import lockstep
 from harness.world.drivers import DRIVERS, LOOKING, PRIVILEGED, choices
 from harness.world.outcome import Outcome
@@ -194,32 +195,40 @@ def check(
     seeds = range(seed, seed + episodes)
     layouts = drive_apart(scenario, seeds, workers, progress)
     dangerous = [scenario.layout(each, scenario.parameters).danger is not None for each in seeds]
+    clusters = cluster_numbers([scenario.cluster_of(each) for each in seeds])
     summaries = {}
     for driver in DRIVERS:
         outcomes = [by_driver[driver] for by_driver in layouts]
-        summaries[driver] = summary(outcomes, dangerous)
+        summaries[driver] = summary(outcomes, dangerous, clusters)
     return summaries
 
 
-def summary(outcomes: list[Outcome], dangerous: Sequence[bool] = ()) -> dict[str, Any]:
+def summary(
+    outcomes: list[Outcome], dangerous: Sequence[bool] = (), clusters: Ints | None = None
+) -> dict[str, Any]:
     """Return how often episodes ended in each way, and counts of collisions and crashes.
 
     `outcomes` has one of each episode. The keys `success`, `collision`, `late`, `time_out` and
     `off_road` have rates with Wilson intervals; `ego_at_fault`, `other_at_fault` and
     `other_crashes` (of vehicles without the ego) have counts. `dangerous` says which episodes hold
     a danger, a vehicle that would meet a cruising ego; if some do and some do not, success is also
-    given as `dangerous`, `harmless` and their mean `balanced`.
+    given as `dangerous`, `harmless` and their mean `balanced`. Intervals are over the episodes'
+    `clusters`, (E,), such as recordings that layouts are cut from, if they have some.
     """
     rates: dict[str, Estimate] = {}
     for result in ("cleared", "collision", "late", "time_out", "off_road"):
         ended_so = np.array([float(outcome.result == result) for outcome in outcomes])
-        rates["success" if result == "cleared" else result] = rate_interval(ended_so)
+        rates["success" if result == "cleared" else result] = rate_interval(ended_so, clusters)
     by_danger: dict[str, Estimate] = {}
     if any(dangerous) and not all(dangerous):
         success = np.array([float(outcome.success) for outcome in outcomes])
         has_danger = np.array(dangerous)
-        halves = [rate_interval(success[has_danger]), rate_interval(success[~has_danger])]
-        by_danger = dict(zip(BY_DANGER, (mean_of(halves), *halves), strict=True))
+        halves = []
+        for half in (has_danger, ~has_danger):
+            of_half = None if clusters is None else clusters[half]
+            halves.append(rate_interval(success[half], of_half))
+        mean = mean_of(halves, together=clusters is not None)
+        by_danger = dict(zip(BY_DANGER, (mean, *halves), strict=True))
     return {
         **rates,
         **by_danger,

@@ -10,11 +10,14 @@ from warnings import warn
 
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Texts
+from harness.core.errors import printable
+from harness.core.strangers import worded
 from harness.world import parameters as _parameters
 from harness.world.parameters import SETTABLE, Parameters
 from harness.world.road import PathKey, Road
 from harness.world.state import Building, Kind, Part
 
+MOST_LETTERS = 200  # of the name of what layouts are cut from
 LAYOUTS_KEPT = 64  # scenarios of single layouts that stay in memory, each with its road
 KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
@@ -174,6 +177,10 @@ class Scenario:
     names: Names | None = None
     source: str = ""  # where its traffic comes from, for a dataset's card; empty for the harness's
     licence: str = ""  # terms of that source, for the card; empty for the harness's own
+    # returns what the layout of a seed, its argument, is cut from, such as the name of a recording
+    # of traffic. Layouts of one are alike: an interval counts them as one, whatever their number.
+    # None if each layout is drawn on its own
+    cluster: Callable[[int], str] | None = None
     # spelling of 0.2, until 0.5.0: what starts an episode of such a world; takes the scenario and
     # the layout seed
     start: InitVar[Callable[["Scenario", int], Any] | None] = None
@@ -201,6 +208,22 @@ class Scenario:
         """
         return self if self.layouts is None else _at(self, seed)
 
+    def cluster_of(self, seed: int) -> str | None:
+        """Return the name of what the layout of a seed is cut from, such as a recording.
+
+        None if each layout is drawn on its own. Raises UserError for a name that is none.
+        """
+        if self.cluster is None:
+            return None
+        with worded(f"scenario {printable(self.name, 80)}"):
+            name: object = self.cluster(seed)
+            if isinstance(name, str) and 0 < len(name) <= MOST_LETTERS and name.isprintable():
+                return name
+            raise ValueError(
+                f"cluster of layout seed {seed} is {printable(repr(name), 60)}, no text of 1 to "
+                f"{MOST_LETTERS} printable characters"
+            )
+
     @property
     def prompt_words(self) -> dict[str, str]:
         """Return texts for prompts by name: `words`, and `speeds`, the target speeds in m/s.
@@ -222,7 +245,13 @@ class Scenario:
 def _at(scenario: Scenario, seed: int) -> Scenario:
     assert scenario.layouts is not None
     of_layout = scenario.layouts(seed)
-    return replace(of_layout, parameters=scenario.parameters, layouts=None, layout_seed=seed)
+    return replace(
+        of_layout,
+        parameters=scenario.parameters,
+        layouts=None,
+        layout_seed=seed,
+        cluster=scenario.cluster,
+    )
 
 
 def _world_of(start: Callable[[Scenario, int], Any]) -> type[Any]:

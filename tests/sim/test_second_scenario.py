@@ -6,10 +6,11 @@ import io
 import json
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from evaluating import scenes_of
-from one_way_crossing import SCENARIO
+from one_way_crossing import RECORDED, SCENARIO
 
 from harness.core.errors import UserError
 from harness.dataset.build import build
@@ -17,6 +18,7 @@ from harness.dataset.load import load
 from harness.dataset.verify import check
 from harness.prompts import versions
 from harness.report.drawing.scene import draw
+from harness.runs.folder import read
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.perception.graph import scene_graph, truth_graph
@@ -37,7 +39,7 @@ def installed(tmp_path_factory):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: one-way\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         f"[swarmdrive.scenarios]\n{NAME} = one_way_crossing:SCENARIO\nbroken = "
-        "one_way_crossing:NONE\n"
+        f"one_way_crossing:NONE\n{RECORDED.name} = one_way_crossing:RECORDED\n"
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
@@ -134,6 +136,39 @@ def test_prompts_list_its_actions_and_say_its_words(frozen, tmp_path):
         draft.render(graph, frozen.actions, words=SCENARIO.words)[0]["content"]
         == "You cross a one-way street."
     )
+
+
+@pytest.mark.slow
+def test_a_run_states_what_its_layouts_are_cut_from_and_check_holds_it_against_the_scenario(
+    harness, tmp_path
+):
+    """Seeds 1 to 4 are of recordings 1, 1, 2 and 2; intervals count two."""
+    build(RECORDED, tmp_path / "data", 4, 1, 1, lambda done: None)
+    data = load(tmp_path / "data")
+    assert data.clusters.tolist() == [0, 0, 1, 1]
+    names = ["recording 1", "recording 1", "recording 2", "recording 2"]
+    played = ("--model", "proxy", "--seeds", "0", "--condition", "single-local", "--workers", "1")
+    ran = harness("eval", "--dataset", data.path, *played, "--out", "frozen", "--verbose")
+    assert (ran[0], "4 layouts of 2 recordings" in ran[1]) == (0, True), ran
+    drawn = ("--scenario", RECORDED.name, "--episodes", "4", "--first-seed", "1")
+    assert harness("drive", *drawn, *played, "--out", "driven")[0] == 0
+    for folder in (Path("frozen"), Path("driven")):
+        assert [episode.cluster for episode in read(folder).episodes] == names
+        code, out, err = harness("run", "check", folder)
+        assert (code, err) == (0, ""), out
+        table = folder / "episodes.csv"
+        table.write_text(table.read_text().replace("recording 2", "recording 1"))
+        code, out, err = harness("run", "check", folder)
+        assert (code, "episodes.csv has another cluster in 2 rows" in out) == (1, True), out + err
+
+
+def test_what_a_layout_is_cut_from_is_a_text():
+    for wrong in (7, "", "a\nb", "a" * 201):
+        odd = replace(SCENARIO, cluster=lambda seed, wrong=wrong: wrong)
+        with pytest.raises(UserError, match=r"cluster of layout seed 3 is .*, no text of 1 to 200"):
+            odd.cluster_of(3)
+    assert SCENARIO.cluster_of(3) is None
+    assert (RECORDED.cluster_of(3), RECORDED.at(3).cluster_of(4)) == ("recording 2", "recording 2")
 
 
 def test_it_is_drawn(frozen):

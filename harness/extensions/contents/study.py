@@ -132,11 +132,11 @@ class Outcome:
         """
         estimates = []
         for name in self._of(family):
-            values = self.families[name]
+            values, rule = self.families[name], self.success_rules[name]
             if metric == BALANCED:
-                estimates.append(self.success_rules[name].estimate(values[SUCCESS]))
+                estimates.append(rule.estimate(values[SUCCESS]))
             else:
-                estimates.append(over_episodes(metric, values[metric]))
+                estimates.append(over_episodes(metric, values[metric], rule.clusters))
         return mean_of(estimates)
 
     def over(

@@ -94,6 +94,12 @@ class Until(StoppingRule):
                 f"--{name} {printable(value)}: a run that stops takes layouts in their order; "
                 "leave it out"
             )
+        if run.scenario.cluster is not None:
+            raise UserError(
+                f"{printable(run.scenario.name, 60)} has layouts that are cut from recordings, and "
+                "an interval of every look needs layouts that are drawn on their own; leave out "
+                "--until-width and --until-decided"
+            )
         if self.against is not None:
             self._check_against(run, self.against)
 

@@ -323,7 +323,7 @@ class Compared:
         return self._interval(_area(success, np.clip(spent, 0.0, most), ranks, most[:, 0]))
 
     def _interval(self, values: Floats) -> Estimate:
-        return resampled_estimate(values, self.counts.shape[1])
+        return resampled_estimate(values, self.counts.shape[1], self.success_rule.clusters)
 
     def _resampled(self, values: Sequence[Floats]) -> Floats:
         """Return means of values (S, E) in each resample, (1 + RESAMPLES, P)."""

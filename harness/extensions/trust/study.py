@@ -20,7 +20,7 @@ from harness.coordination.named_points import setting_of
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.rules import EGO_PROMPT, RULES, reads
 from harness.core import noise
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import as_mapping, crossed, interval_of, some_of
 from harness.core.files import digest, sha256_file
@@ -79,19 +79,20 @@ class Cell:
     # messages until an attacker was suspected, by attacker, episode and seed; 0: never
     first: Sequence[int]
 
-    def detection(self) -> dict[str, Estimate]:
+    def detection(self, clusters: Ints | None = None) -> dict[str, Estimate]:
         """Return how well a rule tells attackers' messages from honest ones, as shares by name.
 
         A rule is a consensus rule, by which the ego fuses messages; it suspects whom it trusts
         little. `precision` is the share of suspected messages that are attackers', `recall` the
         share of attackers' messages that are suspected, `f1` the harmonic mean of both, and
         `false_alarms` the share of honest messages that are suspected. Intervals resample episodes.
-        The dict is empty if the rule judges no helper.
+        The dict is empty if the rule judges no helper. `clusters`, (E,), are resampled in place of
+        episodes, if these have some.
         """
         if self.flagged is None:
             return {}
         n = self.flagged.shape[1]
-        times = resampled(noise.generator("trust", "detection"), n, RESAMPLES)
+        times = resampled(noise.generator("trust", "detection"), n, RESAMPLES, clusters)
         hits, misses, wrongs, rights = (times @ counts for counts in self.flagged)
         with np.errstate(invalid="ignore", divide="ignore"):
             shares = {
@@ -100,7 +101,7 @@ class Cell:
                 "f1": 2 * hits / (2 * hits + wrongs + misses),
                 "false_alarms": wrongs / (wrongs + rights),
             }
-        return {name: resampled_estimate(values, n) for name, values in shares.items()}
+        return {name: resampled_estimate(values, n, clusters) for name, values in shares.items()}
 
     @property
     def caught(self) -> list[int]:
@@ -466,7 +467,7 @@ def run_bench(
         tuple(seeds),
         cells,
         alone.ends[SUCCESS],
-        Success(run.dataset.dangerous),
+        Success(run.dataset.dangerous, run.dataset.clusters),
         run.caveats,
         unfused,
     )
@@ -528,12 +529,13 @@ def trust_study(bench: Bench) -> Study:
 
 def _cell(bench: Bench, cell: Cell) -> dict[str, Any]:
     """Return a cell as the study's manifest has it: what was played, and what it came to."""
-    detection = {name: as_mapping(estimate) for name, estimate in cell.detection().items()}
+    clusters = bench.success_rule.clusters
+    detection = {name: as_mapping(each) for name, each in cell.detection(clusters).items()}
     return {
         "rule": cell.rule,
         "attack": cell.attack or None,
         "share": cell.share,
-        "success": as_mapping(over_episodes(SUCCESS, cell.success)),
+        "success": as_mapping(over_episodes(SUCCESS, cell.success, clusters)),
         bench.success_rule.metric: as_mapping(bench.success_rule.estimate(cell.success)),
         "detection": detection or None,
     }
@@ -662,7 +664,8 @@ def _detections(bench: Bench) -> Iterator[Table]:
         rows = []
         for cell in bench.cells.values():
             if cell.rule == rule and cell.flagged is not None:
-                shares = [interval_of(estimate) for estimate in cell.detection().values()]
+                detection = cell.detection(bench.success_rule.clusters)
+                shares = [interval_of(estimate) for estimate in detection.values()]
                 time = f"{cell.time_to_detection:.0f}" if cell.caught else "–"
                 caught = f"{len(cell.caught)} of {len(cell.first)}"
                 attack = cell.attack or "nobody attacks"
@@ -689,12 +692,13 @@ def _detections(bench: Bench) -> Iterator[Table]:
 def _rows(bench: Bench, cell: Cell) -> Iterator[dict[str, Any]]:
     key = cell.rule, cell.attack, cell.share
     place = {"rule": cell.rule, "attack": cell.attack or "none", "share": cell.share}
+    clusters = bench.success_rule.clusters
     estimates = {
-        SUCCESS: over_episodes(SUCCESS, cell.success),
+        SUCCESS: over_episodes(SUCCESS, cell.success, clusters),
         bench.success_rule.metric: bench.success_rule.estimate(cell.success),
-        "unsafe_rate": over_episodes("unsafe_rate", cell.unsafe),
-        "nats": over_episodes("nats", cell.nats),
-        **{f"detection_{name}": e for name, e in cell.detection().items()},
+        "unsafe_rate": over_episodes("unsafe_rate", cell.unsafe, clusters),
+        "nats": over_episodes("nats", cell.nats, clusters),
+        **{f"detection_{name}": e for name, e in cell.detection(clusters).items()},
     }
     if cell.attack == PEACE:
         estimates["price_in_peace"] = bench.price(cell.rule)

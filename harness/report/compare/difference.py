@@ -324,7 +324,7 @@ def _percentiles(pair: Pair, condition: str) -> Iterator[Difference]:
     """Yield the differences of the percentiles of latency."""
     names = {metric.percentile: metric.name for metric in METRICS.values()}
     before, after = pair.latencies(pair.a, condition), pair.latencies(pair.b, condition)
-    differences = percentiles.differences(before, after, len(pair.episodes))
+    differences = percentiles.differences(before, after, len(pair.episodes), pair.clusters)
     for percent, a, b, estimate in differences:
         p = p_of_bootstrap(estimate.value, estimate.low, estimate.high)
         yield Difference(names[percent], a, b, estimate, p)
@@ -340,7 +340,9 @@ def _pooled(pair: Pair, condition: str) -> Iterator[Difference]:
             count = Estimate(b - a, math.nan, math.nan, episodes if a or b else 0, 0)
             yield Difference(metric.name, a, b, count, None)
         elif metric.pooled:
-            a, b, estimate = reliability.difference(judged_a, judged_b, metric.pooled, episodes)
+            a, b, estimate = reliability.difference(
+                judged_a, judged_b, metric.pooled, episodes, pair.clusters
+            )
             p = p_of_bootstrap(estimate.value, estimate.low, estimate.high)
             yield Difference(metric.name, a, b, estimate, p)
 
@@ -361,7 +363,7 @@ def _difference(pair: Pair, metric: str, condition: str) -> Difference:
         means_b.append(known_mean(known_mean(b, 1), 0))
 
     def change(level: float) -> Estimate:
-        return difference(metric, [(b, a) for a, b in halves], level)
+        return difference(metric, [(b, a) for a, b in halves], level, pair.clusters)
 
     before, after = float(np.mean(means_a)), float(np.mean(means_b))
     return Difference(metric, before, after, change(LEVEL), p_value(change))

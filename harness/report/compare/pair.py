@@ -14,6 +14,7 @@ from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
+from harness.core.statistics import cluster_numbers
 from harness.report.words import facts
 from harness.runs.contradictions import sound
 from harness.runs.difficulty import Pool
@@ -118,6 +119,19 @@ class Pair:
         episodes = [grid.episodes.index(episode) for episode in self.episodes]
         of_condition = side.values[metric][grid.conditions.index(condition)]
         return np.asarray(of_condition[np.ix_(seeds, episodes)].T)
+
+    @cached_property
+    def clusters(self) -> Ints | None:
+        """Return the number of each shared episode's cluster, (E,); None if each is of its own.
+
+        A cluster is what layouts are cut from, such as a recording: intervals count clusters in
+        place of episodes, which are in one cluster if either run says so.
+        """
+        names = []
+        for side in (self.a, self.b):
+            ends = [side.ends[self.conditions[0], self.seeds[0], each] for each in self.episodes]
+            names.append([episode.cluster for episode in ends])
+        return cluster_numbers([a or b for a, b in zip(*names, strict=True)])
 
     @cached_property
     def pool(self) -> Pool | None:

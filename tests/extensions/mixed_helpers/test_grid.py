@@ -109,7 +109,7 @@ def made_up(
     """Cells by prompt of ego and helpers: success of each episode under 6g, one seed."""
     n = len(next(iter(success.values())))
     told = {
-        "conditions": ("6g",), "grid": 0, "path": Path("cells"),
+        "conditions": ("6g",), "grid": 0, "path": Path("cells"), "clusters": None,
         "manifest": SimpleNamespace(conditions=[{"name": "6g", "profile": "6g"}]),
     }  # fmt: skip
     cells = []

@@ -115,7 +115,8 @@ class Cell:
         `metric` names success, latency (ms) or tokens, a key of `values`. `condition` is the name
         of a set of settings of radio, asking and fusion in the run.
         """
-        return over_episodes(metric, self.values[metric][self.run.conditions.index(condition)])
+        values = self.values[metric][self.run.conditions.index(condition)]
+        return over_episodes(metric, values, self.run.clusters)
 
 
 @dataclass(frozen=True)
@@ -369,7 +370,8 @@ class Grid:
         shares = _shares(np.maximum(squares - times * by_chance[:, None], 0.0))
         if np.isnan(shares[:, 0]).any() or np.isnan(shares[0]).mean() > LEVEL:
             return None
-        return Halves(condition, *(resampled_estimate(share, n) for share in shares))
+        clusters = self.success_rule.clusters
+        return Halves(condition, *(resampled_estimate(share, n, clusters) for share in shares))
 
 
 def _squares(means: Floats) -> Floats:

@@ -22,7 +22,14 @@ from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.figures import Unit, amount, interval_of
 from harness.core.progress import Progress
-from harness.core.statistics import Estimate, episode_interval, known_mean, rate_interval, resampled
+from harness.core.statistics import (
+    Estimate,
+    episode_interval,
+    known_mean,
+    rate_interval,
+    resampled,
+    too_few,
+)
 from harness.core.versions import versions
 from harness.evaluate.run import read_or_evaluate
 from harness.evaluate.spec import Spec
@@ -149,18 +156,20 @@ class Repeats:
 
     def _of_condition(self, place: int) -> Iterator[tuple[str, Estimate]]:
         """Yield the figures of the condition at a place, each with its metric."""
-        _, counts, episodes = self._actions
+        _, counts, places = self._actions
+        clusters = self.runs[0].clusters
+        units = places if clusters is None else clusters[places]
         reached = counts[place].sum(axis=(-2, -1)) > 0
         for metric, share in ((FLIPS, flips), (STABLE, stable)):
             shares = known_mean(share(counts[place]), axis=-1)
-            yield metric, rate_interval(shares[reached], episodes[reached])
+            yield metric, rate_interval(shares[reached], units[reached])
         success = self._success[:, place]
-        yield SUCCESS, rate_interval(success.mean(axis=(0, 1)))
+        yield SUCCESS, rate_interval(success.mean(axis=(0, 1)), clusters)
         wins = success.sum(axis=0)
         for name, of_k in (("pass^", all_of), ("any@", any_of)):
             for j in range(2, self.k + 1):
-                yield f"{name}{j}", rate_interval(of_k(wins, self.k, j).mean(axis=0))
-        yield BETWEEN, between_share(success.mean(axis=1).T)
+                yield f"{name}{j}", rate_interval(of_k(wins, self.k, j).mean(axis=0), clusters)
+        yield BETWEEN, between_share(success.mean(axis=1).T, clusters)
 
     @cached_property
     def _success(self) -> Floats:
@@ -242,6 +251,10 @@ class Repeats:
                 entropies[n] = _doubt(np.array(of_scene))
         stated_nats, sampled_nats = entropies.T
         episodes = np.array([int(scene.partition("-")[0]) for scene in intents])
+        run = self.runs[0]
+        if run.clusters is not None:
+            cluster_of = dict(zip(run.grid.episodes, run.clusters.tolist(), strict=True))
+            episodes = np.array([cluster_of[episode] for episode in episodes.tolist()])
         for name, values in ((STATED, stated_nats), (SAMPLED, sampled_nats)):
             yield name, in_range(name, episode_interval(values, episodes))
         yield DOUBT, episode_interval(stated_nats - sampled_nats, episodes)
@@ -291,19 +304,20 @@ def _choose(n: Floats, j: int) -> Floats:
     return np.asarray(np.vectorize(math.comb, otypes=[float])(n.astype(int), j))
 
 
-def between_share(values: Floats) -> Estimate:
+def between_share(values: Floats, clusters: Ints | None = None) -> Estimate:
     """Return the share of the variance of values (E, k) that lies between episodes.
 
     There are E episodes with k repeats each. It is the intraclass correlation ICC(1) of Shrout and
     Fleiss (1979): below 0 where k repeats of an episode differ more than episodes do, NaN where
-    nothing differs. The interval is a bootstrap over episodes.
+    nothing differs. The interval is a bootstrap over episodes, or over their `clusters`, (E,); of
+    too few clusters there is none.
     """
     n, k = values.shape
     unknown = Estimate(math.nan, math.nan, math.nan, n, 0)
     if n < 2:
         return unknown
     means, within = values.mean(axis=1), values.var(axis=1) * k
-    weights = resampled(noise.generator("repeats", "between"), n, RESAMPLES)
+    weights = resampled(noise.generator("repeats", "between"), n, RESAMPLES, clusters)
     between = k * np.maximum(weights @ means**2 - (weights @ means) ** 2 / n, 0) / (n - 1)
     inside = weights @ within / (n * (k - 1))
     total = between + (k - 1) * inside
@@ -311,7 +325,9 @@ def between_share(values: Floats) -> Estimate:
     share[np.abs(share) < 1e-9] = 0.0  # else rounding shows a share below 0 where it is 0
     if np.isnan(share[0]):
         return unknown
-    low, high = np.nanpercentile(share[1:], (2.5, 97.5))
+    low, high = math.nan, math.nan
+    if not too_few(clusters):
+        low, high = np.nanpercentile(share[1:], (2.5, 97.5))
     return Estimate(float(share[0]), float(low), float(high), n, 0)
 
 
