@@ -86,6 +86,31 @@ def elements(path: Path, wanted: Callable[[str], bool] = lambda tag: True) -> It
         yield from reader.feed(b"", is_last=True)
 
 
+def starts(path: Path, take: Callable[[str, dict[str, str]], None]) -> None:
+    """Call a function with the tag and attributes of each element of a file, as it begins.
+
+    It is several times as fast as `elements`, for files of millions of rows. Raises UserError.
+    """
+    parser = _parser()
+    parser.StartElementHandler = take
+    with unpacked(path) as file:
+        while data := file.read(CHUNK):
+            parser.Parse(data, False)
+        parser.Parse(b"", True)
+
+
+def _parser() -> expat.XMLParserType:
+    """Return a parser that refuses document types, whose entities may stand for anything."""
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartDoctypeDeclHandler = _refuse
+    return parser
+
+
+def _refuse(*_: object) -> None:
+    raise ValueError("it has a document type, which is not read; delete its <!DOCTYPE …>")
+
+
 class _Reader:
     """Turn bytes of XML into the children of its root."""
 
@@ -93,9 +118,7 @@ class _Reader:
         self.wanted, self.depth, self.since = wanted, 0, 0
         self.ready: list[Element] = []
         self.builder: TreeBuilder | None = None
-        self.parser = expat.ParserCreate()
-        self.parser.buffer_text = True
-        self.parser.StartDoctypeDeclHandler = self._refuse
+        self.parser = _parser()
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
         self.parser.CharacterDataHandler = self._text
@@ -109,9 +132,6 @@ class _Reader:
             raise ValueError(f"one element has more than {MOST_OF_ELEMENT >> 20} MB")
         yield from self.ready
         self.ready.clear()
-
-    def _refuse(self, *_: object) -> None:
-        raise ValueError("it has a document type, which is not read; delete its <!DOCTYPE …>")
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self.depth += 1

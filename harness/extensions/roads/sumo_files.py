@@ -6,6 +6,7 @@ bumper, and an angle is a compass's, in degrees. No package of SUMO is needed.
 """
 
 import math
+from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ from harness.extensions.roads.sources import (
     no_use,
     once,
     sha256_of,
+    starts,
     stem_of,
     sum_up,
     tracks_of,
@@ -83,6 +85,8 @@ TYPES = {
     "DEFAULT_BIKETYPE": "bicycle",
     "DEFAULT_TAXITYPE": "taxi",
 }
+# What has a position, and its type where none is stated.
+ROAD_USERS = {"vehicle": "DEFAULT_VEHTYPE", "person": "DEFAULT_PEDTYPE"}
 NO_LANES = {"walkingarea", "crossing"}
 UNKNOWN_TYPE = "not left out, but taken for a car of 5 m, since no file states its type:"
 FAR_M = 1000.0  # from a net, where no vehicle of it can be
@@ -298,54 +302,52 @@ class _Rows:
     """Gather the rows of positions by road user."""
 
     def __init__(self) -> None:
-        self.times: dict[str, list[float]] = {}
-        self.poses: dict[str, list[tuple[float, float, float, float]]] = {}
+        self.rows: dict[str, array[float]] = {}  # time, x, y, angle and speed, one after another
         self.types: dict[str, str] = {}
         self.left_out: dict[str, int] = {}
         self.n = 0
         self.clock: list[float] = []
 
-    def take(self, step: Element) -> None:
-        """Take in all road users of one time."""
-        time_s = float(step.get("time", "nan"))
-        if not math.isfinite(time_s) or (self.clock and time_s <= self.clock[-1]):
-            raise ValueError(f"time {step.get('time')} does not rise")
-        self.clock.append(time_s)
-        for one in step:
-            if one.tag not in ("vehicle", "person"):
-                sum_up(self.left_out, f"row of a {printable(one.tag, 30)}")
-                continue
-            key, get = one.get("id", ""), one.attrib.get
-            times = self.times.get(key)
-            if times is None:
-                few_enough(len(self.times) + 1, MOST_TRACKS, "road users")
-                usual = "DEFAULT_PEDTYPE" if one.tag == "person" else "DEFAULT_VEHTYPE"
-                self.types[key] = get("type", usual)
-                times = self.times[key] = []
-                self.poses[key] = []
-            elif times[-1] == time_s:
-                raise ValueError(f"{printable(key, 60)} is twice at {time_s:g} s")
-            times.append(time_s)
-            pose = (get("x", "nan"), get("y", "nan"), get("angle", "nan"), get("speed", "nan"))
-            self.poses[key].append((float(pose[0]), float(pose[1]), float(pose[2]), float(pose[3])))
+    def take(self, tag: str, attributes: dict[str, str]) -> None:
+        """Take in a time, or one who is there then."""
+        if tag in ROAD_USERS:
+            if attributes.get("vehicle"):  # a person who rides in it
+                return
+            key, now_s = attributes["id"], self.clock[-1]
+            rows = self.rows.get(key)
+            if rows is None:
+                few_enough(len(self.rows) + 1, MOST_TRACKS, "road users")
+                self.types[key] = attributes.get("type", ROAD_USERS[tag])
+                rows = self.rows[key] = array("d")
+            elif rows[-5] == now_s:
+                raise ValueError(f"{printable(key, 60)} is twice at {now_s:g} s")
+            x, y, angle, speed = (attributes[name] for name in ("x", "y", "angle", "speed"))
+            rows.extend((now_s, float(x), float(y), float(angle), float(speed)))
             self.n += 1
-        few_enough(self.n, MOST_ROWS, "poses")
+        elif tag == "timestep":
+            time_s = float(attributes["time"])
+            if not math.isfinite(time_s) or (self.clock and time_s <= self.clock[-1]):
+                raise ValueError(f"time {time_s:g} does not rise")
+            self.clock.append(time_s)
+            few_enough(self.n, MOST_ROWS, "poses")
+        elif self.clock:
+            sum_up(self.left_out, f"row of a {printable(tag, 30)}")
 
 
 def _scene(path: Path, net: Map, types: Mapping[str, VehicleType]) -> Scene:
     rows = _Rows()
     try:
-        for element in elements(path):
-            if element.tag == "timestep":
-                rows.take(element)
-    except (ValueError, TypeError) as error:
-        raise no_use(path, error) from None
+        starts(path, rows.take)
+    except KeyError as error:
+        raise no_use(path, f"a row has no {error.args[0]}") from None
+    except IndexError:
+        raise no_use(path, "a road user stands before the first timestep") from None
     if len(rows.clock) < 2:
         raise no_use(path, "it has fewer than two times")
     step_s = float(np.median(np.diff(rows.clock)))
     tracks: dict[str, Track] = {}
-    for key, times in rows.times.items():
-        poses = np.array(rows.poses.pop(key))
+    for key in list(rows.rows):
+        values = np.array(rows.rows.pop(key)).reshape(-1, 5)
         if rows.types[key] not in types:
             sum_up(rows.left_out, f"{UNKNOWN_TYPE} {printable(rows.types[key], 30)}")
         kind = types.get(rows.types[key], types["DEFAULT_VEHTYPE"])
@@ -354,8 +356,8 @@ def _scene(path: Path, net: Map, types: Mapping[str, VehicleType]) -> Scene:
             continue
         size_m = kind.length_m, kind.width_m
         named = KINDS.get(kind.vehicle_class, "car")
-        centres = _centres(poses, kind.length_m)
-        for track in tracks_of(key, named, size_m, np.array(times), centres, step_s):
+        centres = _centres(values[:, 1:], kind.length_m)
+        for track in tracks_of(key, named, size_m, values[:, 0], centres, step_s):
             once(tracks, track.id, "road users", path)
             tracks[track.id] = track
     _refuse_degrees(path, tracks, net)

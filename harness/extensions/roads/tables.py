@@ -604,7 +604,7 @@ def _problems(scene: Scene) -> Iterator[str]:
     for house in scene.houses:
         if len(house.outline) < 3 or not _is_place(house.outline):
             yield f"building {printable(house.id)} has no outline of three points or more"
-    for late, early in overlaps(scene.tracks.values()):
+    for late, early in overlaps(scene.tracks.values()) if scene.tracks else ():
         yield (
             f"{printable(late.id)} appears at {late.begin_s:g} s "
             f"where {printable(early.id)} is already"
@@ -682,20 +682,44 @@ def _problems_of_lane(lane: Lane, lanes: Mapping[str, Lane]) -> Iterator[str]:
 def overlaps(tracks: Iterable[Track]) -> Iterator[tuple[Track, Track]]:
     """Yield each track that appears where another is at that time, by more than sensors err.
 
-    Only its first moment is looked at, and only others that are there half a step before or after.
-    The track that began later comes first.
+    Only its first moment is looked at. The track that began later comes first.
     """
     by_begin = sorted(tracks, key=lambda track: track.begin_s)
-    begins = np.array([track.begin_s for track in by_begin])
-    ends = np.array([track.end_s for track in by_begin])
+    there = _Positions(by_begin)
     sizes = np.array([(track.length_m, track.width_m) for track in by_begin])
     for place, track in enumerate(by_begin):
-        others = np.flatnonzero(ends[:place] >= begins[place])
-        if not len(others):
-            continue
-        poses = np.array([by_begin[other].at(track.begin_s) for other in others], dtype=float)
+        others = np.flatnonzero(there.ends_s[:place] >= track.begin_s)
+        poses = there.at(others, track.begin_s)
         mine = np.repeat(track.poses[:1, :3], len(others), axis=0)
         my_sizes = np.repeat(sizes[place : place + 1], len(others), axis=0)
-        apart = separation_m(mine, my_sizes, poses[:, :3], sizes[others])
-        for other in others[apart < -SLACK_M]:
+        apart_m = separation_m(mine, my_sizes, poses, sizes[others])
+        for other in others[apart_m < -SLACK_M]:
             yield track, by_begin[other]
+
+
+class _Positions:
+    """Look many tracks up at one time, which `Track.at` does for one."""
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        self.begins_s = np.array([track.begin_s for track in tracks])
+        self.ends_s = np.array([track.end_s for track in tracks])
+        stops = np.cumsum([len(track.time_s) for track in tracks], dtype=np.int64)
+        self.stops, self.starts = stops, np.append(0, stops[:-1])
+        self.poses = np.concatenate([track.poses[:, :3] for track in tracks])
+        # Times of one track after those of another, so that one search has its rows.
+        span_s = self.ends_s.max(initial=0) - self.begins_s.min(initial=0) + 1
+        self.shifts_s = np.arange(len(tracks)) * span_s
+        times = [track.time_s for track in tracks]
+        self.times_s = np.concatenate(times) + np.repeat(self.shifts_s, stops - self.starts)
+
+    def at(self, which: Ints, time_s: float) -> Floats:
+        """Return x_m, y_m and heading_rad at a time, (n, 3), of n tracks that are there then."""
+        times_s = self.shifts_s[which] + time_s
+        after = np.searchsorted(self.times_s, times_s, side="right")
+        after = after.clip(self.starts[which], self.stops[which] - 1)
+        before = (after - 1).clip(self.starts[which])
+        length_s = self.times_s[after] - self.times_s[before]
+        share = (times_s - self.times_s[before]) / np.where(length_s > 0, length_s, 1)
+        step = self.poses[after] - self.poses[before]
+        step[:, 2] = (step[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        return np.asarray(self.poses[before] + share.clip(0, 1)[:, None] * step)

@@ -201,9 +201,11 @@ BAD_SUMO = {
     "no file has the positions": {"fcd": files.NET},
     "two lanes have the id in_1": {"net": files.NET.replace('"in_2"', '"in_1"')},
     "could not convert string to float: 'x'": {"net": files.NET.replace("50,4.7,1", "x,4.7")},
-    "time 0.50 does not rise": {"fcd": files.FCD.replace('"0.00"', '"0.50"')},
+    "time 0.5 does not rise": {"fcd": files.FCD.replace('"0.00"', '"0.50"')},
     "time nan does not rise": {"fcd": files.FCD.replace('"0.00"', '"nan"')},
     "v is twice at 0 s": {"fcd": files.FCD.replace('"tram" x', '"v" x')},
+    "a row has no angle": {"fcd": files.FCD.replace("angle", "turn")},
+    "a road user stands before": {"fcd": files.FCD.replace("timestep", "step")},
     "nobody is near the net": {
         "net": files.NET.replace('shape="', 'shape="1e6,1e6 ')
         .replace(" 0,", " 1e6,")
