@@ -275,9 +275,12 @@ class Dataset:
         return scenes
 
     def _seat(self, number: int) -> Scenario | None:
-        """Return the scenario as an episode's layout has it; None if all have one road."""
+        """Return the scenario as an episode's layout has it.
+
+        None of one whose name alone says its road, and that of all layouts.
+        """
         scenario = self.scenario
-        return None if scenario.layouts is None else scenario.at(self.manifest.seed + number)
+        return scenario.at(self.manifest.seed + number) if scenario.has_own_world else None
 
     def __contains__(self, name: str) -> bool:
         try:

@@ -31,7 +31,6 @@ from harness.dataset.schema import (
 from harness.world import scenarios
 from harness.world.drivers import DRIVERS
 from harness.world.families import keep
-from harness.world.parameters import LATER
 from harness.world.scenario import Scenario
 from harness.world.state import Snapshot
 
@@ -95,7 +94,8 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
         other_text = isinstance(value, str) != isinstance(example, str)
         if other_list or other_text:
             yield f"[parameters]: {name} = {printable(value)}; wanted is a value such as {example}"
-    if missing := usual.keys() - dict(LATER).keys() - manifest.parameters.keys():
+    later = dict(scenario.parameters.later)
+    if missing := usual.keys() - later.keys() - manifest.parameters.keys():
         yield f"[parameters] has no {', '.join(sorted(missing))}"
     if scenario.world is None:
         return
@@ -324,6 +324,8 @@ def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, 
     should have.
     """
     whole, episode = scenarios.get(manifest.scenario), name.partition("-")[0]
+    if whole.has_own_world:  # its road may follow from its parameters
+        whole = scenario_of(manifest)
     scenario = whole if whole.layouts is None else whole.at(manifest.seed + int(episode))
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
     try:

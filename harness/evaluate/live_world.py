@@ -343,7 +343,7 @@ def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) 
         for n, record in zip(places, records_of(scenario, seen), strict=True):
             world, agent, _ = points[n]
             place = world.answering.index(agent) if agent else 0
-            seat = scenario if agent or scenario.layout_seed is not None else None
+            seat = scenario if agent or scenario.has_own_world else None
             scenes[n] = Scene(
                 record, seat=seat, agent=place, several=agent_share(world.scenario) > 0
             )

@@ -3,9 +3,10 @@ times, limits of the ego, and what vehicles know of each other.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from harness.core.config import changed
 from harness.core.errors import UserError, printable, unknown
@@ -58,6 +59,8 @@ class Parameters:
     out of bounds.
     """
 
+    # parameters of a subclass that were added later, as in `LATER`
+    additions: ClassVar[tuple[tuple[str, Any], ...]] = ()
     # speeds that SLOWER, IDLE and FASTER step through, m/s
     target_speeds_mps: tuple[float, ...] = (0.0, 7.0, 14.0)
     braking_mps2: float = 8.0  # hardest braking, m/s2
@@ -161,7 +164,12 @@ class Parameters:
         Some were added to the harness later (`LATER`). One of these is left out while its value
         says that all is as before it was added, so that older digests stay valid.
         """
-        return {k: v for k, v in asdict(self).items() if (k, v) not in LATER}
+        return {k: v for k, v in asdict(self).items() if (k, v) not in self.later}
+
+    @property
+    def later(self) -> Sequence[tuple[str, Any]]:
+        """Return the parameters that were added later, with the values of the earlier behaviour."""
+        return *LATER, *self.additions
 
     @property
     def lag_frames(self) -> int:

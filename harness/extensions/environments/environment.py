@@ -117,7 +117,7 @@ def guarded(name: str, env: Any) -> Iterator[None]:
     from highway_env import utils
 
     def import_allowed(module: str) -> ModuleType:
-        if module not in env.own_modules:
+        if module not in getattr(env, "own_modules", ()):
             _only_allowed(name, module)
         return importlib.import_module(module)
 
@@ -140,14 +140,15 @@ def _texts(value: Any) -> Iterator[str]:
             rest += value.values() if isinstance(value, dict) else value
 
 
-def reset(name: str, seed: int) -> Any:
-    """Return a new environment of highway-env (an `AbstractEnv`), reset to a seed.
+def reset(name: str, seed: int, env: Any = None) -> Any:
+    """Return an environment of highway-env (an `AbstractEnv`), reset to a seed.
 
-    `name` is its scenario name, such as `env:merge-v0`. Raises UserError if there is none, it
-    fails, or its ego (the car that decides) cannot be driven by meta-actions: SLOWER, IDLE, FASTER
-    and changes of lane.
+    `name` is its scenario name, such as `env:merge-v0`, and `env` a new environment; by default the
+    one that `created` makes by that name. Raises UserError if there is none, it fails, or its ego
+    (the car that decides) cannot be driven by meta-actions: SLOWER, IDLE, FASTER and changes of
+    lane.
     """
-    env = _create(name)
+    env = created(name) if env is None else env
     _constants().restore()
     try:
         with watched(label(name)), strangers(label(name)), guarded(name, env):
@@ -190,7 +191,11 @@ def hittable(thing: Any) -> bool:
     return bool(thing.collidable and thing.solid)
 
 
-def _create(name: str) -> Any:
+def created(name: str) -> Any:
+    """Return the new environment of a scenario name, such as `env:merge-v0`, without a seed.
+
+    Raises UserError if there is none, or it is not highway-env's.
+    """
     import gymnasium
     import highway_env
     from highway_env.envs.common.abstract import AbstractEnv
@@ -267,7 +272,7 @@ def config(name: str) -> dict[str, Any]:
     `name` is its scenario name, such as `env:merge-v0` or `env:merge-v0:config={...}`. Keys are
     highway-env's, and values are plain values of JSON.
     """
-    text = json.dumps(_create(name).config, default=str)
+    text = json.dumps(created(name).config, default=str)
     whole: dict[str, Any] = json.loads(text, parse_constant=str)
     return whole
 

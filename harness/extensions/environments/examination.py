@@ -11,7 +11,6 @@ from harness.extensions.environments.environment import (
     meta_actions,
     numbered,
     raised,
-    reset,
 )
 from harness.extensions.environments.world import EnvironmentWorld
 from harness.world.scenario import Scenario
@@ -27,6 +26,7 @@ def examine(scenario: Scenario, seed: int) -> None:
     The environment's own `step` takes IDLE, FASTER and SLOWER twice, and deep copies take them
     frame by frame; positions, headings and speeds of all vehicles must agree at every decision.
     """
+    scenario = scenario.at(seed)
     name = label(scenario.name)
     once, again = (_stepped(scenario, seed, TRIED) for _ in range(2))
     if once != again:
@@ -35,7 +35,8 @@ def examine(scenario: Scenario, seed: int) -> None:
             "env.np_random, and keep "
             "nothing between episodes"
         )
-    world = EnvironmentWorld.begun(scenario, seed)
+    kind: type[EnvironmentWorld] = scenario.world or EnvironmentWorld
+    world = kind.begun(scenario, seed)
     for action, expected in zip(TRIED, once, strict=False):
         try:
             world = world.branch()
@@ -56,7 +57,8 @@ def examine(scenario: Scenario, seed: int) -> None:
 
 
 def _stepped(scenario: Scenario, seed: int, actions: Sequence[str]) -> list[Places]:
-    env, places = reset(scenario.name, seed), []
+    world: type[EnvironmentWorld] = scenario.world or EnvironmentWorld
+    env, places = world.started(scenario, seed), []
     kind = meta_actions(scenario.name, env)
     for action in actions:
         try:

@@ -49,7 +49,10 @@ class Routes:
         streets, plan = [lane[:2]], list(plan or ())
         while lane[1] in self.network.graph:
             end = self.network.get_lane(lane)
-            follows = self.network.next_lane(lane, plan, end.position(end.length, 0.0))
+            try:
+                follows = self.network.next_lane(lane, plan, end.position(end.length, 0.0))
+            except KeyError:  # its plan leads out of what is there of the network
+                break
             if follows[:2] in streets:
                 break
             lane = follows
@@ -146,7 +149,7 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
     streets = _streets(network)
     after: dict[Street, list[Street]] = {}
     for street in streets:
-        joining = [other for other in streets if other[0] == street[1]]
+        joining = [(street[1], end) for end in network.graph.get(street[1], ())]
         after[street] = [other for other in joining if _goes_on(network, street, other)]
     led_to = {street for following in after.values() for street in following}
     complete: list[Route] = []
@@ -155,8 +158,8 @@ def _routes(name: str, network: Any, begin: Street) -> Iterator[Route]:
     def extend(route: Route) -> None:
         if len(complete) + len(rings) > MOST_ROUTES:
             raise UserError(
-                f"{printable(name)}: its road has more than {MOST_ROUTES} routes; give it fewer "
-                "junctions"
+                f"{printable(name)}: its road has more than {MOST_ROUTES} routes; set window_m, "
+                "or give it fewer junctions"
             )
         following = [street for street in after[route[-1]] if street not in route]
         for street in following:

@@ -8,14 +8,15 @@ happens as usual.
 """
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, cast, get_args
 
 import numpy as np
 
 from harness.core.errors import UserError
+from harness.extensions.environments import environment
 from harness.extensions.environments.environment import (
     Constants,
     config,
@@ -27,8 +28,17 @@ from harness.extensions.environments.environment import (
     numbered,
     reset,
 )
-from harness.extensions.environments.place import Parameters, ends_of, first_target_mps, place
-from harness.world import beacons
+from harness.extensions.environments.goal import OWN
+from harness.extensions.environments.place import (
+    Parameters,
+    Place,
+    RoadOf,
+    first_target_mps,
+    start,
+    usual,
+)
+from harness.extensions.environments.window import is_within, quicken
+from harness.world import beacons, scenarios
 from harness.world.conflict_measures import observe
 from harness.world.gaps import least_gaps_m
 from harness.world.own_world import OwnWorld
@@ -50,7 +60,7 @@ class EnvironmentWorld(OwnWorld):
     them. `everybody` has highway-env's vehicles that can be hit, the ego first, of which `born`
     have entered so far. `action` was taken last; `taken` has each action with the number of its
     frame, counted from the episode's start. `failed` says whether the environment has ended the
-    episode without success.
+    episode without success, and `succeeded` whether with it.
     """
 
     env: Any = None  # highway-env's environment, an `AbstractEnv`
@@ -64,31 +74,37 @@ class EnvironmentWorld(OwnWorld):
     # the number of the frame in which each action was taken, from the episode's start, and its name
     taken: tuple[tuple[int, str], ...] = ()
     failed: bool = False  # whether the environment has ended the episode without success
+    succeeded: bool = False  # whether the environment has ended it with success
 
     @classmethod
     def begun(cls, scenario: Scenario, seed: int) -> "EnvironmentWorld":
         """Start the episode of a seed, in the environment that `scenario` is made of.
 
-        Raises UserError if its road, or the path on which the ego starts, differs from seed 0's.
+        Raises UserError if its road, the path on which the ego starts, or the goal that it declares
+        differs from seed 0's, and the environment does not say so.
         """
-        name, env = scenario.name, reset(scenario.name, seed)
-        here, ego = place(name), env.vehicle
-        if ends_of(env.road.network) != here.ends:
+        scenario = scenario.at(seed)
+        name, env, here = scenario.name, cls.started(scenario, seed), RoadOf.of(scenario).place
+        ego, p = env.vehicle, cast("Parameters", scenario.parameters)
+        if scenario.layout_seed is None and (part := here.differs(env)):
             raise UserError(
-                f"{label(name)}: its road is another in seed {seed} than in seed 0; fix it in its "
-                "config"
+                f"{label(name)}: its {part} is another in seed {seed} than in seed 0; fix it in "
+                "its config, or set several_roads = True in its class"
             )
-        if not set(here.routes.keys(lane_of(ego), ego.route)).intersection(here.road.ways):
+        if here.goal.seconds > p.time_limit_s:
             raise UserError(
-                f"{label(name)}: the ego starts on another road in seed {seed} than in seed 0; fix "
-                "it in its config"
+                f"{label(name)}: its goal is at {here.goal.seconds:g} s, after the time limit of "
+                f"{p.time_limit_s:g} s; set time_limit_s"
             )
-        layout = Layout((), _buildings(env, here.road.origin_m), None, None)
-        p = cast("Parameters", scenario.parameters)
+        layout = Layout((), _buildings(env, here), None, None)
         world = cls(scenario, seed, layout, env.road, env=env, here=here, constants=Constants.now())
-        ego.to_go_m = p.goal_s * first_target_mps(ego)
+        ego.to_go_m = {
+            "speed": p.goal_s * first_target_mps(ego),
+            "place": here.goal.metres,
+            "stay": here.goal.metres,
+        }.get(here.goal.kind, np.inf)
         world._enter(ego, "ego")
-        traffic = (v for v in _solid(env.road) if v is not ego)
+        traffic = (v for v in world._solid() if v is not ego)
         nearest = sorted(
             traffic, key=lambda v: (v not in env.controlled_vehicles, _apart_m(v, ego))
         )
@@ -98,6 +114,24 @@ class EnvironmentWorld(OwnWorld):
         poses = beacons.lead_in(p, world._in_road_frame(world._poses()))
         world._broadcast(poses, 1 - len(poses))
         return world
+
+    @classmethod
+    def environment(cls, name: str, parameters: Parameters | None = None) -> Any:
+        """Return a new environment of highway-env by its scenario's name, without a seed.
+
+        A subclass makes those of its own names. `parameters` are the scenario's; None where only
+        its road, its goal and its defaults matter.
+        """
+        return environment.created(name)
+
+    @classmethod
+    def started(cls, scenario: Scenario, seed: int) -> Any:
+        """Return an environment at the start of the episode of a layout seed."""
+        p = cast("Parameters", scenario.parameters)
+        env = reset(scenario.name, seed, cls.environment(scenario.name, p))
+        if p.window_m:
+            quicken(env.road.network, RoadOf.of(scenario).place.road.origin_m, p.window_m)
+        return env
 
     @classmethod
     def examine(cls, scenario: Scenario, seed: int) -> None:
@@ -208,11 +242,25 @@ class EnvironmentWorld(OwnWorld):
             speeds_mps = np.concatenate([[speed_mps], poses[:, 0, 3]])
             self.journey.passed(speeds_mps, gap_m, conflicts, hz)
 
+    def _solid(self) -> list[Any]:
+        """Return the vehicles that can be hit, and are within the window.
+
+        One that collides with nothing hides nothing, and helps nobody. The window is looked at when
+        periods end, so that it does not matter when else the simulation stops.
+        """
+        solid = list(filter(hittable, self.road.vehicles))
+        if not self.here.window_m:
+            return solid
+        known_ids = {id(v) for v in self.everybody}
+        if self.frame % self.period:
+            return [v for v in solid if id(v) in known_ids]
+        return [v for v in solid if v is self.env.vehicle or self.here.has(v)]
+
     def _recast(self) -> None:
         """Remove vehicles that have left, and add new ones.
         Raises UserError if the ego has left.
         """
-        solid = _solid(self.road)
+        solid = self._solid()
         present, places = {id(v) for v in solid}, {id(v): n for n, v in enumerate(self.everybody)}
         if id(self.everybody[0]) not in present:
             raise UserError(
@@ -257,14 +305,21 @@ class EnvironmentWorld(OwnWorld):
             *_, terminated, _, info = env.step(numbered(env, kind, self.action))
         finally:
             del env._simulate
-        if terminated and not ego.crashed and ego.on_road:
+        is_own = self.here.goal.kind == OWN and bool(info.get("is_success", False))
+        if (terminated or is_own) and not ego.crashed and ego.on_road:
             if info.get("is_success", True):
-                ego.to_go_m = 0.0
+                self.succeeded = True
             else:
                 self.failed = True
 
     def _cleared(self, agent: int) -> bool:
-        return bool(self.everybody[0].to_go_m <= 0)
+        goal, to_go_m = self.here.goal, self.everybody[0].to_go_m
+        if self.succeeded or not goal.is_time:
+            return bool(self.succeeded or to_go_m <= 0)
+        if self.frame < round(goal.seconds * self.scenario.parameters.simulation_hz):
+            return False
+        self.failed = to_go_m < 0  # it is decided now
+        return not self.failed
 
     def _step(self) -> None:
         standing = {v.spawn.id for v in self.vehicles if v.crashed}
@@ -294,18 +349,15 @@ def _kind(v: Any) -> Kind:
     )
 
 
-def _solid(road: Any) -> list[Any]:
-    """Return the vehicles that can be hit:
-    one that collides with nothing hides nothing, and helps nobody.
-    """
-    return list(filter(hittable, road.vehicles))
-
-
-def _buildings(env: Any, origin_m: tuple[float, float]) -> tuple[Building, ...]:
+def _buildings(env: Any, here: Place) -> tuple[Building, ...]:
     """Return the solid objects nearest to the ego as buildings,
     by their axis-parallel bounding boxes.
     """
-    solid = sorted(filter(hittable, env.road.objects), key=partial(_apart_m, env.vehicle))
+    origin_m = here.road.origin_m
+    objects = [
+        thing for thing in env.road.objects if is_within(thing.position, origin_m, here.window_m)
+    ]
+    solid = sorted(filter(hittable, objects), key=partial(_apart_m, env.vehicle))
     boxes = [thing.polygon()[:4] - origin_m for thing in solid[:MOST_BUILDINGS]]
     return tuple(
         Building(f"b{n}", *box.min(axis=0).round(3).tolist(), *box.max(axis=0).round(3).tolist())
@@ -317,27 +369,82 @@ def _apart_m(first: Any, second: Any) -> float:
     return float(np.hypot(*(first.position - second.position)))
 
 
+class EnvironmentScenario(Scenario):
+    """Describe an environment as a scenario, whose road and words follow from its parameters."""
+
+    def __post_init__(self, start: Any) -> None:
+        super().__post_init__(start)
+        road = RoadOf.of(self)
+        is_one = self.layout_seed is not None or not road.differs
+        layouts = None if is_one else Layouts(self.name, self.world)
+        for name, value in (("road", road), ("words", Words(road)), ("layouts", layouts)):
+            object.__setattr__(self, name, value)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return scenarios.restore, (self.name, self.parameters, self.layout_seed)
+
+
+@dataclass(frozen=True)
+class Words(Mapping[str, str]):
+    """Hold the texts for prompts, which are known when the place is: no map is read before."""
+
+    road: RoadOf  # where it is
+
+    @cached_property
+    def texts(self) -> dict[str, str]:
+        here = self.road.place
+        where = here.road.ego[1].partition(" lane ")[0]
+        return {"task": here.goal.task(where, here.kind), "hiding": "other vehicles"}
+
+    def __getitem__(self, name: str) -> str:
+        return self.texts[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.texts)
+
+    def __len__(self) -> int:
+        return len(self.texts)
+
+
+@dataclass(frozen=True)
+class Layouts:
+    """Return, when called with a layout seed, the scenario whose place becomes that layout's."""
+
+    name: str  # the scenario's name
+    world: Any  # the class of its worlds, an `EnvironmentWorld`
+
+    def __call__(self, seed: int) -> Scenario:
+        return scenario(self.name, self.world)
+
+
 @lru_cache(maxsize=16)
-def scenario(name: str) -> Scenario:
+def scenario(name: str, world: type[EnvironmentWorld] = EnvironmentWorld) -> Scenario:
     """Return an environment of highway-env as a scenario, by its name, such as `env:merge-v0`.
 
-    The environment itself decides where vehicles start and when the goal is reached, so the
+    `world` is the class of its worlds. The environment itself decides where vehicles start, so the
     scenario knows no start situations and no danger. Raises UserError if there is no such
     environment, or it lacks something needed.
     """
-    here = place(name)
-    where = here.road.ego[1].partition(" lane ")[0]
-    return Scenario(
+    parameters, actions = usual(world.environment, name)
+    kind = type(start(world.environment, name, 0)).__name__
+    return EnvironmentScenario(
         name=name,
-        description=f"Scenario {name}: {here.kind} of highway-env, "
-        "with its own vehicles and traffic.\n",
-        actions=here.actions,
-        parameters=here.parameters,
-        road=lambda: here.road,
+        description=f"Scenario {name}: {kind} of highway-env, with its own vehicles and traffic.\n",
+        actions=actions,
+        parameters=parameters,
+        road=RoadOf(world.environment, name, 0, parameters.goal, parameters.window_m, None),
         layout=lambda seed, parameters: Layout((), (), None, None),
         cleared=lambda xy_m, approaches, parameters: np.zeros(xy_m.shape[:-2], dtype=bool),
-        words={"task": f"follow your road, {where}, and keep up speed", "hiding": "other vehicles"},
+        words={},  # they follow from the goal
         brake_lamps=True,
-        dials=(*DIALS, "decisions", "helpers", "time_limit_s", "delay_allowance_s"),
-        world=EnvironmentWorld,
+        dials=(
+            *DIALS,
+            "decisions",
+            "helpers",
+            "time_limit_s",
+            "delay_allowance_s",
+            "goal",
+            "window_m",
+        ),
+        world=world,
     )

@@ -62,7 +62,7 @@ def draw(scene: Scene, out: Path | BinaryIO, format: Format, viewer: str | None 
     seen = {*graph.seen, viewer}
 
     state = scene.state
-    scenario = scenarios.get(state.scenario).at(state.episode_seed)
+    scenario = scene.seat or scenarios.get(state.scenario).at(state.episode_seed)
     road, shape = scenario.road(), shape_of(scenario)
     held = spots(state, road.zone_m, graph, (scene.record.danger.vehicle, *scene.viewers))
     view = view_of(held, shape)

@@ -18,7 +18,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
 from harness.core.plugins import Plugins
 from harness.world.families import family_of
-from harness.world.parameters import LATER, SCENES, SUITES, Parameters
+from harness.world.parameters import SCENES, SUITES, Parameters
 from harness.world.scenario import KNOWN_ACTIONS, Scenario
 
 FURTHER = ("LANE_LEFT", "LANE_RIGHT")  # actions that the simulator knows beside those of drivers
@@ -186,8 +186,8 @@ def of_manifest(name: str, parameters: Mapping[str, Any]) -> Scenario:
     """Return the scenario `name` with the parameters that a dataset's or run's manifest states.
 
     `parameters` has values by the name of the parameter. One that was added to the harness later
-    and is not stated takes the value under which all is as before it was added (`LATER`). Raises
-    UserError if one is unknown here, of another type or out of bounds.
+    and is not stated takes the value under which all is as before it was added
+    (`Parameters.later`). Raises UserError if one is unknown here, of another type or out of bounds.
     """
     scenario = get(name)
     names = [field.name for field in fields(scenario.parameters)]
@@ -198,7 +198,7 @@ def of_manifest(name: str, parameters: Mapping[str, Any]) -> Scenario:
             f"{where} has other parameters here (not {printable(extra[0])}); "
             "use the version that its manifest names"
         )
-    earlier = {key: value for key, value in LATER if key in here}
+    earlier = {key: value for key, value in scenario.parameters.later if key in here}
     values = here | earlier
     for key, value in parameters.items():
         # Numbers in a manifest are decoded as floats.

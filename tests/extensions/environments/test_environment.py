@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import pytest
 from evaluating import scenes_of
-from highway_env.envs import HighwayEnv, MergeEnv
+from highway_env.envs import MergeEnv
 from highway_env.road.lane import StraightLane
 from highway_env.utils import class_from_path
 from highway_env.vehicle.behavior import IDMVehicle
@@ -763,14 +763,6 @@ class Broken(MergeEnv):
         return 1 / 0
 
 
-class Rebuilt(HighwayEnv):
-    """Has another road for each seed."""
-
-    def _reset(self):
-        self.config["lanes_count"] = int(self.np_random.integers(2, 6))
-        super()._reset()
-
-
 class Unlike(Breakdown):
     """Starts without an ego."""
 
@@ -778,7 +770,7 @@ class Unlike(Breakdown):
         raise ValueError("nobody\nis here")
 
 
-for kind in (Forgetful, Locked, Hasty, Broken, Rebuilt, Unlike):
+for kind in (Forgetful, Locked, Hasty, Broken, Unlike):
     gymnasium.register(f"{kind.__name__.lower()}-v0", entry_point=kind)
 
 
@@ -815,19 +807,6 @@ def test_what_an_environment_lacks_is_said_in_a_line(env, config, said):
         examine(scenarios.get(named(env, config)), 0)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.slow
-def test_a_road_of_another_seed_is_refused():
-    scenario = scenarios.get("env:rebuilt-v0")
-    lanes = reset(scenario.name, 0).config["lanes_count"]
-    other = next(
-        seed for seed in range(1, 9) if reset(scenario.name, seed).config["lanes_count"] != lanes
-    )
-    with pytest.raises(
-        UserError, match=rf"its road is another in seed {other} than in seed 0; fix it"
-    ):
-        World.start(scenario, other)
 
 
 @pytest.mark.parametrize(
