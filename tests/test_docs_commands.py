@@ -68,6 +68,7 @@ MEASURED = sorted((ROOT / "benchmarks/measured").rglob("*.md"))
 READER_HAS = {
     "my-checkpoint": ROOT / "models/swarm-tiny",
     "tokenizer.json": ROOT / "models/swarm-tiny/tokenizer.json",
+    "street": ROOT / "tests/extensions/roads/street",
 }
 
 CHECKED = (

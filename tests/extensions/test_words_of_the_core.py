@@ -18,6 +18,7 @@ from harness.radio.profiles import CHANNELS
 
 HARNESS = Path(__file__).parents[2] / "harness"
 WORD = re.compile(r"[a-z][a-z0-9]*(?:-[a-z0-9]+)*")
+IMPORTS = re.compile(r"^ *from [a-z_.]+ import", re.MULTILINE)  # no command `dataset import`
 BETWEEN = re.compile(r"""["'`#\s]+|//""")  # marks of quotation, comments and ends of lines
 
 # Names of extensions that the core has for something of its own.
@@ -51,6 +52,7 @@ ORDINARY = {
     "grid": "the values of a sweep, and the episodes of a run by seed",
     "helper": "a vehicle that the ego may ask, a role",
     "helper_answer": "in which form a prompt asks helpers to answer",
+    "import": "of Python, and what reads files in",
     "history": "of a browser's tab",
     "inspect": "Python's module",
     "learn": "a verb",
@@ -170,7 +172,7 @@ def found() -> Iterator[tuple[str, str]]:
     for path, text in texts():
         for name in {*WORD.findall(text)} & ours:
             yield path, name
-        for phrase in said.findall(BETWEEN.sub(" ", text)):
+        for phrase in said.findall(BETWEEN.sub(" ", IMPORTS.sub("", text))):
             yield path, phrase
 
 

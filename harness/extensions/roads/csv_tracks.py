@@ -26,6 +26,7 @@ from harness.extensions.roads.sources import (
     once,
     sha256_of,
     stem_of,
+    step_of,
     sum_up,
     tracks_of,
     unpacked,
@@ -343,7 +344,7 @@ def _tracks(path: Path, rows: _Rows) -> tuple[dict[str, Track], dict[str, int], 
     inside = np.ones(n - 1, dtype=bool)
     inside[[stop - 1 for _, stop in runs[:-1]]] = False
     inside &= np.isfinite(steps)
-    step_s = float(np.median(steps[inside])) if inside.any() else 1.0
+    step_s = step_of(steps[inside]) if inside.any() else 1.0
     unknown_m = np.full(n, np.nan)
     columns = [numbers.get(name, unknown_m) for name in ("heading_rad", "speed_mps")]
     poses = np.column_stack([numbers["x_m"], numbers["y_m"], *columns])

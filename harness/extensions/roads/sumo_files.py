@@ -25,6 +25,7 @@ from harness.extensions.roads.sources import (
     sha256_of,
     starts,
     stem_of,
+    step_of,
     sum_up,
     tracks_of,
 )
@@ -344,7 +345,7 @@ def _scene(path: Path, net: Map, types: Mapping[str, VehicleType]) -> Scene:
         raise no_use(path, "a road user stands before the first timestep") from None
     if len(rows.clock) < 2:
         raise no_use(path, "it has fewer than two times")
-    step_s = float(np.median(np.diff(rows.clock)))
+    step_s = step_of(np.diff(rows.clock))
     tracks: dict[str, Track] = {}
     for key in list(rows.rows):
         values = np.array(rows.rows.pop(key)).reshape(-1, 5)

@@ -503,6 +503,23 @@ def write(
     return read(folder)
 
 
+def chosen(
+    recording: Recording,
+    speeds_mps: Sequence[float],
+    moments: Iterable[Moment],
+    choice: Mapping[str, Any],
+) -> Recording:
+    """Write the moments of a recording and the ego's target speeds, and return it, read again."""
+    facts = msgspec.structs.replace(
+        recording.facts,
+        speeds_mps=tuple(speeds_mps),
+        moments=tuple(moments),
+        choice=dict(choice),
+    )
+    write_whole(recording.folder / FACTS, canonical_json(msgspec.to_builtins(facts)) + "\n")
+    return read(recording.folder)
+
+
 @contextmanager
 def _writers(folder: Path) -> Iterator[dict[str, pq.ParquetWriter]]:
     """Enter a context that yields a writer of each table, all closed in the end."""

@@ -1,0 +1,458 @@
+"""`harness dataset import`: recorded and simulated traffic as a folder that scenarios read."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from harness.cli import options
+from harness.cli.progress import Bar, bar
+from harness.core.errors import UserError, in_range, printable, sayable, unknown
+from harness.core.figures import amount
+from harness.core.files import making, refuse_taken
+from harness.core.progress import Progress
+
+if TYPE_CHECKING:
+    from harness.extensions.roads.csv_tracks import Columns
+    from harness.extensions.roads.tables import Moment, Recording, Scene
+
+MOST_FILES = 10_000
+MOST_OVERLAPS = 0.1  # share of road users that may appear where another is, and are left out
+LONGEST_TEXT = 1000  # characters of a licence and a source
+SHOWN = 3  # reasons that the screen has
+KNOWN = (
+    "CommonRoad's XML, SUMO's net, positions (FCD), routes and polygons, and tables of tracks, "
+    "lanes or buildings"
+)
+
+
+def command(
+    files: list[Path] = typer.Argument(
+        help="Files with road users and their map, or folders of them. What stands in a file says "
+        f"what it is: {KNOWN}.",
+        metavar="FILE...",
+    ),
+    out: Path = typer.Option(..., help="Folder to make; its name becomes the recording's name."),
+    licence: str | None = typer.Option(
+        None, help="Under which licence the files may be used, such as CC-BY-4.0; or unknown."
+    ),
+    source: str = typer.Option("", help="Where the traffic is from, in words for cards."),
+    name: str | None = typer.Option(None, help="Name of the recording. Default: the folder's."),
+    window: float = typer.Option(80.0, help="Metres around the ego that an episode has."),
+    decisions: int = typer.Option(4, help="Number of decisions of an episode, a second each."),
+    columns: str | None = typer.Option(
+        None,
+        help="Which columns a table of tracks has, such as "
+        "time_s=frame/25,id=track,x_m=x,y_m=y, or a TOML file of such lines.",
+    ),
+    show: Path | None = typer.Option(
+        None, help="Also draw the scenes and moments to this file: .svg, .pdf or .png."
+    ),
+    as_json: options.Json = False,
+) -> None:
+    """Import recorded or simulated traffic, and choose the moments at which episodes begin.
+
+    Whoever cannot be taken is left out and counted. Nothing is written if a file is wrong.
+    """
+    from harness.extensions.roads.csv_tracks import columns_of
+
+    refuse_taken("--out", out)
+    in_range("--window", window, 10, 2000)
+    in_range("--decisions", decisions, 1, 9)
+    about = _About(_name(name, out), _text("--source", source), _licence(licence))
+    _refuse_format(show)
+    declared = columns_of(columns)
+    with bar("sorting files", quiet=as_json) as progress:
+        sources = Sources.of(files, progress)
+    with bar(f"reading {printable(files[0].name, 30)}", sources.count, as_json) as progress:
+        recording, taken = _imported(
+            sources, declared, out, about, window, decisions, show, progress
+        )
+    if as_json:
+        _echo_json(recording, taken)
+    else:
+        _echo(recording, taken, show)
+
+
+@dataclass(frozen=True)
+class _About:
+    """Hold what is stated of a recording."""
+
+    name: str
+    source: str
+    licence: str
+
+
+@dataclass
+class Sources:
+    """Hold the files to read, by what stands in them."""
+
+    commonroad: list[Path] = field(default_factory=list)
+    sumo: list[Path] = field(default_factory=list)  # nets, routes and polygons
+    positions: list[Path] = field(default_factory=list)  # of SUMO's vehicles
+    tracks: list[Path] = field(default_factory=list)
+    lanes: list[Path] = field(default_factory=list)
+    buildings: list[Path] = field(default_factory=list)
+    others: int = 0  # files of folders that are none of these
+
+    @property
+    def count(self) -> int:
+        """Return how many files have road users."""
+        return len(self.commonroad) + len(self.positions) + len(self.tracks)
+
+    @classmethod
+    def of(cls, paths: Sequence[Path], progress: Progress) -> "Sources":
+        """Sort files, and all files of folders, by what stands in them.
+
+        Raises UserError for a file that is none of them; of folders such files are counted.
+        """
+        sources = cls()
+        for path in paths:
+            if not path.is_dir():
+                sources._add(path, kind_of(path))
+                continue
+            for inner in files_of(path):
+                try:
+                    kind = kind_of(inner)
+                except UserError:
+                    sources.others += 1
+                    continue
+                sources._add(inner, kind)
+                progress(1)
+        if not sources.count and not sources.sumo:
+            raise UserError(f"no file has road users; give {KNOWN}")
+        return sources
+
+    def _add(self, path: Path, kind: str) -> None:
+        list_of: list[Path] = getattr(self, kind)
+        if path not in list_of:
+            list_of.append(path)
+
+
+def files_of(folder: Path) -> list[Path]:
+    """Return all files of a folder and of folders in it, by name, but hidden ones."""
+    files = []
+    for path in sorted(folder.rglob("*")):
+        inner = path.relative_to(folder).parts
+        if path.is_file() and not any(part.startswith(".") for part in inner):
+            files.append(path)
+        if len(files) > MOST_FILES:
+            raise UserError(
+                f"folder {printable(folder)} has more than {MOST_FILES} files; give a part of it"
+            )
+    return files
+
+
+def kind_of(path: Path) -> str:
+    """Return what a file is, a field of `Sources`, by what stands in it.
+
+    Raises UserError for one that is none of them.
+    """
+    from harness.extensions.roads import commonroad, csv_tracks, sumo_files
+    from harness.extensions.roads.sources import no_use, unpacked
+
+    with unpacked(path) as file:
+        head = file.read(1 << 12)
+    if not head.strip():
+        raise no_use(path, "it is empty")
+    text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if text.startswith((b"<", b"\xff\xfe", b"\xfe\xff")):
+        root = sumo_files.root_of(path)
+        kinds = {
+            commonroad.ROOT: "commonroad",
+            sumo_files.POSITIONS: "positions",
+            **dict.fromkeys((sumo_files.NET, *sumo_files.FURTHER), "sumo"),
+        }
+        if root not in kinds:
+            raise no_use(path, f"its root is {printable(root, 40)}; known: {', '.join(kinds)}")
+        return kinds[root]
+    if b"\0" in head:
+        raise no_use(path, f"it is neither XML nor text; known: {KNOWN}")
+    header = csv_tracks.header_of(path)
+    if csv_tracks.is_lanes(header):
+        return "lanes"
+    if csv_tracks.is_buildings(header):
+        return "buildings"
+    if len(header) < len(csv_tracks.NEEDED):
+        raise no_use(path, f"its first line names no columns; known: {KNOWN}")
+    return "tracks"
+
+
+@dataclass
+class _Taken:
+    """Hold what was read, for the screen."""
+
+    kinds: Counter[str] = field(default_factory=Counter)
+    still: int = 0
+    minutes: float = 0.0
+    lanes: int = 0
+    lights: int = 0  # scenes with traffic lights
+    left_out: Counter[str] = field(default_factory=Counter)
+    speeds_mps: list[float] = field(default_factory=list)
+
+    def add(self, scene: "Scene") -> None:
+        for track in scene.tracks.values():
+            self.kinds[track.kind] += 1
+            self.still += track.still
+            if not track.still and track.kind not in ("bicycle", "pedestrian"):
+                self.speeds_mps += track.poses[::10, 3].tolist()
+        self.minutes += (scene.end_s - scene.begin_s) / 60
+        self.lanes += len(scene.lanes)
+        self.lights += scene.lights
+        self.left_out.update(scene.left_out)
+
+    def targets_mps(self) -> tuple[float, float, float]:
+        """Return the ego's target speeds: none, half and all of what 95 % of poses stay below."""
+        import numpy as np
+
+        fast = [speed for speed in self.speeds_mps if speed > 1]
+        top = max(2.0, float(np.round(np.percentile(fast, 95)))) if fast else 10.0
+        return 0.0, top / 2, top
+
+
+def _imported(
+    sources: Sources,
+    columns: "Columns",
+    out: Path,
+    about: _About,
+    window_m: float,
+    decisions: int,
+    show: Path | None,
+    progress: Bar,
+) -> "tuple[Recording, _Taken]":
+    """Write a recording, all of it or nothing, and return it with what was read."""
+    from harness.extensions.roads import tables
+
+    taken = _Taken()
+    if sources.others:
+        taken.left_out["file of another kind"] = sources.others
+    texts = (about.name, about.source, about.licence, window_m)
+    try:
+        with making(out) as part:
+            scenes = _watched(_unique(scenes_of(sources, columns)), taken, progress)
+            recording = tables.write(part, *texts, scenes, (), {}, decisions=decisions)
+            moments, choice = _chosen(recording, progress)
+            recording = tables.chosen(recording, taken.targets_mps(), moments, choice)
+            if show:
+                from harness.extensions.roads.picture import draw
+
+                draw(recording, show)
+    except OSError as error:
+        raise UserError(
+            f"--out {printable(out)} cannot be written ({error.strerror}); give another folder"
+        ) from None
+    return replace(recording, folder=out), taken
+
+
+def scenes_of(sources: Sources, columns: "Columns") -> Iterator["Scene"]:
+    """Yield the scenes of all files.
+
+    Raises UserError for a broken file, and for road users whose map is not among the files.
+    """
+    from harness.extensions.roads import commonroad, csv_tracks, sumo_files
+
+    maps = list(sources.commonroad)
+    if sources.positions or (sources.sumo and not sources.tracks):
+        yield from sumo_files.scenes(*sources.sumo, *sources.positions)
+    if sources.tracks:
+        lanes, houses, lights = _map_of(sources)
+        maps = []
+        for path in sources.tracks:
+            yield from csv_tracks.scenes(
+                path, columns=columns, lanes=lanes, houses=houses, lights=lights
+            )
+    yield from commonroad.scenes(*maps)
+
+
+def _map_of(sources: Sources) -> tuple[Any, Any, bool]:
+    """Return the lanes, buildings and lights that tables of tracks go with."""
+    from harness.extensions.roads import commonroad, csv_tracks, sumo_files
+
+    amounts = len(sources.lanes), len(sources.sumo), len(sources.commonroad)
+    if sum(n > 0 for n in amounts) != 1 or amounts[0] > 1 or amounts[2] > 1:
+        raise UserError(
+            "tables of tracks need one map; give with them a table of lanes (id, x_m, y_m), a net "
+            "of SUMO or a file of CommonRoad, and no other"
+        )
+    more = tuple(house for path in sources.buildings for house in csv_tracks.buildings_of(path))
+    if sources.lanes:
+        return csv_tracks.lanes_of(sources.lanes[0]), more, False
+    if sources.sumo:
+        net = sumo_files.map_of(*sources.sumo)
+        return net.lanes, (*net.houses, *more), net.lights
+    road = commonroad.map_of(sources.commonroad[0])
+    return road.lanes, (*road.houses, *more), road.lights
+
+
+def _unique(scenes: Iterable["Scene"]) -> Iterator["Scene"]:
+    """Yield scenes, each with a name that none before it has."""
+    names: set[str] = set()
+    for scene in scenes:
+        name, n = scene.name, 1
+        while name in names:
+            n += 1
+            name = f"{scene.name}-{n}"
+        names.add(name)
+        yield scene if name == scene.name else replace(scene, name=name)
+
+
+def _watched(scenes: Iterable["Scene"], taken: _Taken, progress: Progress) -> Iterator["Scene"]:
+    for scene in scenes:
+        whole = without_overlaps(scene)
+        yield whole  # which writes it, and refuses it where it cannot be
+        taken.add(whole)
+        progress(1)
+
+
+def without_overlaps(scene: "Scene") -> "Scene":
+    """Return a scene without those who appear where another is, if they are few.
+
+    Many of them are a mistake of sizes or positions, which `checked` names.
+    """
+    import numpy as np
+
+    from harness.extensions.roads.tables import overlaps
+
+    poses = [track.poses for track in scene.tracks.values()]
+    if not poses or not all(np.isfinite(each).all() and len(each) for each in poses):
+        return scene  # which is refused
+    late = {track.id for track, _ in overlaps(scene.tracks.values())}
+    if not late or len(late) > MOST_OVERLAPS * len(scene.tracks):
+        return scene
+    tracks = {key: track for key, track in scene.tracks.items() if key not in late}
+    left_out = {**scene.left_out, "appears where another is": len(late)}
+    return replace(scene, tracks=tracks, left_out=left_out)
+
+
+def _chosen(
+    recording: "Recording", progress: Progress
+) -> "tuple[Sequence[Moment], Mapping[str, Any]]":
+    """Return the moments of a recording, and how they were chosen."""
+    place = "harness.extensions.roads.moments"
+    if not find_spec(place):
+        return (), {"rule": "none", "candidates": 0, "left_out": {}}
+    from harness.extensions.environments.place import AFTER
+
+    facts = recording.facts
+    horizon_s = (facts.decisions + AFTER) * facts.period_s
+    choice = import_module(place).choose(recording.scenes(), recording.window_m, horizon_s)
+    about = {
+        "rule": choice.rule,
+        "candidates": choice.candidates,
+        "left_out": dict(choice.left_out),
+        "horizon_s": horizon_s,
+    }
+    return choice.moments, about
+
+
+def _name(name: str | None, out: Path) -> str:
+    from harness.extensions.roads.tables import WORDS
+
+    given = out.name.lower() if name is None else name
+    if not WORDS.fullmatch(given):
+        raise UserError(
+            f"--name {printable(given)!r}; allowed: small letters, digits, `.`, `_` and `-`, "
+            "80 at most; give one"
+        )
+    return given
+
+
+def _licence(text: str | None) -> str:
+    if text is None or not text.strip():
+        raise UserError(
+            "--licence is missing: it goes on cards of whatever is made from the files; give "
+            "theirs, such as CC-BY-4.0, or `--licence unknown`"
+        )
+    return _text("--licence", text)
+
+
+def _text(option: str, text: str) -> str:
+    if len(text) > LONGEST_TEXT:
+        raise UserError(f"{option} has {len(text)} characters; give {LONGEST_TEXT} at most")
+    return sayable(f"{option}", text, "give another text")
+
+
+def _refuse_format(show: Path | None) -> None:
+    if show:
+        from harness.report.drawing.pictures import FORMATS
+
+        if show.suffix[1:] not in FORMATS:
+            endings = [f".{name}" for name in FORMATS]
+            raise unknown("--show, a file that ends in", show.suffix, endings)
+
+
+def _echo_json(recording: "Recording", taken: _Taken) -> None:
+    import msgspec
+
+    from harness.cli.terminal import echo_json
+
+    facts = msgspec.to_builtins(recording.facts)
+    read = {
+        "road_users": dict(taken.kinds),
+        "still": taken.still,
+        "minutes": taken.minutes,
+        "left_out": dict(taken.left_out),
+    }
+    echo_json({"folder": str(recording.folder), "sha256": recording.digest, **facts, **read})
+
+
+def _echo(recording: "Recording", taken: _Taken, show: Path | None) -> None:
+    """Print what was imported, and what to type next."""
+    from harness.cli.next_command import echo_next
+    from harness.cli.terminal import echo_text
+
+    facts = recording.facts
+    scenes = amount(len(facts.scenes), "scene")
+    users = amount(sum(taken.kinds.values()), "road user")
+    lanes = amount(taken.lanes, "lane")
+    echo_text(
+        f"wrote {printable(recording.folder)}: {scenes} of {taken.minutes:.1f} minutes, {users}, "
+        f"{lanes}"
+    )
+    kinds = ", ".join(amount(n, kind) for kind, n in taken.kinds.most_common())
+    echo_text(f"road users: {kinds}; {taken.still} of them never move")
+    if taken.lights:
+        echo_text(f"traffic lights: in {taken.lights} of {scenes}, and their signals are not known")
+    if taken.left_out:
+        echo_text(f"left out: {_reasons(taken.left_out)}")
+    slow, middle, fast = facts.speeds_mps
+    echo_text(
+        f"episodes: {facts.window_m:g} m around the ego, {amount(facts.decisions, 'decision')}, "
+        f"target speeds {slow:g}, {middle:g} and {fast:g} m/s"
+    )
+    _echo_moments(recording)
+    if facts.licence == "unknown":
+        echo_text("the licence is unknown, and cards of what is made from this say so")
+    if show:
+        echo_text(f"drew {printable(show)}")
+    if facts.moments:
+        dataset = Path(f"{recording.folder}-dataset")
+        echo_next("dataset", "build", "--recording", recording.folder, "--out", dataset)
+
+
+def _echo_moments(recording: "Recording") -> None:
+    from harness.cli.terminal import echo_text
+
+    facts = recording.facts
+    purposes = Counter(moment.purpose for moment in facts.moments)
+    by_purpose = ", ".join(f"{n} to {purpose}" for purpose, n in purposes.items()) or "none"
+    hidden = sum(moment.hidden is not None for moment in facts.moments)
+    echo_text(
+        f"moments: {by_purpose}, of {facts.choice.get('candidates', 0)} candidates; in {hidden} "
+        "somebody hidden comes into conflict"
+    )
+    if reasons := facts.choice.get("left_out"):
+        echo_text(f"not taken: {_reasons(reasons)}")
+
+
+def _reasons(counts: Mapping[str, int]) -> str:
+    """Return the most frequent reasons with their counts, as one text."""
+    most = Counter(counts).most_common()
+    texts = [f"{n} {printable(reason, 60)}" for reason, n in most[:SHOWN]]
+    rest = sum(n for _, n in most[SHOWN:])
+    return "; ".join([*texts, *([f"{rest} for other reasons"] if rest else [])])
