@@ -49,6 +49,7 @@ def build(
     ),
     out: Path = typer.Option(..., help="Folder to make; its name becomes the dataset's name."),
     shard: options.Shard = None,
+    unreachable: options.Unreachable = False,
 ) -> None:
     """Build a frozen dataset of some layouts of a scenario.
 
@@ -76,7 +77,7 @@ def build(
     mine = len(part.part(range(episodes))) if part else episodes
     with bar(f"freezing {printable(name, 30)}", mine) as progress:
         manifest = build_dataset(
-            scenario, out, episodes, seed, who, progress, audit, progress.more, part
+            scenario, out, episodes, seed, who, progress, audit, progress.more, part, unreachable
         )
     if part:
         options.say_shard(part, out, f"{mine} of {episodes} layouts")
@@ -166,7 +167,7 @@ def show(
     if camera:
         from harness.world.perception.camera import frame
 
-        picture.write(frame(data.scenario, drawn.state, viewer).png())
+        picture.write(frame(drawn.seat or data.scenario, drawn.state, viewer).png())
     else:
         from harness.report.drawing.scene import draw
 

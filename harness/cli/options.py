@@ -147,6 +147,10 @@ FullPage = Annotated[
 ]
 # Of a command whose page `harness report` writes again, until 0.5.0.
 OldFullPage = Annotated[bool, Option("--full", hidden=True, callback=_say_report)]
+Unreachable = Annotated[
+    bool,
+    Option("--unreachable", help="Keep a dataset in which no course reaches the goal."),
+]
 Shard = Annotated[
     str | None,
     Option(

@@ -167,6 +167,7 @@ def merge(
     audit: bool = typer.Option(
         True, help="Audit a merged dataset of 100 layouts or more, as `harness dataset build` does."
     ),
+    unreachable: options.Unreachable = False,
     workers: options.Workers = "2",
     as_json: options.Json = False,
     quiet: options.Quiet = False,
@@ -181,7 +182,9 @@ def merge(
         from harness.dataset.build import merge as merge_dataset
 
         with bar("layouts", quiet=silent) as progress:
-            manifest = merge_dataset(folders, out, who, progress, audit, progress.more)
+            manifest = merge_dataset(
+                folders, out, who, progress, audit, progress.more, unreachable
+            )
         if as_json:
             echo_json(manifest)
         elif not quiet:

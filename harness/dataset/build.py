@@ -98,6 +98,7 @@ def build(
     audits: bool = True,
     more: Callable[[int], None] = lambda count: None,
     shard: Shard | None = None,
+    unreachable: bool = False,
 ) -> dict[str, Any]:
     """Build a dataset in `out`, or freeze a shard of one, which `harness run merge` combines.
 
@@ -115,10 +116,12 @@ def build(
             are at least `LEAST_AUDITED`.
         more: called with the number of layouts to be audited, before that.
         shard: the part of the dataset to make; None for all of it.
+        unreachable: whether to keep a dataset in which no course reaches the goal.
 
     Returns the manifest as a dict; for a shard, the settings that it begins with. Raises UserError
     if the folder holds a finished dataset, one begun with other settings, or something else; the
-    seeds are for several purposes; or the audit needs a package that is missing.
+    seeds are for several purposes; no course reaches the goal, and that was not asked for; or the
+    audit needs a package that is missing.
     """
     refuse_agents(scenario, "a dataset")
     # Of worlds that are played elsewhere no danger is known.
@@ -155,7 +158,7 @@ def build(
         if shard:
             return config
         manifest = _write_dataset(
-            scenario, out, place, config, own_files, workers, progress, audits, more
+            scenario, out, place, config, own_files, workers, progress, audits, more, unreachable
         )
         work.tidy(out)
     return manifest
@@ -192,6 +195,7 @@ def merge(
     progress: Callable[[int], None],
     audits: bool = True,
     more: Callable[[int], None] = lambda count: None,
+    unreachable: bool = False,
 ) -> dict[str, Any]:
     """Combine the shards of a dataset, a folder each, into the one that `build` makes without.
 
@@ -205,6 +209,7 @@ def merge(
         progress: called with the number of layouts just finished or audited.
         audits: whether the layouts are examined for what gives a danger away.
         more: called with the number of layouts to be audited, before that.
+        unreachable: whether to keep a dataset in which no course reaches the goal.
 
     Raises UserError if the folders are not all the shards of one build, a shard is unfinished, or
     two hold different bytes for the same layout; if `out` holds something else; or if the audit
@@ -226,7 +231,17 @@ def merge(
         keep(config["scenario"], folders[0])
         scenario = scenarios.of_manifest(config["scenario"], config["parameters"])
         count, seed = config["episodes"], config["seed"]
-        return build(scenario, out, count, seed, workers, progress, audits, more)
+        return build(
+            scenario,
+            out,
+            count,
+            seed,
+            workers,
+            progress,
+            audits,
+            more,
+            unreachable=unreachable,
+        )
 
 
 def _write_own_files(scenario: Scenario, out: Path) -> dict[str, str]:
@@ -284,6 +299,7 @@ def _write_dataset(
     progress: Callable[[int], None],
     audits: bool,
     more: Callable[[int], None],
+    unreachable: bool,
 ) -> dict[str, Any]:
     """Write all files of a dataset from the layouts in `place`; return its manifest.
 
@@ -293,13 +309,15 @@ def _write_dataset(
     texts = _join_layouts(place, episodes, out / LAYOUTS)
     trees = [msgspec.json.decode(text, type=Tree) for text in texts]
     forest = Forest.of(trees, scenario.actions, scenario.parameters)
+    if is_lost := not forest.value[forest.root].any():
+        _keep_unreachable(scenario, episodes, unreachable)
     findings = list[str]()
     for name in AUDITS if audits else ():
         more(episodes)
         findings.append(
             AUDITS.ask(name, lambda audit: audit.found(scenario, episodes, seed, progress, workers))
         )
-    command = _command(scenario, episodes, seed, audits)
+    command = _command(scenario, episodes, seed, audits) + (" --unreachable" if is_lost else "")
     files = {
         "README.md": _readme(name, command, config, forest, findings).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
@@ -318,6 +336,18 @@ def _write_dataset(
         write_whole(out / file, data)
     write_whole(out / "manifest.json", _pretty(manifest))
     return manifest
+
+
+def _keep_unreachable(scenario: Scenario, layouts: int, unreachable: bool) -> None:
+    """Raise UserError unless a dataset in which no course reaches the goal was asked for."""
+    if unreachable:
+        return
+    of_name = printable(scenario.name, 80)
+    other = f"declare another, as in {of_name}:goal=6s," if "goal" in scenario.dials else "mend it,"
+    raise UserError(
+        f"no course of {layouts} layout{'s' if layouts > 1 else ''} of {of_name} reaches the goal "
+        f"({printable(scenario.prompt_words['task'])}); {other} or type --unreachable to keep it"
+    )
 
 
 def _freeze_layouts(scenario: Scenario, seed: int, episodes: Sequence[int]) -> list[bytes]:

@@ -291,3 +291,23 @@ def test_in_a_window_vehicles_drive_as_they_do_without():
 def test_a_map_of_too_many_routes_is_a_line():
     with pytest.raises(UserError, match="more than 200 routes; set window_m"):
         World.start(scenarios.get(named("places-grid-v0", {"crossings": 4})), 0)
+
+
+@pytest.mark.slow
+def test_a_goal_that_no_course_reaches_is_a_line_before_the_dataset_is_there(harness, tmp_path):
+    built = ("dataset", "build", "--env", f"{OWN}:decisions=1,goal=390m", "--episodes", "2")
+    shards = ("--workers", "1", "--shard", "1/1", "--out")
+    code, _, err = harness(*built, "--workers", "1", "--out", "set")
+    assert (code, err.count("\n")) == (2, 1)
+    said = "no course of 2 layouts of env:my_roads:breakdown-v0 reaches the goal (follow your road,"
+    assert said in err
+    assert "declare another, as in env:my_roads:breakdown-v0:goal=6s, or type --unreachable" in err
+    assert not (tmp_path / "set/manifest.json").exists()
+    code, wrote, _ = harness(*built, "--workers", "1", "--out", "set", "--unreachable")
+    assert (code, "2 layouts" in wrote) == (0, True)
+    card = (tmp_path / "set/README.md").read_text()
+    assert "| the best policy | 0.0 |" in card
+    assert "--seed 0 --unreachable`" in card
+    assert harness(*built, *shards, "part")[0] == 0
+    assert harness("run", "merge", "part", "--out", "merged")[0] == 2
+    assert harness("run", "merge", "part", "--out", "merged", "--unreachable")[0] == 0
