@@ -182,9 +182,7 @@ def merge(
         from harness.dataset.build import merge as merge_dataset
 
         with bar("layouts", quiet=silent) as progress:
-            manifest = merge_dataset(
-                folders, out, who, progress, audit, progress.more, unreachable
-            )
+            manifest = merge_dataset(folders, out, who, progress, audit, progress.more, unreachable)
         if as_json:
             echo_json(manifest)
         elif not quiet:

@@ -98,7 +98,7 @@ def build(
     audits: bool = True,
     more: Callable[[int], None] = lambda count: None,
     shard: Shard | None = None,
-    unreachable: bool = False,
+    unreachable: bool = True,
 ) -> dict[str, Any]:
     """Build a dataset in `out`, or freeze a shard of one, which `harness run merge` combines.
 
@@ -195,7 +195,7 @@ def merge(
     progress: Callable[[int], None],
     audits: bool = True,
     more: Callable[[int], None] = lambda count: None,
-    unreachable: bool = False,
+    unreachable: bool = True,
 ) -> dict[str, Any]:
     """Combine the shards of a dataset, a folder each, into the one that `build` makes without.
 

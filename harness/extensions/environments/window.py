@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from harness.extensions.environments.environment import lane_of
+from harness.world.road import lanes_of
 
 LEAST_M = 20.0  # the smallest window
-MARGIN_M = 10.0  # a vehicle nearer to the window's edge than this may be on a lane beyond it
-SLACK_M = 20.0  # a lane that is no straight line may be longer than it says, by this at most
+NEAR_M = 10.0  # a lane farther from a vehicle than this is not its own, if there is a nearer one
+SLACK_M = 5.0  # a lane that is no straight line may be longer than it says, by this at most
 Point = tuple[float, float]
 
 
@@ -65,17 +66,23 @@ def is_within(position: Any, origin_m: Point, window_m: float) -> bool:
     return not window_m or math.dist(position, origin_m) < window_m
 
 
-def quicken(network: Any, origin_m: Point, window_m: float) -> None:
-    """Let who is within a window look for his lane among those that come into it.
+def quicken(network: Any) -> None:
+    """Let vehicles look for their lane among those that come near them.
 
     highway-env's own `RoadNetwork` looks through all lanes of the map, for each vehicle in each
-    frame.
+    frame. The answer is the same where no lane's length is shorter than the lane.
     """
-    near, of_all = within(network, origin_m, window_m), network.get_closest_lane_index
+    lanes = list(lanes_of(network).items())
+    centres_m = np.array([lane.position(lane.length / 2, 0.0) for _, lane in lanes])
+    reaches_m = np.array([lane.length / 2 + SLACK_M + NEAR_M for _, lane in lanes])
+    of_all = network.get_closest_lane_index
 
     def closest(position: Any, heading: float | None = None) -> Any:
-        is_inside = is_within(position, origin_m, window_m - MARGIN_M)
-        of_some = near.get_closest_lane_index if is_inside else of_all
-        return of_some(position, heading)
+        near = np.flatnonzero(np.hypot(*(centres_m - position).T) < reaches_m).tolist()
+        distances = [lanes[n][1].distance_with_heading(position, heading) for n in near]
+        least = min(distances, default=np.inf)
+        if least > NEAR_M:
+            return of_all(position, heading)
+        return lanes[near[distances.index(least)]][0]
 
     network.get_closest_lane_index = closest

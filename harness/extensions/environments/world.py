@@ -130,7 +130,7 @@ class EnvironmentWorld(OwnWorld):
         p = cast("Parameters", scenario.parameters)
         env = reset(scenario.name, seed, cls.environment(scenario.name, p))
         if p.window_m:
-            quicken(env.road.network, RoadOf.of(scenario).place.road.origin_m, p.window_m)
+            quicken(env.road.network)
         return env
 
     @classmethod

@@ -369,7 +369,7 @@ def test_a_vehicle_without_a_lane_is_named(kind, tmp_path):
 @pytest.mark.exhaustive
 def test_an_ego_that_begins_in_a_collision_is_said_by_the_check_and_by_runs(tmp_path, harness):
     scenario = scenarios.get("env:crashed-v0:decisions=1")
-    build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None, unreachable=True)
+    build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None)
     assert check(tmp_path / "set") == []
     assert load(tmp_path / "set").lost == 2
     code, said, _ = harness("dataset", "check", tmp_path / "set")
