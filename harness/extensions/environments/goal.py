@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from harness.core.errors import UserError, printable
+from harness.extensions.environments.environment import raised
 from harness.world.road import Path
 
 Kind = Literal["speed", "own", "place", "time", "stay"]
@@ -100,8 +101,11 @@ def declared(name: str, env: Any) -> str | tuple[float, float]:
     declares none. `env` is the environment after its reset, and `name` names it in messages. Raises
     UserError for anything else.
     """
-    goal = getattr(env, "goal", None)
-    goal = goal() if callable(goal) else goal
+    try:
+        goal = getattr(env, "goal", None)
+        goal = goal() if callable(goal) else goal
+    except Exception as error:
+        raise UserError(f"{name}: its goal fails: {raised(error)}") from None
     if goal is None:
         return SPEED
     if isinstance(goal, str):

@@ -15,7 +15,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.extensions.environments import environment
-from harness.extensions.environments.environment import label, lane_of, reset
+from harness.extensions.environments.environment import label, lane_of, raised, reset
 from harness.extensions.environments.goal import Goal, at_place, declared
 from harness.extensions.environments.routes import Routes, routes
 from harness.extensions.environments.window import LEAST_M, is_within, middle, within
@@ -354,8 +354,16 @@ def _parameters(name: str, env: Any, actions: int) -> Parameters:
         time_limit_s=(decisions + LIMIT) * period_s,
         delay_allowance_s=period_s,
         beacon_hz=min(Common.beacon_hz, hz),
-        window_m=float(getattr(env, "window_m", 0.0)),
+        window_m=_window_m(name, env),
     )
+
+
+def _window_m(name: str, env: Any) -> float:
+    """Return the window that an environment has by its attribute `window_m`, m; 0 for none."""
+    try:
+        return float(getattr(env, "window_m", 0.0))
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{label(name)}: its window_m is no number: {raised(error)}") from None
 
 
 def _sectors(

@@ -353,7 +353,7 @@ def test_every_environment_of_highway_env_freezes_or_says_why_not(name, tmp_path
     says = pytest.raises(UserError, match="has no meta-actions but ContinuousAction; config")
     with says if continuous else nullcontext():
         build(
-            scenarios.get(f"env:{name}:decisions=2"), tmp_path / "set", 1, 0, 1, lambda done: None
+            scenarios.get(f"env:{name}:decisions=2"), tmp_path / "set", 2, 0, 1, lambda done: None
         )
     assert continuous or check(tmp_path / "set") == []
 

@@ -18,9 +18,10 @@ from harness.core.errors import UserError
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.dataset.verify import check
-from harness.extensions.environments.environment import joined, named
+from harness.extensions.environments.environment import joined, named, reset
 from harness.extensions.environments.examination import examine
 from harness.extensions.environments.goal import Goal
+from harness.extensions.environments.window import quicken
 from harness.extensions.environments.world import EnvironmentWorld
 from harness.world import scenarios
 from harness.world.reference import drive
@@ -46,11 +47,18 @@ class Wrong(Breakdown):
     """Declares what is no goal: the layout seed says which."""
 
     several_roads = True
-    GOALS = ("soon", 7, (10.0, 0.0), (60.0, 30.0), (60.0, "x"), "0m")
+    GOALS = ("soon", 7, (10.0, 0.0), (60.0, 30.0), (60.0, "x"), "0m", ZeroDivisionError("no"))
 
     @property
     def goal(self):
-        return self.GOALS[(self.np_random_seed or 0) % len(self.GOALS)]
+        goal = self.GOALS[(self.np_random_seed or 0) % len(self.GOALS)]
+        if isinstance(goal, Exception):
+            raise goal
+        return goal
+
+
+class Boundless(Breakdown):
+    window_m = "none"
 
 
 class Proclaims(Breakdown):
@@ -93,7 +101,7 @@ class Houses(Grid):
         self.road.vehicles.append(IDMVehicle(self.road, lane.position(0.0, 0), np.pi, 14))
 
 
-for kind in (Declares, Wrong, Proclaims, Rebuilt, Late, Grid, Houses):
+for kind in (Boundless, Declares, Wrong, Proclaims, Rebuilt, Late, Grid, Houses):
     gymnasium.register(f"places-{kind.__name__.lower()}-v0", entry_point=kind)
 
 
@@ -192,6 +200,7 @@ def test_each_layout_may_declare_a_goal():
             "its goal is 40 m along the ego's path, 26 m beside it",
             "its goal is (60.0, 'x'); it must be speed",
             "goal is '0m'; it must be speed",
+            "its goal fails: ZeroDivisionError: no",
         )
     ),
 )
@@ -201,6 +210,11 @@ def test_what_is_no_goal_is_a_line(seed, said):
         World.start(scenario, seed)
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_is_no_window_is_a_line():
+    with pytest.raises(UserError, match="its window_m is no number: ValueError: could not convert"):
+        scenarios.get("env:places-boundless-v0")
 
 
 @pytest.mark.parametrize(
@@ -286,6 +300,21 @@ def test_in_a_window_vehicles_drive_as_they_do_without():
     whole, cut = ([v.position.tolist() for v in world.env.road.vehicles] for world in worlds)
     assert whole == cut
     examine(scenario, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env", ["merge-v0", "roundabout-v0", "two-way-v0", "places-grid-v0"])
+def test_who_looks_among_near_lanes_finds_the_lane_of_all(env):
+    network = reset(named(env), 0).road.network
+    of_all, draws = network.get_closest_lane_index, np.random.default_rng(0)
+    quicken(network)
+    for _ in range(150):
+        lane = draws.choice(np.array(network.lanes_list(), dtype=object))
+        along_m = draws.uniform(-20, lane.length + 20)
+        position = lane.position(along_m, draws.normal(0, 6))
+        for heading in (None, draws.uniform(-4, 4)):
+            index = network.get_closest_lane_index(position, heading)
+            assert index == of_all(position, heading)
 
 
 def test_a_map_of_too_many_routes_is_a_line():
