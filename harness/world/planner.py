@@ -4,7 +4,7 @@ It knows only the scene graph. It plays every sequence of meta-actions over the 
 FASTER, against the conflicts of the graph at constant speed, and takes the first action of the
 sequence that passes the conflict zone soonest without meeting anyone. A vehicle that is seen to
 brake is assumed to brake until it stands. The planner does not guess what it cannot see, so
-occlusion has a cost.
+occlusion has a cost. Where the goal is to wait, the best sequence is the one that comes least far.
 
 Under `limits` 1 it plays only changes to ways that lie beside its own now, so that a driver who
 overtakes never comes back in what it plays. Under 2 it plays the way back, too.
@@ -142,6 +142,8 @@ def _chosen(
         gap = np.minimum(gap, least_gap(tried, motion, under_way))
     gap = np.where(_too_fast(road.paths[way], at_m, tried, under_way), np.minimum(gap, 0.0), gap)
     arrival_s = short.sum(axis=1) * STEP_S - 1e-3 * tried.travelled_m[:, -1]
+    if road.waits:
+        arrival_s = tried.travelled_m[:, -1]
     cost = arrival_s[tried.motion]
     if road.ways:
         cost += AWAY_S * (road.ways.index(way) + sequences.ends != road.ways.index(road.ego))

@@ -300,6 +300,7 @@ class Road:
     # returns, for the scenario's parameters, the distance along the ego's path, m, at which the
     # episode ends; vehicles beyond do not matter. None if the goal is not a place on its path.
     goal_m: Callable[[Any], float] | None = None
+    waits: bool = False  # whether the goal is to wait: who drives less reaches it sooner
     # returns the ground for a picture that reaches so many metres, its argument, from the origin;
     # None if it is that of the network's lanes
     ground: Callable[[float], Ground] | None = None

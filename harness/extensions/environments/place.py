@@ -298,6 +298,7 @@ def place(
         ways=ways,
         origin_m=origin,
         goal_m=partial(_goal_m, aim, speed_mps, begin_m) if aim.is_place else None,
+        waits=aim.kind == "stay",
     )
     return Place(
         near, ends_of(network), road, actions, p, type(env).__name__, aim, declaration, window_m

@@ -139,6 +139,7 @@ def test_a_goal_is_a_text(text, goal):
         ("3s", "cruise", "cleared", 3.0),
         ("3s", "brake", "cleared", 3.0),
         ("3s/30m", "brake", "cleared", 3.0),
+        ("3s/30m", "full-view", "cleared", 3.0),
         ("3s/30m", "cruise", "time_out", 3.0),
         ("speed", "cruise", "collision", 3.87),
     ],
