@@ -229,7 +229,6 @@ def _rows(path: Path, columns: Columns) -> _Rows:
     table = _table(path, header, kinds)
     if not len(table):
         raise no_use(path, "it has no rows")
-    with_limit(path, len(table), MOST_ROWS, "rows")
     numbers: dict[str, Floats] = {}
     codes: dict[str, Ints] = {}
     names: dict[str, list[str]] = {}
@@ -293,7 +292,12 @@ def _table(path: Path, header: list[str], kinds: Mapping[str, pa.DataType]) -> p
                     column_types=kinds, include_columns=list(kinds), strings_can_be_null=False
                 ),
             )
-            return reader.read_all().unify_dictionaries()
+            batches, n = [], 0
+            for batch in reader:
+                batches.append(batch)
+                n += len(batch)
+                few_enough(n, MOST_ROWS, "rows")
+            return pa.Table.from_batches(batches, reader.schema).unify_dictionaries()
         except pa.ArrowException as error:
             reason = str(error).split("\n")[0]
             is_empty = reason.startswith("Could not skip")  # the header, as there is no more

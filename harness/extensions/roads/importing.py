@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from harness.cli import options
-from harness.cli.progress import Bar, bar
+from harness.cli.progress import bar
 from harness.core.errors import UserError, in_range, printable, sayable, unknown
 from harness.core.figures import amount
 from harness.core.files import making, refuse_taken
@@ -69,10 +69,8 @@ def command(
     declared = columns_of(columns)
     with bar("sorting files", quiet=as_json) as progress:
         sources = Sources.of(files, progress)
-    with bar(f"reading {printable(files[0].name, 30)}", sources.count, as_json) as progress:
-        recording, taken = _imported(
-            sources, declared, out, about, window, decisions, show, progress
-        )
+    what = about, window, decisions
+    recording, taken = _imported(sources, declared, out, what, show, as_json)
     if as_json:
         _echo_json(recording, taken)
     else:
@@ -219,11 +217,9 @@ def _imported(
     sources: Sources,
     columns: "Columns",
     out: Path,
-    about: _About,
-    window_m: float,
-    decisions: int,
+    what: tuple[_About, float, int],
     show: Path | None,
-    progress: Bar,
+    quiet: bool,
 ) -> "tuple[Recording, _Taken]":
     """Write a recording, all of it or nothing, and return it with what was read."""
     from harness.extensions.roads import tables
@@ -231,12 +227,15 @@ def _imported(
     taken = _Taken()
     if sources.others:
         taken.left_out["file of another kind"] = sources.others
+    about, window_m, decisions = what
     texts = (about.name, about.source, about.licence, window_m)
     try:
         with making(out) as part:
-            scenes = _watched(_unique(scenes_of(sources, columns)), taken, progress)
-            recording = tables.write(part, *texts, scenes, (), {}, decisions=decisions)
-            moments, choice = _chosen(recording, progress)
+            with bar("reading files", sources.count, quiet) as progress:
+                scenes = _watched(_unique(scenes_of(sources, columns)), taken, progress)
+                recording = tables.write(part, *texts, scenes, (), {}, decisions=decisions)
+            with bar("choosing moments", len(recording.scenes_stated), quiet) as progress:
+                moments, choice = _chosen(recording, progress)
             recording = tables.chosen(recording, taken.targets_mps(), moments, choice)
             if show:
                 from harness.extensions.roads.picture import draw
@@ -318,10 +317,10 @@ def without_overlaps(scene: "Scene") -> "Scene":
 
     from harness.extensions.roads.tables import overlaps
 
-    poses = [track.poses for track in scene.tracks.values()]
-    if not poses or not all(np.isfinite(each).all() and len(each) for each in poses):
-        return scene  # which is refused
-    late = {track.id for track, _ in overlaps(scene.tracks.values())}
+    for track in scene.tracks.values():
+        if not len(track.time_s) or not np.isfinite([*track.time_s, *track.poses.flat]).all():
+            return scene  # which is refused
+    late = {track.id for track, _ in overlaps(list(scene.tracks.values()))}
     if not late or len(late) > MOST_OVERLAPS * len(scene.tracks):
         return scene
     tracks = {key: track for key, track in scene.tracks.items() if key not in late}
@@ -340,14 +339,15 @@ def _chosen(
 
     facts = recording.facts
     horizon_s = (facts.decisions + AFTER) * facts.period_s
-    choice = import_module(place).choose(recording.scenes(), recording.window_m, horizon_s)
-    about = {
-        "rule": choice.rule,
-        "candidates": choice.candidates,
-        "left_out": dict(choice.left_out),
-        "horizon_s": horizon_s,
-    }
-    return choice.moments, about
+    scenes = _counted(recording.scenes(), progress)
+    choice = import_module(place).choose(scenes, recording.window_m, horizon_s)
+    return choice.moments, {**choice.record, "horizon_s": horizon_s}
+
+
+def _counted(scenes: Iterator["Scene"], progress: Progress) -> Iterator["Scene"]:
+    for scene in scenes:
+        yield scene
+        progress(1)
 
 
 def _name(name: str | None, out: Path) -> str:

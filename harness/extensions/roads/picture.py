@@ -144,12 +144,21 @@ def _moments(axes: Axes, scene: Scene, moments: Iterable[Moment]) -> None:
         there = other.at(moment.time_s) if other else None
         if there is not None:
             axes.plot(*np.stack([pose[:2], there[:2]]).T, color=ROLES["danger"], linewidth=0.5)
-            axes.plot(*there[:2], marker="D", markersize=3.5, **MARK, color=ROLES["danger"])
+            axes.plot(*there[:2], **DIAMOND)
         turned = (3, 0, np.degrees(pose[2]) - 90)
         axes.plot(*pose[:2], marker=turned, markersize=5, **MARK, color=ROLES["ego"])
 
 
 MARK: dict[str, Any] = {"markeredgecolor": INK, "markeredgewidth": 0.4, "zorder": 4}
+# Hollow, since who is hidden from one ego may be another ego.
+DIAMOND: dict[str, Any] = {
+    "marker": "D",
+    "markersize": 6,
+    "markerfacecolor": "none",
+    "markeredgecolor": ROLES["danger"],
+    "markeredgewidth": 1.0,
+    "zorder": 5,
+}
 
 
 def _legend(figure: Figure, kinds: set[str], with_moments: bool) -> None:
@@ -157,9 +166,10 @@ def _legend(figure: Figure, kinds: set[str], with_moments: bool) -> None:
     for kind, colour in KIND_COLOURS.items():
         if kind in kinds:
             handles.append(Line2D([], [], color=colour, linewidth=1.2, label=kind))
-    plain: dict[str, Any] = {"linestyle": "none", "markeredgecolor": INK, "markeredgewidth": 0.4}
-    ego = Line2D([], [], marker="^", color=ROLES["ego"], label="ego at its moment", **plain)
-    hidden = Line2D([], [], marker="D", color=ROLES["danger"], label="hidden, in conflict", **plain)
+    alone: dict[str, Any] = {"linestyle": "none"}
+    way: dict[str, Any] = {"marker": "^", "color": ROLES["ego"], **MARK, **alone}
+    ego = Line2D([], [], label="ego at its moment", **way)
+    hidden = Line2D([], [], label="hidden, in conflict", **DIAMOND, **alone)
     figure.legend(
         handles=[*handles, ego, hidden] if with_moments else handles,
         loc="lower center",

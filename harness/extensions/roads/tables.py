@@ -619,9 +619,10 @@ def _problems(scene: Scene) -> Iterator[str]:
     for lane in scene.lanes.values():
         yield from _problems_of_lane(lane, scene.lanes)
     for house in scene.houses:
+        yield from _problems_of_id(f"building {printable(house.id)}", house.id)
         if len(house.outline) < 3 or not _is_place(house.outline):
             yield f"building {printable(house.id)} has no outline of three points or more"
-    for late, early in overlaps(scene.tracks.values()) if scene.tracks else ():
+    for late, early in overlaps(list(scene.tracks.values())):
         yield (
             f"{printable(late.id)} appears at {late.begin_s:g} s "
             f"where {printable(early.id)} is already"
@@ -653,10 +654,16 @@ def _is_place(points: Floats) -> bool:
     return bool((np.abs(points) <= FARTHEST_M).all())
 
 
+def _problems_of_id(which: str, text: str) -> Iterator[str]:
+    if not 0 < len(text) <= LONGEST_ID:
+        yield f"{which}: its id has {len(text)} characters; allowed: 1 to {LONGEST_ID}"
+    if not text.isprintable():
+        yield f"{which}: its id has characters that nothing can show"
+
+
 def _problems_of_track(track: Track) -> Iterator[str]:
     who, times, poses = f"track {printable(track.id)}", track.time_s, track.poses
-    if not 0 < len(track.id) <= LONGEST_ID:
-        yield f"{who}: its id has {len(track.id)} characters; allowed: 1 to {LONGEST_ID}"
+    yield from _problems_of_id(who, track.id)
     if track.kind not in KINDS:
         yield f"{who}: kind {printable(track.kind)!r}; allowed: {', '.join(KINDS)}"
     sizes = (("length_m", track.length_m, LENGTHS_M), ("width_m", track.width_m, WIDTHS_M))
@@ -679,8 +686,7 @@ def _problems_of_track(track: Track) -> Iterator[str]:
 
 def _problems_of_lane(lane: Lane, lanes: Mapping[str, Lane]) -> Iterator[str]:
     which = f"lane {printable(lane.id)}"
-    if not 0 < len(lane.id) <= LONGEST_ID:
-        yield f"{which}: its id has {len(lane.id)} characters; allowed: 1 to {LONGEST_ID}"
+    yield from _problems_of_id(which, lane.id)
     if len(lane.points) < 2 or not _is_place(lane.points):
         yield f"{which} has no centre line of two points or more"
     elif not (np.diff(lane.points, axis=0) ** 2).sum() > 1e-6:
@@ -696,11 +702,13 @@ def _problems_of_lane(lane: Lane, lanes: Mapping[str, Lane]) -> Iterator[str]:
             yield f"{which} names lane {printable(other)}, which is not there"
 
 
-def overlaps(tracks: Iterable[Track]) -> Iterator[tuple[Track, Track]]:
+def overlaps(tracks: Sequence[Track]) -> Iterator[tuple[Track, Track]]:
     """Yield each track that appears where another is at that time, by more than sensors err.
 
     Only its first moment is looked at. The track that began later comes first.
     """
+    if not tracks:
+        return
     by_begin = sorted(tracks, key=lambda track: track.begin_s)
     there = _Positions(by_begin)
     sizes = np.array([(track.length_m, track.width_m) for track in by_begin])

@@ -79,7 +79,7 @@ def same(read: Scene, scene: Scene) -> None:
         assert np.array_equal(house.outline, other.outline)
 
 
-NAMES = st.text(min_size=1, max_size=5)
+NAMES = st.text(min_size=1, max_size=5).filter(str.isprintable)
 NUMBERS = st.floats(-1e6, 1e6)
 
 
@@ -136,6 +136,10 @@ WRONG: dict[str, dict[str, Any]] = {
     "lane 1: width_m 0": {"lanes": {"1": Lane("1", LINE, 0, None, (), None, None)}},
     "lane 1 names lane 9": {"lanes": {"1": Lane("1", LINE, 4, None, ("9",), None, None)}},
     "building h has no outline": {"houses": (House("h", LINE),)},
+    "its id has 0 characters": {"tracks": {"": straight("", 0, 1)}},
+    "track \\x1b: its id has characters that nothing can show": {
+        "tracks": {"\x1b": straight("\x1b", 0, 1)}
+    },
     "a step of 0 s": {"step_s": 0.0},
 }
 
