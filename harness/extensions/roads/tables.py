@@ -39,7 +39,7 @@ FACTS = "recording.json"
 KINDS = ("car", "van", "truck", "bicycle", "motorcycle", "pedestrian")
 STILL_M = 0.5  # what moves less than this in all its time stands
 # Of one scene; what is beyond these is no traffic of one place.
-MOST_ROWS, MOST_TRACKS, MOST_LANES, MOST_HOUSES = 20_000_000, 50_000, 100_000, 100_000
+MOST_ROWS, MOST_TRACKS, MOST_LANES, MOST_HOUSES = 10_000_000, 50_000, 100_000, 100_000
 MOST_POINTS = 5_000_000  # of all its lanes
 MOST_SCENES, MOST_MOMENTS = 10_000, 1_000_000
 FARTHEST_M = 1e8  # of a coordinate: maps have them in metres from an equator and a meridian
@@ -221,6 +221,7 @@ SCHEMAS = {
 }
 TRACKS, LANES, BUILDINGS = SCHEMAS
 NULLABLE = {"limit_mps", "left", "right"}
+PLAIN = {"PLAIN", "RLE", "BIT_PACKED"}  # of values, and the latter two of levels of lists
 # Bytes that a file's rows may unpack to: a few bytes can state thousands of millions of them.
 MOST_BYTES = {TRACKS: 4 << 30, LANES: 1 << 30, BUILDINGS: 1 << 30}
 
@@ -322,11 +323,19 @@ def _rows(file: BinaryIO, file_name: str, scene: str) -> pa.Table:
         raise ValueError(f"scene {printable(scene)} has more than {MOST_ROWS} rows")
     if sum(size.total_byte_size for size in sizes) > MOST_BYTES[file_name]:
         raise ValueError(f"scene {printable(scene)} takes more bytes than a scene needs")
+    if file_name != TRACKS and any(map(_may_grow, sizes)):
+        raise ValueError("it is packed so that few bytes may be many values")
     table = source.read_row_groups(groups, use_threads=False).cast(expected)
     for name in expected.names:
         if name not in NULLABLE and table[name].null_count:
             raise ValueError(f"{name} is unknown in some rows")
     return table.filter(pa.compute.equal(table["scene"].cast(TEXT), scene))
+
+
+def _may_grow(group: pq.RowGroupMetaData) -> bool:
+    """Return whether a group's values may take more than the bytes that it states."""
+    columns = [group.column(n) for n in range(group.num_columns)]
+    return any(not PLAIN.issuperset(column.encodings) for column in columns)
 
 
 def _may_have(metadata: pq.FileMetaData, group: int, scene: str) -> bool:
@@ -528,7 +537,9 @@ def _writers(folder: Path) -> Iterator[dict[str, pq.ParquetWriter]]:
         for file_name, schema in SCHEMAS.items():
             path = folder / file_name
             stack.enter_context(naming(path))
-            writer = pq.ParquetWriter(path.absolute(), schema, compression="zstd")
+            writer = pq.ParquetWriter(
+                path.absolute(), schema, compression="zstd", use_dictionary=file_name == TRACKS
+            )
             writers[file_name] = stack.enter_context(writer)
         yield writers
 

@@ -1,16 +1,20 @@
 """Recordings: what is written is read, and what cannot be is refused in one line."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from harness.core.errors import UserError
+from harness.core.files import sha256_file
 from harness.extensions.roads import tables
 from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track
 
@@ -192,3 +196,69 @@ def test_a_folder_with_other_tables_is_refused(tmp_path: Path) -> None:
         tables.read(tmp_path).scene("s")
     with pytest.raises(UserError, match="is no recording"):
         tables.read(tmp_path / "nowhere")
+
+
+def rewritten(folder: Path, file_name: str, table: pa.Table, **how: Any) -> None:
+    """Replace a table of a recording, and state its digest."""
+    pq.write_table(table, folder / file_name, **how)
+    facts = json.loads((folder / "recording.json").read_text())
+    facts["files"][file_name] = sha256_file(folder / file_name)
+    (folder / "recording.json").write_text(json.dumps(facts))
+
+
+def lanes_with(**columns: Any) -> pa.Table:
+    """Return the table of one lane, with some columns changed."""
+    line = {"x_m": [[0.0, 9.0]], "y_m": [[0.0, 0.0]], "width_m": [4.0], "limit_mps": [None]}
+    beside = {"successors": [[]], "left": [None], "right": [None]}
+    whole = {"scene": ["s"], "id": ["1"], **line, **beside, **columns}
+    return pa.table(whole, schema=tables.SCHEMAS["lanes.parquet"])
+
+
+def many(rows: int) -> pa.Table:
+    """Return so many equal rows of tracks."""
+    schema = tables.SCHEMAS["tracks.parquet"]
+    kinds = [pa.string() if kind == tables.LABEL else kind for kind in schema.types]
+    return pa.table(
+        [
+            pa.repeat(pa.scalar("s" if kind == pa.string() else 0.0), rows).cast(kind)
+            for kind in kinds
+        ],
+        names=schema.names,
+    )
+
+
+HOSTILE: dict[str, Callable[[Path], None]] = {
+    "packed so that few bytes may be many values": lambda folder: rewritten(
+        folder, "lanes.parquet", lanes_with(), use_dictionary=True
+    ),
+    "its columns are id, x_m": lambda folder: rewritten(
+        folder, "lanes.parquet", lanes_with().drop_columns("scene"), use_dictionary=False
+    ),
+    "lane 1 names lane None": lambda folder: rewritten(
+        folder, "lanes.parquet", lanes_with(successors=[[None]]), use_dictionary=False
+    ),
+    "lane 1 has no centre line": lambda folder: rewritten(
+        folder, "lanes.parquet", lanes_with(x_m=[[None, 1.0]]), use_dictionary=False
+    ),
+    "line 1 has another number of x_m": lambda folder: rewritten(
+        folder, "lanes.parquet", lanes_with(x_m=[[1.0]]), use_dictionary=False
+    ),
+    "scene s has more than 100 rows": lambda folder: rewritten(folder, "tracks.parquet", many(101)),
+    "track s: kind 's'; allowed: car": lambda folder: rewritten(folder, "tracks.parquet", many(9)),
+    "x_m is unknown in some rows": lambda folder: rewritten(
+        folder, "tracks.parquet", many(2).set_column(4, "x_m", pa.array([None, 1.0]))
+    ),
+}
+
+
+@pytest.mark.parametrize("words", HOSTILE)
+def test_tables_of_a_stranger_are_refused_in_one_line(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written(tmp_path, road())
+    monkeypatch.setattr(tables, "MOST_ROWS", 100)
+    HOSTILE[words](tmp_path)
+    with pytest.raises(UserError) as refusal:
+        tables.read(tmp_path).scene("s")
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
