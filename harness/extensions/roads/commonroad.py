@@ -15,6 +15,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.extensions.roads.sources import (
+    distinct,
     elements,
     few_enough,
     name_of,
@@ -293,7 +294,7 @@ def _lane(
     limits_mps = [limit for limit in stated_mps if limit > 0]
     return Lane(
         key,
-        (left + right) / 2,
+        distinct((left + right) / 2),
         width_m,
         min(limits_mps, default=None),
         tuple(dict.fromkeys(here)),

@@ -20,6 +20,7 @@ from harness.core.arrays import Floats, Ints
 from harness.core.config import toml
 from harness.core.errors import UserError, printable, unknown
 from harness.extensions.roads.sources import (
+    distinct,
     few_enough,
     name_of,
     no_use,
@@ -409,7 +410,7 @@ def lanes_of(path: Path) -> dict[str, Lane]:
         once(lanes, key, "lanes", path)
         lanes[key] = Lane(
             key,
-            points,
+            distinct(points),
             _number_of(path, first, "width_m") or LANE_WIDTH_M,
             _number_of(path, first, "limit_mps"),
             tuple(each for each in first.get("successors", "").split(SEPARATOR) if each),

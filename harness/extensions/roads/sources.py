@@ -21,6 +21,7 @@ CHUNK = 1 << 18
 MOST_OF_ELEMENT = 32 << 20  # bytes of one child of a file's root: a lane, a road user, a time
 DEEPEST = 50  # elements in one another
 MOVES_M = 0.05  # from one pose to the next: what moves less keeps its heading
+SAME_M = 0.001  # by which points of a line that are nearer are one
 LONGEST_GAP_S = 1.0  # without a pose, after which a road user counts as another one
 
 
@@ -232,6 +233,12 @@ def moving(time_s: Floats, poses: Floats) -> Floats:
     poses[:, 2] = np.where(np.isfinite(poses[:, 2]), poses[:, 2], headings)
     poses[:, 3] = np.where(np.isfinite(poses[:, 3]), poses[:, 3], speeds)
     return poses
+
+
+def distinct(points: Floats) -> Floats:
+    """Return a line's points (n, 2) without those that are where the one before is."""
+    steps_m = np.hypot(*np.diff(points, axis=0).T)
+    return np.asarray(points[np.append(True, ~(steps_m <= SAME_M))[: len(points)]])
 
 
 def step_of(steps_s: Floats) -> float:

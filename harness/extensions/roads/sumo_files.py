@@ -17,6 +17,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.extensions.roads.sources import (
+    distinct,
     elements,
     few_enough,
     name_of,
@@ -166,6 +167,7 @@ class _Net:
         self.path, self.place, self.left_hand = path, "its root", False
         self.lanes: dict[str, dict[str, Any]] = {}
         self.edges: dict[str, list[str]] = {}  # ids of an edge's lanes, by their index
+        self.empty: set[str] = set()  # lanes without length, past which others lead on
         self.connections: list[tuple[str, str, str, str, str]] = []
         self.lights = False
         self.left_out: dict[str, int] = {}
@@ -193,8 +195,13 @@ class _Net:
                 continue
             name = lane.get("id", "")
             once(self.lanes, name, "lanes", self.path)
+            points = distinct(_points(lane.get("shape", "")))
+            if len(points) < 2:  # as netconvert makes them within small junctions
+                sum_up(self.left_out, "lane without length")
+                self.empty.add(name)
+                continue
             self.lanes[name] = {
-                "points": _points(lane.get("shape", "")),
+                "points": points,
                 "width_m": float(lane.get("width", LANE_WIDTH_M)),
                 "limit_mps": float(lane.get("speed", "nan")),
             }
@@ -229,11 +236,20 @@ class _Net:
     def _successors(self) -> dict[str, dict[str, None]]:
         """Return on which lanes each lane leads, by the connections, in their order."""
         after: dict[str, dict[str, None]] = {}
+        here = self.lanes.keys() | self.empty
         for start, start_lane, end, end_lane, via in self.connections:
             begin, goal = self._at(start, start_lane), via or self._at(end, end_lane)
-            if begin in self.lanes and goal in self.lanes and begin != goal:
+            if begin in here and goal in here and begin != goal:
                 after.setdefault(begin, {})[goal] = None
-        return after
+        return {key: dict.fromkeys(self._past(key, after)) for key in self.lanes}
+
+    def _past(self, key: str, after: Mapping[str, Mapping[str, None]]) -> Iterator[str]:
+        """Yield the lanes that a lane leads on to, past one without length."""
+        for goal in after.get(key, ()):
+            if goal in self.lanes:
+                yield goal
+            else:
+                yield from (next_one for next_one in after.get(goal, ()) if next_one in self.lanes)
 
     def _at(self, edge: str, index: str) -> str:
         lanes = self.edges.get(edge, ())

@@ -93,6 +93,14 @@ def test_sumo_gives_front_bumpers_and_degrees_of_a_compass(tmp_path: Path) -> No
     }
 
 
+def test_a_lane_without_length_is_passed_by(tmp_path: Path) -> None:
+    net = files.NET.replace('shape="50,1.6 60,1.6"', 'shape="50,1.6 50,1.6"')
+    road = sumo_files.map_of(written(tmp_path, "j.net.xml", net))
+    assert road.lanes["in_1"].successors == ("out_0",)
+    assert ":J_0_0" not in road.lanes
+    assert road.left_out["lane without length"] == 1
+
+
 MAPPED = "time_s=frame/25,id=track,x_m=cx*0.3048,y_m=cy*0.3048,kind=class,length_m=len,width_m=wid"
 
 
