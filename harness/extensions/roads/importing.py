@@ -238,14 +238,23 @@ def _imported(
                 moments, choice = _chosen(recording, progress)
             recording = tables.chosen(recording, taken.targets_mps(), moments, choice)
             if show:
-                from harness.extensions.roads.picture import draw
-
-                draw(recording, show)
+                _draw(recording, show)
     except OSError as error:
         raise UserError(
             f"--out {printable(out)} cannot be written ({error.strerror}); give another folder"
         ) from None
     return replace(recording, folder=out), taken
+
+
+def _draw(recording: "Recording", show: Path) -> None:
+    from harness.extensions.roads.picture import draw
+
+    try:
+        draw(recording, show)
+    except OSError as error:
+        raise UserError(
+            f"--show {printable(show)} cannot be written ({error.strerror}); give another path"
+        ) from None
 
 
 def scenes_of(sources: Sources, columns: "Columns") -> Iterator["Scene"]:

@@ -127,6 +127,10 @@ WRONG: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("hand-1.xml",),
         ("--licence", "x", "--show", "a.gif"),
     ),
+    "--show /proc/a.svg cannot be written": (
+        ("hand-1.xml",),
+        ("--licence", "x", "--show", "/proc/a.svg"),
+    ),
     "--window 5 is out of range": (("hand-1.xml",), ("--licence", "x", "--window", "5")),
     "--name '../x'; allowed: small letters": (
         ("hand-1.xml",),
