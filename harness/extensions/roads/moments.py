@@ -1,0 +1,569 @@
+"""Choose the moments of recorded traffic at which episodes begin, by a rule that can be stated.
+
+Most of traffic decides nothing: cars follow each other. A moment is *decisive* if somebody whom the
+ego cannot see comes into conflict with it soon. As many moments without such a conflict are chosen,
+by a draw that no order of files moves, and whatever is left out is counted by its reason.
+
+A conflict is an encroachment with a post-encroachment time of at most `SHORT_PET_S` (sources:
+`harness.world.conflict_measures`): one road user is where the other was so short a time before.
+"""
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import shapely
+from msgspec import structs
+
+from harness.core.arrays import Bools, Floats, Ints
+from harness.core.seeds import FIRST, Purpose
+from harness.extensions.roads.tables import STILL_M, Moment, Scene, Track
+from harness.world.conflict_measures import MOMENTS_HZ, SHORT_PET_S
+from harness.world.state import separation_m
+
+EGOS = ("car", "van", "truck", "motorcycle")  # kinds that may be the ego
+OPAQUE = ("car", "van", "truck")  # kinds that nobody sees through
+EVERY_S = 1.0  # from one candidate of a vehicle to the next
+APART_S = 5.0  # least time from one moment of a vehicle to the next
+HARD_MPS2 = 4.0  # mean deceleration over a second that is hard braking, as metrics have it
+ALIKE_RAD = math.pi / 4  # headings that differ by less are of one direction
+EVERY = round(EVERY_S * MOMENTS_HZ)  # frames from one candidate to the next
+NEVER = np.iinfo(np.int64).max  # a frame that does not come
+BLOCK = 600  # frames whose encroachments are looked for at once
+TRIPLES = 4000  # pairs of road users whose paths are compared at once
+
+DEALT: Sequence[Purpose] = ("report", "tune", "train")  # purposes as scenes are dealt to them
+LIGHTS = "its scene has a traffic light"
+STILL = "it stands still"
+LEAVES = "it leaves the recording within the horizon"
+OFF_LANE = "it is on no lane"
+NEAR = "another moment of it is too near in time"
+GAP = "it is in a gap between two purposes"
+NOT_REACHED = "its recorded driver does not reach the goal"  # of a function that looks for it
+TWICE = "its scene is there twice"
+NO_CONFLICT = "no moment of its scene is decisive"
+NOT_DRAWN = "it was not drawn"
+
+Unfit = Callable[[Scene, Moment], str | None]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Hold the chosen moments, those of one purpose together, and how they were chosen.
+
+    Of each purpose, every other moment is decisive, and all are in the order of a draw: so any
+    number of them from the first is a fair part.
+    """
+
+    rule: str  # what was done, in words
+    moments: tuple[Moment, ...]
+    candidates: int  # how many there were: seconds of motor vehicles
+    left_out: Mapping[str, int]  # how many of these were not taken, by the reason
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Return what a recording states of the choice."""
+        return {"rule": self.rule, "candidates": self.candidates, "left_out": dict(self.left_out)}
+
+
+def choose(
+    scenes: Iterable[Scene],
+    window_m: float,
+    horizon_s: float,
+    gap_s: float = SHORT_PET_S,
+    unfit: Unfit | None = None,
+    most: int | None = None,
+) -> Choice:
+    """Return the moments of some scenes at which episodes begin; see `Chooser`."""
+    chooser = Chooser(window_m, horizon_s, gap_s, unfit, most)
+    for scene in scenes:
+        chooser.look(scene)
+    return chooser.choice()
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """A candidate that is left after all that its own scene says."""
+
+    content: str  # digest of its scene's file
+    draw: str  # digest of the candidate, which orders the draw
+    scene: str
+    moment: Moment  # without its purpose
+    span_s: tuple[float, float]  # begin and end of its scene
+
+
+@dataclass
+class Chooser:
+    """Choose moments of scenes that come one after the other; none of them is kept.
+
+    Attributes:
+        window_m: radius around the ego in which others count, m.
+        horizon_s: length of an episode, s.
+        gap_s: greatest post-encroachment time of a conflict, s.
+        unfit: returns a reason, such as `NOT_REACHED`, why a moment of a scene is none, else None.
+            It is asked about candidates that nothing else speaks against.
+        most: how many moments of a purpose are chosen; None for all that can be.
+    """
+
+    window_m: float
+    horizon_s: float
+    gap_s: float = SHORT_PET_S
+    unfit: Unfit | None = None
+    most: int | None = None
+    candidates: int = 0
+    left_out: Counter[str] = field(default_factory=Counter)
+    _fit: list[_Fit] = field(default_factory=list)
+
+    def look(self, scene: Scene) -> None:
+        """Count a scene's candidates, and note those at which an episode may begin."""
+        frames = _Frames.of(scene)
+        egos = np.array([track.kind in EGOS for track in frames.tracks], dtype=bool)
+        rows = np.flatnonzero((frames.frame % EVERY == 0) & egos[frames.track])
+        self.candidates += len(rows)
+        if scene.lights:
+            self.left_out[LIGHTS] += len(rows)
+            return
+        horizon = round(self.horizon_s * MOMENTS_HZ)
+        rows = self._without(rows, frames.leaves(rows, horizon), LEAVES)
+        rows = self._without(rows, frames.stands(rows, horizon), STILL)
+        rows = self._without(rows, ~_on_lane(scene, frames.poses[rows]), OFF_LANE)
+        gap = round(self.gap_s * MOMENTS_HZ)
+        conflicts = _hidden_conflicts(scene, frames, rows, self.window_m, horizon, gap)
+        fit, span_s = [], (scene.begin_s, scene.end_s)
+        for row in rows.tolist():
+            who = frames.tracks[int(frames.track[row])].id
+            hidden, conflict_s = conflicts.get(row, (None, None))
+            moment = Moment(
+                scene.name, who, float(frames.frame[row] / MOMENTS_HZ), hidden, conflict_s, ""
+            )
+            draw = _digest(scene.sha256, who, f"{moment.time_s:.3f}")
+            fit.append(_Fit(scene.sha256, draw, scene.name, moment, span_s))
+        for candidate in self._apart(fit):
+            reason = self.unfit and self.unfit(scene, candidate.moment)
+            if reason:
+                self.left_out[reason] += 1
+            else:
+                self._fit.append(candidate)
+
+    def choice(self) -> Choice:
+        """Deal what is left to the purposes, and draw as many moments with a conflict as without.
+
+        What is not taken is counted by its reason.
+        """
+        left_out = Counter(self.left_out)
+        names: dict[str, str] = {}  # of the scene of each content
+        for each in self._fit:
+            names[each.content] = min(names.get(each.content, each.scene), each.scene)
+        decisive = {each.content for each in self._fit if each.moment.hidden is not None}
+        contents = sorted(decisive, key=_digest)
+        place_of = {content: place for place, content in enumerate(contents)}
+        by_purpose: dict[str, list[_Fit]] = {purpose: [] for purpose in FIRST}
+        for candidate in self._fit:
+            purpose: str | None = DEALT[place_of.get(candidate.content, 0) % len(DEALT)]
+            if len(contents) < len(DEALT):
+                purpose = part_of(candidate.moment.time_s, candidate.span_s, self.horizon_s)
+            if names[candidate.content] != candidate.scene:
+                left_out[TWICE] += 1
+            elif candidate.content not in decisive:
+                left_out[NO_CONFLICT] += 1
+            elif purpose is None:
+                left_out[GAP] += 1
+            else:
+                by_purpose[purpose].append(candidate)
+        moments: list[Moment] = []
+        for purpose, dealt in by_purpose.items():
+            drawn = self._drawn(dealt)
+            left_out[NOT_DRAWN] += len(dealt) - len(drawn)
+            moments += [structs.replace(each.moment, purpose=purpose) for each in drawn]
+        counts = {reason: count for reason, count in sorted(left_out.items()) if count}
+        return Choice(self.rule(len(contents)), tuple(moments), self.candidates, counts)
+
+    def rule(self, scenes: int) -> str:
+        """Return the rule in words, as it is for so many scenes that have decisive moments."""
+        dealt = (
+            "Scenes with a decisive moment are dealt in turn to report, tune and train, in the "
+            "order of their digests; none is in two."
+        )
+        if scenes < len(DEALT):
+            dealt = (
+                "Each scene with a decisive moment is cut in three by time, for tune, train and "
+                f"report, with gaps of {self.horizon_s:g} s, so that no second is in two; one that "
+                "is too short is for report."
+            )
+        most = "" if self.most is None else f", at most {self.most} of a purpose"
+        return (
+            f"Candidates: each whole second of a motor vehicle that is recorded for "
+            f"{self.horizon_s:g} s more, moves {STILL_M:g} m or more in these, and is on a lane, "
+            f"in scenes without traffic lights; two of one vehicle are {APART_S:g} s apart. One is "
+            "decisive if a road user whom the ego does not see (no line from its centre to the "
+            "other's centre or corners is free of buildings, cars, vans and trucks), at most "
+            f"{self.window_m:g} m away, comes into conflict with it in these {self.horizon_s:g} s: "
+            f"by their recorded paths, one is where the other was at most {self.gap_s:g} s before. "
+            "Who follows the other, driving in its direction over the place where it is now, is in "
+            "no conflict, unless the ego follows so near and the other slows down by "
+            f"{HARD_MPS2:g} m/s within a second. As many with such a conflict are drawn as "
+            f"without, by digest{most}. {dealt}"
+        )
+
+    def _without(self, rows: Ints, falls: Bools, reason: str) -> Ints:
+        """Return the candidates that do not fall for a reason, and count those that do."""
+        self.left_out[reason] += int(falls.sum())
+        return rows[~falls]
+
+    def _apart(self, fit: Sequence[_Fit]) -> list[_Fit]:
+        """Return candidates of which no two of a vehicle are nearer than `APART_S`.
+
+        Decisive ones go first, and then the draw decides.
+        """
+        order = sorted(fit, key=lambda each: (each.moment.hidden is None, each.draw))
+        times: dict[str, list[float]] = {}
+        apart = []
+        for candidate in order:
+            time_s = candidate.moment.time_s
+            of_vehicle = times.setdefault(candidate.moment.vehicle, [])
+            if all(abs(time_s - other) >= APART_S for other in of_vehicle):
+                of_vehicle.append(time_s)
+                apart.append(candidate)
+        self.left_out[NEAR] += len(fit) - len(apart)
+        return apart
+
+    def _drawn(self, dealt: Sequence[_Fit]) -> list[_Fit]:
+        """Return as many candidates with a hidden conflict as without, in turn, as drawn."""
+        order = sorted(dealt, key=lambda each: each.draw)
+        decisive = [each for each in order if each.moment.hidden is not None]
+        others = [each for each in order if each.moment.hidden is None]
+        drawn: list[_Fit] = []
+        for pair in zip(decisive, others, strict=False):
+            drawn += pair
+        return drawn[: self.most]
+
+
+def part_of(time_s: float, span_s: tuple[float, float], horizon_s: float) -> str | None:
+    """Return the purpose of a moment of a scene that is cut by time; None between two parts.
+
+    `span_s` is the scene's begin and end. Parts are of one length, and a horizon lies between the
+    last moment of one and the first of the next. A scene too short for that is for reports alone.
+    """
+    begin_s, end_s = span_s
+    # no moment is later than a horizon before the end
+    length_s = (end_s - begin_s - len(FIRST) * horizon_s) / len(FIRST)
+    if length_s <= 0:
+        return list(FIRST)[-1]
+    place = int((time_s - begin_s) // (length_s + horizon_s))
+    within_s = time_s - begin_s - place * (length_s + horizon_s)
+    return list(FIRST)[place] if within_s < length_s and place < len(FIRST) else None
+
+
+def _digest(*texts: str) -> str:
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """All tracks of a scene at frames, `MOMENTS_HZ` a second, one track after the other: P rows.
+
+    Frames are counted from second 0 of the scene's clock. Tracks are in the order of their ids.
+    """
+
+    tracks: Sequence[Track]
+    first: Ints  # each track's first frame, (N,)
+    last: Ints  # and its last
+    start: Ints  # row of its first frame
+    track: Ints  # of each row, the place of its track, (P,)
+    frame: Ints  # and its frame
+    poses: Floats  # x_m, y_m, heading_rad, speed_mps, (P, 4)
+
+    @classmethod
+    def of(cls, scene: Scene) -> "_Frames":
+        tracks, first, last, parts = list[Track](), list[int](), list[int](), list[Floats]()
+        for key in sorted(scene.tracks):
+            track = scene.tracks[key]
+            begin = math.ceil(track.begin_s * MOMENTS_HZ - 1e-6)
+            end = math.floor(track.end_s * MOMENTS_HZ + 1e-6)
+            if begin > end:
+                continue
+            times_s = np.arange(begin, end + 1) / MOMENTS_HZ
+            unwrapped = np.array(track.poses)
+            unwrapped[:, 2] = np.unwrap(unwrapped[:, 2])
+            columns = [np.interp(times_s, track.time_s, column) for column in unwrapped.T]
+            tracks.append(track)
+            first.append(begin)
+            last.append(end)
+            parts.append(np.stack(columns, axis=-1))
+        counts = np.array([len(part) for part in parts], dtype=np.int64)
+        start = np.cumsum(counts) - counts
+        place = np.repeat(np.arange(len(tracks)), counts)
+        begins = np.array(first, dtype=np.int64)
+        frame = np.arange(int(counts.sum())) - start[place] + begins[place]
+        poses = np.concatenate(parts) if parts else np.empty((0, 4))
+        return cls(tracks, begins, np.array(last, dtype=np.int64), start, place, frame, poses)
+
+    @cached_property
+    def sizes_m(self) -> Floats:
+        """Return each track's length and width, (N, 2)."""
+        sizes = [(track.length_m, track.width_m) for track in self.tracks]
+        return np.array(sizes, dtype=float).reshape(-1, 2)
+
+    def rows(self, track: Ints, frame: Ints) -> Ints:
+        """Return the rows of tracks at frames; of a track that is gone, its last."""
+        return self.start[track] + np.minimum(frame, self.last[track]) - self.first[track]
+
+    def leaves(self, rows: Ints, horizon: int) -> Bools:
+        """Return whether the tracks of rows end before so many more frames."""
+        return np.asarray(self.frame[rows] + horizon > self.last[self.track[rows]])
+
+    def stands(self, rows: Ints, horizon: int) -> Bools:
+        """Return whether the tracks of rows get no farther than `STILL_M` in so many frames."""
+        farthest_m = np.zeros(len(rows))
+        for later in range(EVERY, horizon + EVERY, EVERY):
+            there = rows + min(later, horizon)
+            way = self.poses[there, :2] - self.poses[rows, :2]
+            farthest_m = np.maximum(farthest_m, np.hypot(way[:, 0], way[:, 1]))
+        return farthest_m < STILL_M
+
+    def brakings(self, track: int) -> Ints:
+        """Return the frames at which a track begins to slow down by `HARD_MPS2` in a second."""
+        start, count = self.start[track], self.last[track] - self.first[track] + 1
+        speeds = self.poses[start : start + count, 3]
+        drops = speeds[:-MOMENTS_HZ] - speeds[MOMENTS_HZ:]
+        return np.asarray(np.flatnonzero(drops >= HARD_MPS2) + self.first[track])
+
+
+def _on_lane(scene: Scene, poses: Floats) -> Bools:
+    """Return whether vehicles (n, >=3) are on a lane and drive in its direction, (n,)."""
+    lanes = list(scene.lanes.values())
+    lines = np.array([shapely.LineString(lane.points) for lane in lanes])
+    half_m = np.array([lane.width_m / 2 for lane in lanes])
+    points = shapely.points(poses[:, :2])
+    which, lane = shapely.STRtree(lines).query(points, "dwithin", float(half_m.max(initial=0.0)))
+    near = shapely.distance(points[which], lines[lane]) <= half_m[lane]
+    which, lane = which[near], lane[near]
+    along_m = shapely.line_locate_point(lines[lane], points[which])
+    # a negative place would be counted from the end
+    before_m = np.maximum(along_m - 0.5, 0.0)
+    behind = shapely.get_coordinates(shapely.line_interpolate_point(lines[lane], before_m))
+    ahead = shapely.get_coordinates(shapely.line_interpolate_point(lines[lane], along_m + 0.5))
+    way = ahead - behind
+    turned = _turn_rad(np.arctan2(way[:, 1], way[:, 0]), poses[which, 2])
+    on_lane = np.zeros(len(poses), dtype=bool)
+    on_lane[which[turned < ALIKE_RAD]] = True
+    return on_lane
+
+
+def _turn_rad(one: Floats, other: Floats) -> Floats:
+    """Return the angle between headings, from 0 to pi."""
+    return np.asarray(np.abs((one - other + np.pi) % (2 * np.pi) - np.pi))
+
+
+Pairs = dict[tuple[int, int], tuple[Ints, Ints]]
+
+
+def _encroachments(frames: _Frames, gap: int) -> Pairs:
+    """Return where one track is where another was at most `gap` frames before.
+
+    The key is the first and the second track. The value is each frame at which the first was there,
+    rising, and the earliest frame at which the second is where the first was then or later.
+    """
+    from scipy.spatial import KDTree
+
+    order = np.argsort(frames.frame, kind="stable")
+    by_frame = frames.frame[order]
+    reach_m = np.hypot(frames.sizes_m[:, 0], frames.sizes_m[:, 1]) / 2
+    radius_m = 2 * float(reach_m.max(initial=0.0))
+    layer_m = radius_m + 1  # in the third axis: only rows of one layer meet
+    parts: list[Ints] = []
+    for begin in range(int(by_frame[0]), int(by_frame[-1]) + 1, BLOCK):
+        ends = np.searchsorted(by_frame, (begin, begin + BLOCK, begin + BLOCK + gap))
+        block, later = order[ends[0] : ends[1]], order[ends[0] : ends[2]]
+        tree = KDTree(_layers(frames, block, 0, layer_m))
+        for lag in range(gap + 1):
+            seconds = KDTree(_layers(frames, later, lag, layer_m))
+            near = tree.sparse_distance_matrix(seconds, radius_m, output_type="ndarray")
+            first, second = block[near["i"]], later[near["j"]]
+            one, other = frames.track[first], frames.track[second]
+            may = (one < other) if lag == 0 else (one != other)
+            may &= near["v"] <= reach_m[one] + reach_m[other]
+            first, second, one, other = first[may], second[may], one[may], other[may]
+            apart_m = separation_m(
+                frames.poses[first, :3],
+                frames.sizes_m[one],
+                frames.poses[second, :3],
+                frames.sizes_m[other],
+            )
+            meet = apart_m <= 0
+            here, there = frames.frame[first[meet]], frames.frame[second[meet]]
+            parts.append(np.stack([one[meet], other[meet], here, there], axis=-1))
+    return dict(_by_pair(np.concatenate(parts)))
+
+
+def _layers(frames: _Frames, rows: Ints, lag: int, layer_m: float) -> Floats:
+    """Return positions of rows, (n, 3), those of a frame in the layer of `lag` frames before."""
+    layer = (frames.frame[rows] - lag) * layer_m
+    return np.column_stack([frames.poses[rows, :2], layer])
+
+
+def _by_pair(events: Ints) -> Iterator[tuple[tuple[int, int], tuple[Ints, Ints]]]:
+    """Yield the entries of `_encroachments` from rows of first, second and both their frames."""
+    if not len(events):
+        return
+    events = events[np.lexsort(events.T[::-1])]
+    changes = np.flatnonzero((np.diff(events[:, :2], axis=0) != 0).any(axis=1)) + 1
+    for part in np.split(events, changes):
+        earliest = np.minimum.accumulate(part[::-1, 3])[::-1]
+        yield (int(part[0, 0]), int(part[0, 1])), (part[:, 2], earliest)
+
+
+@dataclass(frozen=True)
+class _Meetings:
+    """Conflicts, n of them: of candidates with others, by what is recorded."""
+
+    row: Ints  # row of the candidate, (n,)
+    other: Ints  # track of the other, (n,)
+    arrival: Ints  # frame at which the second of both comes to a place where the first was, (n,)
+
+    def those(self, which: Bools) -> "_Meetings":
+        return _Meetings(self.row[which], self.other[which], self.arrival[which])
+
+
+def _hidden_conflicts(
+    scene: Scene, frames: _Frames, rows: Ints, window_m: float, horizon: int, gap: int
+) -> dict[int, tuple[str, float]]:
+    """Return for rows that are decisive who is hidden, and after how many seconds both meet.
+
+    Of several the first to meet is taken.
+    """
+    if not len(rows):
+        return {}
+    meetings = _conflicts(frames, rows, window_m, horizon, gap)
+    meetings = meetings.those(~_visible(scene, frames, meetings))
+    first_of: dict[int, tuple[str, float]] = {}
+    for place in np.lexsort((meetings.other, meetings.arrival)).tolist():
+        row = int(meetings.row[place])
+        wait_s = float((meetings.arrival[place] - frames.frame[row]) / MOMENTS_HZ)
+        first_of.setdefault(row, (frames.tracks[int(meetings.other[place])].id, wait_s))
+    return first_of
+
+
+def _conflicts(frames: _Frames, rows: Ints, window_m: float, horizon: int, gap: int) -> _Meetings:
+    """Return all conflicts of candidates within so many frames, of which none only follows."""
+    pairs = _encroachments(frames, gap)
+    of_track: dict[int, Ints] = {}
+    for track in np.unique(frames.track[rows]).tolist():
+        of_track[track] = rows[frames.track[rows] == track]
+    nobody = np.empty(0, dtype=np.int64)
+    parts: list[Ints] = []
+    for (first, second), (frame, arrival) in pairs.items():
+        for ego, other in ((first, second), (second, first)):
+            ego_rows = of_track.get(ego, nobody)
+            now = frames.frame[ego_rows]
+            meets = np.append(arrival, NEVER)[np.searchsorted(frame, now)]
+            counts = (frames.first[other] <= now) & (now <= frames.last[other])
+            counts &= meets <= now + horizon
+            rows_here = ego_rows[counts]
+            columns = [np.full(len(rows_here), track) for track in (other, first, second)]
+            parts.append(np.stack([rows_here, *columns, meets[counts]], axis=-1))
+    if not parts:
+        return _Meetings(nobody, nobody, nobody)
+    triples = np.concatenate(parts)
+    their_rows = frames.rows(triples[:, 1], frames.frame[triples[:, 0]])
+    way = frames.poses[triples[:, 0], :2] - frames.poses[their_rows, :2]
+    triples = triples[np.hypot(way[:, 0], way[:, 1]) <= window_m]
+    follows = np.zeros(len(triples), dtype=bool)
+    for start in range(0, len(triples), TRIPLES):
+        part = triples[start : start + TRIPLES]
+        follows[start : start + TRIPLES] = _follows(frames, part, horizon)
+    for number in np.flatnonzero(follows).tolist():
+        meets_later = _meets_braking(frames, pairs, triples[number], horizon)
+        if meets_later is not None:
+            triples[number, 4] = meets_later
+            follows[number] = False
+    triples = triples[~follows]
+    return _Meetings(triples[:, 0], triples[:, 1], triples[:, 4])
+
+
+def _follows(frames: _Frames, triples: Ints, horizon: int) -> Bools:
+    """Return whether the second of both drives over the place where the first is now, (n,).
+
+    It counts if both drive in one direction there. `triples` have the candidate's row, the other's
+    track, and the first's and the second's track, (n, >=4).
+    """
+    now = frames.frame[triples[:, 0]]
+    first, second = triples[:, 2], triples[:, 3]
+    leader = np.repeat(frames.poses[frames.rows(first, now), :3], horizon + 1, axis=0)
+    later = now[:, None] + np.arange(horizon + 1)
+    rows = frames.rows(np.repeat(second, horizon + 1), later.ravel())
+    follower = frames.poses[rows, :3]
+    apart_m = separation_m(
+        leader,
+        np.repeat(frames.sizes_m[first], horizon + 1, axis=0),
+        follower,
+        np.repeat(frames.sizes_m[second], horizon + 1, axis=0),
+    )
+    over = (apart_m <= 0) & (_turn_rad(leader[:, 2], follower[:, 2]) < ALIKE_RAD)
+    return np.asarray(over.reshape(len(triples), -1).any(axis=1))
+
+
+def _meets_braking(frames: _Frames, pairs: Pairs, triple: Ints, horizon: int) -> int | None:
+    """Return when somebody whom the ego follows begins to brake hard; None if not in time.
+
+    The ego must be near behind in the second before: as near as in a conflict.
+    """
+    row, other, first, second, _ = triple.tolist()
+    if other != first:
+        return None
+    now = int(frames.frame[row])
+    frame, _ = pairs[first, second]
+    for braking in frames.brakings(other).tolist():
+        if now <= braking <= now + horizon - MOMENTS_HZ:
+            near = (max(now, braking - MOMENTS_HZ) <= frame) & (frame <= braking)
+            if near.any():
+                return int(braking)
+    return None
+
+
+def _visible(scene: Scene, frames: _Frames, meetings: _Meetings) -> Bools:
+    """Return whether the ego of each conflict sees the other at its beginning, (n,).
+
+    It sees it if a straight line from its centre to the other's centre or one of its corners meets
+    no building, and no vehicle of `OPAQUE` kinds beside both.
+    """
+    visible = np.zeros(len(meetings.row), dtype=bool)
+    if not len(visible):
+        return visible
+    houses = [shapely.make_valid(shapely.Polygon(house.outline)) for house in scene.houses]
+    walls = shapely.STRtree(houses)
+    is_opaque = np.array([track.kind in OPAQUE for track in frames.tracks])
+    now = frames.frame[meetings.row]
+    for frame in np.unique(now).tolist():
+        here = np.flatnonzero(now == frame)
+        there = (frames.first <= frame) & (frame <= frames.last) & is_opaque
+        blockers = np.flatnonzero(there)
+        rows = frames.rows(blockers, np.full(len(blockers), frame))
+        outlines = shapely.polygons(_corners(frames.poses[rows], frames.sizes_m[blockers]))
+        egos, others = frames.track[meetings.row[here]], meetings.other[here]
+        target = frames.poses[frames.rows(others, np.full(len(others), frame))]
+        corners = _corners(target, frames.sizes_m[others])
+        ends = np.concatenate([target[:, None, :2], corners], axis=1)
+        starts = np.broadcast_to(frames.poses[meetings.row[here], None, :2], ends.shape)
+        lines = shapely.linestrings(np.stack([starts, ends], axis=2).reshape(-1, 2, 2))
+        blocked = np.zeros(len(lines), dtype=bool)
+        blocked[walls.query(lines, "intersects")[0]] = True
+        line, blocker = shapely.STRtree(outlines).query(lines, "intersects")
+        of_line, who = line // ends.shape[1], blockers[blocker]
+        blocked[line[(who != egos[of_line]) & (who != others[of_line])]] = True
+        visible[here] = ~blocked.reshape(len(here), -1).all(axis=1)
+    return visible
+
+
+def _corners(poses: Floats, sizes_m: Floats) -> Floats:
+    """Return the corners of outlines, (n, 4, 2) m, of poses (n, >=3) and sizes (n, 2)."""
+    half = sizes_m[:, None, :] / 2 * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+    cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+    x_m = poses[:, 0, None] + half[..., 0] * cos - half[..., 1] * sin
+    y_m = poses[:, 1, None] + half[..., 0] * sin + half[..., 1] * cos
+    return np.stack([x_m, y_m], axis=-1)

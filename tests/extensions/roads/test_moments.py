@@ -1,0 +1,244 @@
+"""Moments of recorded traffic: what is decisive, what falls and why, and that no order matters."""
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from harness.core.arrays import Floats
+from harness.extensions.roads.moments import (
+    GAP,
+    LEAVES,
+    LIGHTS,
+    NEAR,
+    NO_CONFLICT,
+    NOT_REACHED,
+    OFF_LANE,
+    STILL,
+    TWICE,
+    Choice,
+    choose,
+    part_of,
+)
+from harness.extensions.roads.tables import House, Lane, Scene, Track, checked
+
+HORIZON_S = 6.0
+EAST, NORTH = 0.0, np.pi / 2
+HOUSE = House("h", np.array([[-35.0, -35.0], [-6.0, -35.0], [-6.0, -6.0], [-35.0, -6.0]]))
+ANY = object()
+
+
+def driven(
+    key: str,
+    begin: tuple[float, float],
+    heading: float,
+    speeds_mps: Floats,
+    **changed: Any,
+) -> Track:
+    """Return a car that drives straight on from a place, with a speed each tenth of a second."""
+    way_m = np.concatenate([[0.0], np.cumsum((speeds_mps[1:] + speeds_mps[:-1]) / 20)])
+    x_m, y_m = begin[0] + way_m * np.cos(heading), begin[1] + way_m * np.sin(heading)
+    poses = np.stack([x_m, y_m, np.full(len(way_m), heading), speeds_mps], axis=-1)
+    times_s = np.arange(len(way_m)) / 10
+    return replace(Track(key, "car", 5.0, 2.0, times_s, poses), **changed)
+
+
+def steady(key: str, begin: tuple[float, float], heading: float, **changed: Any) -> Track:
+    """Return a car that drives at 10 m/s for 14 s."""
+    return driven(key, begin, heading, np.full(141, 10.0), **changed)
+
+
+def crossing(*tracks: Track, **changed: Any) -> Scene:
+    """Return a crossing of a lane to the east and one to the north, both through 0, 0."""
+    ends = np.array([-300.0, 300.0])
+    lanes = {
+        "east": Lane("east", np.stack([ends, 0 * ends], axis=-1), 4.0, None, (), None, None),
+        "north": Lane("north", np.stack([0 * ends, ends], axis=-1), 4.0, None, (), None, None),
+    }
+    by_id = {track.id: track for track in tracks}
+    scene = replace(Scene("s", "s.xml", "0" * 64, 0.1, False, by_id, lanes), **changed)
+    checked(scene)
+    return scene
+
+
+def of(*scenes: Scene, **changed: Any) -> Choice:
+    choice = choose(scenes, 80.0, HORIZON_S, **changed)
+    assert choice.candidates == len(choice.moments) + sum(choice.left_out.values())
+    assert [m.hidden is not None for m in choice.moments] == [
+        True, False] * (len(choice.moments) // 2)  # fmt: skip
+    return choice
+
+
+def decisive(choice: Choice) -> set[tuple[str, str | None]]:
+    return {(m.vehicle, m.hidden) for m in choice.moments if m.hidden is not None}
+
+
+# One crosses half a second after the other has left the place.
+EGO, OTHER = steady("e", (-40.0, 0.0), EAST), steady("o", (0.0, -52.0), NORTH)
+PLATOON = {"e": (-60.0, 0.0), "t": (-50.0, 0.0), "o": (-41.0, 0.0)}
+
+
+def platoon(braking_mps: float) -> list[Track]:
+    """Return a car, a truck and a car that follow each other; after 4 s all slow down in 1 s."""
+    speeds = np.interp(np.arange(141) / 10, [4.0, 5.0], [10.0, 10.0 - braking_mps])
+    tracks = [driven(key, begin, EAST, speeds) for key, begin in PLATOON.items()]
+    return [replace(t, kind="truck", length_m=8.0, width_m=2.5) if t.id == "t" else t
+            for t in tracks]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("scene", "expected"),
+    [
+        (crossing(EGO, OTHER, houses=(HOUSE,)), {("e", "o"), ("o", "e")}),
+        (crossing(EGO, OTHER), set()),
+        # Three seconds later is no conflict.
+        (crossing(EGO, steady("o", (0.0, -75.0), NORTH), houses=(HOUSE,)), set()),
+        # A truck that stands beside the lane hides as a house does; a bicycle does not.
+        (
+            crossing(
+                EGO,
+                OTHER,
+                driven("t", (-14.0, -7.0), NORTH, np.zeros(141), kind="truck", length_m=18.0),
+                driven("u", (-14.0, -25.0), NORTH, np.zeros(141), kind="truck", length_m=18.0),
+                driven("v", (-14.0, -43.0), NORTH, np.zeros(141), kind="truck", length_m=18.0),
+            ),
+            {("e", "o"), ("o", "e")},
+        ),
+        (crossing(*platoon(0.0)), set()),
+        (crossing(*platoon(5.0)), {("e", "o")}),
+        (crossing(*platoon(3.0)), set()),
+    ],
+    ids=["house", "seen", "later", "truck", "follows", "brakes", "slows"],
+)
+def test_a_moment_is_decisive_if_who_is_hidden_comes_into_conflict(
+    scene: Scene, expected: set[tuple[str, str]]
+) -> None:
+    choice = of(scene)
+    assert decisive(choice) == expected
+    for moment in choice.moments:
+        assert (moment.hidden is None) == (moment.conflict_s is None)
+        assert moment.purpose == "report", "14 s are too short to be cut in three"
+    if expected == {("e", "o"), ("o", "e")}:
+        # o is where e was (its front reaches the lane at 5.2 - .35 s) for the first time then
+        for moment in choice.moments:
+            if moment.conflict_s is not None:
+                assert moment.time_s + moment.conflict_s == pytest.approx(4.9, abs=0.11)
+
+
+def test_each_candidate_that_falls_has_its_reason() -> None:
+    still = driven("p", (150.0, 0.0), EAST, np.zeros(141))
+    beside = steady("b", (-60.0, 30.0), EAST)
+    against = steady("w", (280.0, 0.0), np.pi)
+    person = driven("f", (5.0, 5.0), EAST, np.full(141, 1.0), kind="pedestrian",
+                    length_m=0.5, width_m=0.5)  # fmt: skip
+    scene = crossing(EGO, still, beside, person)
+    choice = of(scene)
+    # Each of three vehicles is there at 15 whole seconds, and has 6 s more at nine of them.
+    assert choice.candidates == 45
+    nine = {LEAVES: 18, STILL: 9, OFF_LANE: 9, NEAR: 7, NO_CONFLICT: 2}
+    assert choice.left_out == nine
+    assert choice.moments == ()
+    assert of(crossing(against)).left_out == {LEAVES: 6, OFF_LANE: 9}
+    assert of(replace(scene, lights=True)).left_out == {LIGHTS: 45}
+    lost = of(scene, unfit=lambda scene, moment: NOT_REACHED if moment.time_s > 3 else None)
+    assert lost.left_out[NOT_REACHED] + lost.left_out[NO_CONFLICT] == 2
+    assert lost.record["left_out"] == lost.left_out
+    assert "no building" not in lost.rule
+    assert "6 s more" in lost.rule
+    alone = of(crossing(person))
+    assert (alone.candidates, alone.moments, alone.left_out) == (0, (), {})
+    brief = replace(EGO, time_s=EGO.time_s[:2] / 3 + 0.01, poses=EGO.poses[:2])
+    assert of(crossing(brief)).candidates == 0
+
+
+def long(name: str, sha256: str, times: int = 10) -> Scene:
+    """Return a crossing of a hundred seconds, with a pair of cars every ten."""
+    tracks = []
+    for n in range(times):
+        for car in (replace(EGO, id=f"e{n}"), replace(OTHER, id=f"o{n}")):
+            tracks.append(replace(car, time_s=car.time_s + 10.0 * n))
+    return crossing(*tracks, houses=(HOUSE,), name=name, sha256=sha256 * 64)
+
+
+def test_scenes_are_dealt_whole_and_few_are_cut_by_time() -> None:
+    scenes = [long(name, digit) for name, digit in zip("abcdef", "123456", strict=True)]
+    choice = of(*scenes)
+    purposes = {(m.scene, m.purpose) for m in choice.moments}
+    assert len(purposes) == 6
+    assert sorted(purpose for _, purpose in purposes) == sorted(["tune", "train", "report"] * 2)
+    assert "none is in two" in choice.rule
+    alone = of(scenes[0])
+    twice = of(replace(scenes[0], name="copy"), scenes[0], replace(scenes[0], name="z"))
+    assert twice.moments == alone.moments, "one content under several names is one scene"
+    assert twice.left_out[TWICE] == 2 * (alone.candidates - alone.left_out[LEAVES]
+                                         - alone.left_out[NEAR])  # fmt: skip
+    quiet = replace(scenes[1], houses=())
+    assert of(scenes[0], quiet, replace(quiet, name="q", sha256="9" * 64)).moments == alone.moments
+    assert alone.left_out[GAP] > 0
+    times: dict[str, list[float]] = {"tune": [], "train": [], "report": []}
+    for moment in alone.moments:
+        times[moment.purpose].append(moment.time_s)
+    assert all(times.values())
+    assert max(times["tune"]) + HORIZON_S <= min(times["train"])
+    assert max(times["train"]) + HORIZON_S <= min(times["report"])
+    few = of(scenes[0], most=2)
+    assert {p: sum(m.purpose == p for m in few.moments) for p in times} == dict.fromkeys(times, 2)
+    assert [m for m in alone.moments if m.purpose == "tune"][:2] == list(few.moments[:2])
+
+
+@given(st.floats(0, 100), st.floats(0, 100), st.floats(1, 10))
+def test_no_second_of_a_scene_is_in_two_parts(one_s: float, other_s: float, horizon: float) -> None:
+    first, second = (part_of(time_s, (0.0, 100.0), horizon) for time_s in (one_s, other_s))
+    if first and second and first != second:
+        assert abs(one_s - other_s) >= horizon - 1e-6
+    assert part_of(one_s, (0.0, 3 * horizon), horizon) == "report"
+
+
+@pytest.mark.slow
+@settings(max_examples=4, deadline=None)
+@given(st.data())
+def test_no_order_of_scenes_or_tracks_and_no_name_of_a_scene_moves_the_choice(
+    data: st.DataObject,
+) -> None:
+    scenes = [long(name, digit, 3) for name, digit in zip("abcd", "1234", strict=True)]
+    shuffled = []
+    for scene in data.draw(st.permutations(scenes)):
+        ids = data.draw(st.permutations(list(scene.tracks)))
+        tracks = {key: scene.tracks[key] for key in ids}
+        shuffled.append(
+            replace(scene, tracks=tracks, lanes=dict(reversed(list(scene.lanes.items()))))
+        )
+    assert of(*shuffled) == of(*scenes)
+
+
+def crowd(cars: int, seconds: int) -> Scene:
+    """Return six lanes of cars that change them, as on US-101."""
+    draws = np.random.default_rng(0)
+    xs = np.array([-100.0, 8000.0])
+    lanes = {}
+    for n in range(6):
+        points = np.stack([xs, np.full(2, 3.7 * n)], axis=-1)
+        lanes[str(n)] = Lane(str(n), points, 3.7, None, (), None, None)
+    times_s = np.arange(10 * seconds + 1) / 10
+    tracks = {}
+    for n, lane in zip(range(cars), itertools.cycle(range(6)), strict=False):
+        x_m = 19.0 * (n // 6) + draws.uniform(0, 8) + 12 * times_s
+        x_m = x_m + draws.uniform(0, 3) * np.sin(times_s / 7)
+        change = np.clip((times_s - draws.uniform(5, seconds)) / 4, 0, 1) * (draws.random() < 0.2)
+        y_m = 3.7 * (lane + change * (1 if lane < 5 else -1))
+        heading = np.arctan2(np.gradient(y_m, times_s), np.gradient(x_m, times_s))
+        speed = np.gradient(x_m, times_s)
+        poses = np.stack([x_m, y_m, heading, speed], axis=-1)
+        tracks[f"c{n}"] = Track(f"c{n}", "car", 4.6, 1.9, times_s, poses)
+    return Scene("us", "us.xml", "7" * 64, 0.1, False, tracks, lanes)
+
+
+@pytest.mark.slow
+def test_a_highway_of_a_hundred_cars_takes_seconds() -> None:
+    choice = of(crowd(100, 30))
+    assert choice.candidates == 3100
+    assert all(moment.hidden != moment.vehicle for moment in choice.moments)
