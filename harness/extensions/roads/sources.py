@@ -14,7 +14,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, one_line, printable
 from harness.core.files import MOST_TIMES, opened
-from harness.extensions.roads.tables import FASTEST_MPS, LONGEST_ID, Track
+from harness.extensions.roads.tables import FASTEST_MPS, LONGEST_ID, STILL_M, Track
 
 GZIP = b"\x1f\x8b"
 CHUNK = 1 << 18
@@ -189,7 +189,7 @@ def tracks_of(
     poses: Floats,
     step_s: float,
 ) -> Iterator[Track]:
-    """Yield one road user's tracks: more than one where nothing is known of it for a while.
+    """Yield one road user's tracks: more than one where it moved and nothing is known of it.
 
     `size_m` is its length and width, `poses` (n, 4) are those of `Track`, whose heading or speed
     may be NaN: then they are those of its movement. A later part of it has its id with a tilde and
@@ -197,9 +197,8 @@ def tracks_of(
     """
     gaps = np.diff(time_s)
     jumps_m = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    is_apart = (gaps > max(2.5 * step_s, LONGEST_GAP_S)) | (
-        jumps_m > FASTEST_MPS * gaps.clip(0) + 5
-    )
+    is_long = (gaps > max(2.5 * step_s, LONGEST_GAP_S)) & (jumps_m > STILL_M)
+    is_apart = is_long | (jumps_m > FASTEST_MPS * gaps.clip(0) + 5)
     starts = [0, *(np.flatnonzero(is_apart) + 1).tolist(), len(time_s)]
     for part in range(len(starts) - 1):
         rows = slice(starts[part], starts[part + 1])

@@ -138,6 +138,8 @@ def test_who_is_gone_for_a_while_is_another_one_after_it() -> None:
     poses = np.stack([10 * times, 0 * times, np.full(6, np.nan), np.full(6, np.nan)], axis=1)
     parts = list(sources.tracks_of("a", "car", (5, 2), times, poses, 1.0))
     assert [(part.id, part.begin_s, part.end_s) for part in parts] == [("a", 0, 2), ("a~2", 9, 11)]
+    poses[:] = 7
+    assert len(list(sources.tracks_of("a", "car", (5, 2), times, poses, 1.0))) == 1  # it stood
     stands = np.array([[0, 0], [1, 1], [1, 1], [1, 1]])
     poses = np.column_stack([stands, np.full((4, 2), np.nan)])
     assert close(sources.moving(np.arange(4.0), poses)[:, 2], *[np.pi / 4] * 4)
