@@ -3,8 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -341,15 +339,12 @@ def _chosen(
     recording: "Recording", progress: Progress
 ) -> "tuple[Sequence[Moment], Mapping[str, Any]]":
     """Return the moments of a recording, and how they were chosen."""
-    place = "harness.extensions.roads.moments"
-    if not find_spec(place):
-        return (), {"rule": "none", "candidates": 0, "left_out": {}}
     from harness.extensions.environments.place import AFTER
+    from harness.extensions.roads.moments import choose
 
     facts = recording.facts
     horizon_s = (facts.decisions + AFTER) * facts.period_s
-    scenes = _counted(recording.scenes(), progress)
-    choice = import_module(place).choose(scenes, recording.window_m, horizon_s)
+    choice = choose(_counted(recording.scenes(), progress), recording.window_m, horizon_s)
     return choice.moments, {**choice.record, "horizon_s": horizon_s}
 
 
@@ -414,6 +409,7 @@ def _echo(recording: "Recording", taken: _Taken, show: Path | None) -> None:
     """Print what was imported, and what to type next."""
     from harness.cli.next_command import echo_next
     from harness.cli.terminal import echo_text
+    from harness.core.seeds import FIRST
 
     facts = recording.facts
     scenes = amount(len(facts.scenes), "scene")
@@ -440,8 +436,11 @@ def _echo(recording: "Recording", taken: _Taken, show: Path | None) -> None:
     if show:
         echo_text(f"drew {printable(show)}")
     if facts.moments:
+        purposes = Counter(moment.purpose for moment in facts.moments)
+        purpose = max(FIRST, key=lambda each: (purposes[each] > 0, FIRST[each]))
+        layouts = "--episodes", purposes[purpose], "--seed", FIRST[purpose]
         dataset = Path(f"{recording.folder}-dataset")
-        echo_next("dataset", "build", "--recording", recording.folder, "--out", dataset)
+        echo_next("dataset", "build", "--recording", recording.folder, *layouts, "--out", dataset)
 
 
 def _echo_moments(recording: "Recording") -> None:

@@ -21,7 +21,7 @@ from msgspec import Meta
 
 from harness.core.arrays import Floats, Ints
 from harness.core.config import between, convert, json_loads
-from harness.core.errors import UserError, one_line, printable
+from harness.core.errors import UserError, one_line, printable, unknown
 from harness.core.files import (
     BROKEN,
     bytes_of,
@@ -32,6 +32,7 @@ from harness.core.files import (
     sha256_file,
     write_whole,
 )
+from harness.core.seeds import FIRST
 from harness.world.state import separation_m
 
 FORMAT: Literal["swarmdrive-recording/1"] = "swarmdrive-recording/1"
@@ -157,7 +158,7 @@ class Moment(msgspec.Struct, frozen=True):
     time_s: float
     hidden: Name | None  # id of the road user in conflict whom the ego cannot see; None for none
     conflict_s: float | None  # time from here until the two would be at one place
-    purpose: Annotated[str, Meta(max_length=40)]  # of its layout's seed, such as `report`
+    purpose: Annotated[str, Meta(max_length=40)]  # of its layout's seed, one of `FIRST`
 
 
 class SceneFacts(msgspec.Struct, frozen=True):
@@ -465,6 +466,8 @@ def _check_facts(facts: Facts, where: str) -> None:
     if len(scenes) < len(facts.scenes):
         raise UserError(f"{where}: two scenes have one name; make the recording again")
     for moment in facts.moments:
+        if moment.purpose not in FIRST:
+            raise unknown(f"purpose of a moment in {where}", moment.purpose, FIRST)
         scene = scenes.get(moment.scene)
         if scene is None or not scene.begin_s <= moment.time_s <= scene.end_s:
             raise UserError(

@@ -79,6 +79,27 @@ def test_a_folder_of_files_is_a_recording(harness: Callable[..., Said], source: 
     assert "--out mine is there already" in err
 
 
+STREET = Path(__file__).parent / "street"
+
+
+def test_a_street_whose_moments_are_known(harness: Callable[..., Said]) -> None:
+    """Every 10 s a car from the south is 1.6 s, then 5 s before one from the west, behind a house.
+
+    Where it is 1.6 s each of the two is hidden from the other, and in conflict with it.
+    """
+    code, out, err = harness("dataset", "import", STREET, "--out", "my", "--licence", "CC0-1.0")
+    assert (code, err) == (0, "")
+    assert "wrote my: 1 scene of 3.0 minutes, 38 road users, 4 lanes" in out
+    assert "32 cars, 4 vans, 1 truck, 1 pedestrian; 1 of them never move" in out
+    assert len(out.splitlines()) <= 15
+    assert out.splitlines()[-2].startswith("next: harness dataset build --recording my --episodes")
+    recording = tables.read(Path("my"))
+    conflicts = [{moment.vehicle, moment.hidden} for moment in recording.moments if moment.hidden]
+    assert all(pair in [{f"east{k}", f"north{k}"} for k in range(0, 16, 2)] for pair in conflicts)
+    assert len(conflicts) == len(recording.moments) / 2 > 0
+    assert recording.choice["horizon_s"] == 6
+
+
 @pytest.mark.slow
 def test_a_table_with_its_map_and_a_picture(harness: Callable[..., Said], source: Path) -> None:
     given = [source / name for name in ("tracks.csv", "lanes.csv", "houses.csv")]

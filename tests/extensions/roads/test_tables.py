@@ -171,6 +171,10 @@ EDITS = {
         '"moments":[',
         '"moments":[{"scene":"nowhere","vehicle":"a","time_s":0,"hidden":null,"conflict_s":null,"purpose":"report"}',
     ),
+    "unknown purpose of a moment": (
+        '"moments":[',
+        '"moments":[{"scene":"s","vehicle":"a","time_s":0,"hidden":null,"conflict_s":null,"purpose":"mine"}',
+    ),
     "speeds_mps do not rise": ('"speeds_mps":[0.0', '"speeds_mps":[9.0'),
     "scene s states 9 tracks": ('"tracks":2', '"tracks":9'),
 }
