@@ -22,6 +22,7 @@ from harness.core.statistics import (
     resampled,
     resampled_estimate,
     too_few,
+    units_of,
     wilson,
 )
 from harness.report.caveats import clustered, few
@@ -41,6 +42,9 @@ def test_clusters_are_numbered_as_they_come_and_none_is_told_where_each_layout_i
     numbered = cluster_numbers(["b", "a", None, "b", None])
     assert numbered is not None
     assert numbered.tolist() == [0, 1, 2, 0, 3]
+    values = np.array([7, 7, 2, 4])
+    assert units_of(values, (4, 2, 7), np.array([0, 0, 1])).tolist() == [1, 1, 0, 0]
+    assert units_of(values, (4, 2, 7), None) is values
     for alone in (["a", "b"], [None, None], [None, "a"], []):
         assert cluster_numbers(alone) is None
 

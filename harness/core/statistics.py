@@ -131,6 +131,18 @@ def cluster_numbers(names: Sequence[str | None]) -> Ints | None:
     return None if len(numbers) == len(each) else np.array(each, dtype=np.int64)
 
 
+def units_of(episodes: Ints, numbers: Sequence[int], clusters: Ints | None) -> Ints:
+    """Return the number of what each of n values is counted under: its cluster, or its episode.
+
+    `episodes`, (n,), has the number of each value's episode, `numbers` those of all E episodes, and
+    `clusters`, (E,), the number of each one's cluster; None if each is a cluster of its own.
+    """
+    if clusters is None:
+        return episodes
+    cluster_of = dict(zip(numbers, clusters.tolist(), strict=True))
+    return np.array([cluster_of[episode] for episode in episodes.tolist()], dtype=np.int64)
+
+
 def too_few(clusters: Ints | None) -> bool:
     """Return whether episodes are of fewer than `FEWEST` clusters, too few for a bootstrap.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.plugins import Shipped
-from harness.core.statistics import rate_interval
+from harness.core.statistics import rate_interval, units_of
 from harness.parsing.status import Status
 from harness.report import charts
 from harness.report.references import driven, in_trees, label, sentences
@@ -316,10 +316,7 @@ def _shares(
     as `name`; bins below 0 are left out.
     """
     conditions = run.decisions.codes("condition", run.conditions)
-    units = run.decisions.whole("episode")
-    if run.clusters is not None:
-        cluster_of = dict(zip(run.grid.episodes, run.clusters.tolist(), strict=True))
-        units = np.array([cluster_of[episode] for episode in units.tolist()])
+    units = units_of(run.decisions.whole("episode"), run.grid.episodes, run.clusters)
     for n, condition in enumerate(run.conditions):
         for place in np.unique(bins[(conditions == n) & (bins >= 0)]):
             here = (conditions == n) & (bins == place) & ~np.isnan(hits)

@@ -19,11 +19,12 @@ from harness.backends.base import Request
 from harness.coordination.coordinate import FusionInputs, fuse
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
+from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import PERCENT, Unit, as_mapping, some_of
 from harness.core.figures import interval_of as figure
 from harness.core.files import write_whole
-from harness.core.statistics import Estimate, rate_interval
+from harness.core.statistics import Estimate, rate_interval, units_of
 from harness.dataset.load import Scene
 from harness.evaluate.frozen_world import FrozenWorld
 from harness.evaluate.fusion import codes_of
@@ -273,28 +274,36 @@ def _left_out(
     )
 
 
-def rows(result: Attribution) -> list[Row]:
+def rows(
+    result: Attribution, episodes: Sequence[int] = (), clusters: Ints | None = None
+) -> list[Row]:
     """Return a row for each kind of object or message that was left out, with 95 % intervals.
 
-    `result` is the attribution, what answers become without each. The intervals are over episodes.
+    `result` is the attribution, what answers become without each. The intervals are over episodes,
+    or over the `clusters`, (E,), of the run's E `episodes`, if they have some.
     """
     by_kind: dict[tuple[str, str], list[LeftOut]] = {}
     for each in result.left_out:
         by_kind.setdefault((each.role, each.kind), []).append(each)
-    return [_row(*kind, by_kind[kind]) for kind in KINDS if kind in by_kind]
+    table = []
+    for kind in KINDS:
+        if kind in by_kind:
+            numbers = np.array([each.episode for each in by_kind[kind]])
+            units = units_of(numbers, episodes, clusters)
+            table.append(_row(*kind, by_kind[kind], units))
+    return table
 
 
-def _row(role: str, kind: str, left_out: Sequence[LeftOut]) -> Row:
-    episodes = np.array([each.episode for each in left_out])
+def _row(role: str, kind: str, left_out: Sequence[LeftOut], units: Ints) -> Row:
     shift = np.array([np.nan if each.shift is None else each.shift for each in left_out])
     flips = np.array([float(each.instead != each.action) for each in left_out])
     failed = np.isnan(shift)
     return Row(
         role,
         kind,
-        rate_interval(shift, episodes),  # a distance is from 0 to 1, too
-        rate_interval(np.where(failed, np.nan, flips), episodes),
-        rate_interval(failed.astype(float), episodes),
+        rate_interval(shift, units),  # a distance is from 0 to 1, too
+        rate_interval(np.where(failed, np.nan, flips), units),
+        rate_interval(failed.astype(float), units),
     )
 
 
@@ -338,7 +347,8 @@ def attribution_study(result: Attribution, run: ReplayedRun) -> Study:
     `result` has what the answers become without one object or message, and `run` is the run whose
     answers they are.
     """
-    table, cells, plain_rows = rows(result), list[Sequence[str]](), list[dict[str, Any]]()
+    table = rows(result, run.dataset.episodes, run.clusters)
+    cells, plain_rows = list[Sequence[str]](), list[dict[str, Any]]()
     for row in table:
         shift, flips = figure(row.shift, SHIFT), figure(row.flips)
         failed, n = PERCENT.number(row.failed.value), str(row.shift.n)

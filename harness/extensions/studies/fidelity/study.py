@@ -14,6 +14,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
+from harness.core.statistics import cluster_numbers
 from harness.core.versions import versions
 from harness.report.document import Table
 from harness.runs.alike import different, setup
@@ -107,6 +108,7 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
         _refuse_unlike(read[one], read[other])
     both = both.drop(columns=["run_frozen", "run_closed"])
     rows = pd.DataFrame(_rows(both))
+    both = both.drop(columns=["cluster_frozen", "cluster_closed"])
     return Fidelity(rows, both, *_rank(rows))
 
 
@@ -139,7 +141,7 @@ def _episodes(run: Run) -> "pd.DataFrame":
     """Return the result of each of a run's episodes."""
     import pandas as pd
 
-    columns = ("condition", "seed", "layout_seed", "success", "failure")
+    columns = ("condition", "seed", "layout_seed", "success", "failure", "cluster")
     rows = [attrgetter(*columns)(episode) for episode in run.episodes]
     table = pd.DataFrame(rows, columns=list(columns))
     return table.assign(**asdict(run.manifest.variant))
@@ -154,7 +156,9 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
         frozen = wide["success_frozen"].to_numpy(dtype=float)
         closed = wide["success_closed"].to_numpy(dtype=float)
         row = dict(zip(columns, place, strict=True))
-        for name, estimate in compared(frozen, closed).items():
+        cluster_of = dict(zip(group.layout_seed, group.cluster_closed, strict=True))
+        clusters = cluster_numbers([cluster_of[layout] for layout in wide["success_frozen"]])
+        for name, estimate in compared(frozen, closed, clusters).items():
             row[name] = estimate.value
             row[f"{name}_low"] = estimate.low
             row[f"{name}_high"] = estimate.high

@@ -29,6 +29,7 @@ from harness.core.statistics import (
     rate_interval,
     resampled,
     too_few,
+    units_of,
 )
 from harness.core.versions import versions
 from harness.evaluate.run import read_or_evaluate
@@ -250,11 +251,8 @@ class Repeats:
             if len(of_scene) > 1:
                 entropies[n] = _doubt(np.array(of_scene))
         stated_nats, sampled_nats = entropies.T
-        episodes = np.array([int(scene.partition("-")[0]) for scene in intents])
-        run = self.runs[0]
-        if run.clusters is not None:
-            cluster_of = dict(zip(run.grid.episodes, run.clusters.tolist(), strict=True))
-            episodes = np.array([cluster_of[episode] for episode in episodes.tolist()])
+        numbers = np.array([int(scene.partition("-")[0]) for scene in intents])
+        episodes = units_of(numbers, self.runs[0].grid.episodes, self.runs[0].clusters)
         for name, values in ((STATED, stated_nats), (SAMPLED, sampled_nats)):
             yield name, in_range(name, episode_interval(values, episodes))
         yield DOUBT, episode_interval(stated_nats - sampled_nats, episodes)

@@ -115,7 +115,9 @@ def command(
             questions, where, progress, None if no_cache else default_file(), who
         )
     with work.going_on(where):
-        rows = scoring.rows(pairs, [TWINS[name] for name in questions.twins])
+        data = source.dataset
+        twins = [TWINS[name] for name in questions.twins]
+        rows = scoring.rows(pairs, twins, data.episodes, data.clusters)
         verdicts = [scoring.judge(each, rows) for each in gates]
         write_pairs(pairs, where)
         finish(twins_study(questions, rows, verdicts, unanswered), where, as_json, quiet, verbose)

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from harness.core.arrays import Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import some_of
-from harness.core.statistics import Estimate, rate_interval
+from harness.core.statistics import Estimate, rate_interval, units_of
 from harness.extensions.studies.twins.declared import Twin
 from harness.report.compare.gate import OPERATORS, Gate, Verdict
 
@@ -82,11 +83,17 @@ def held(twin: Twin, p: Sequence[float] | None, q: Sequence[float] | None) -> bo
     return int(np.argmax(p)) == int(np.argmax(q))
 
 
-def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
+def rows(
+    pairs: Sequence[Pair],
+    twins: Sequence[Twin],
+    episodes: Sequence[int] = (),
+    clusters: Ints | None = None,
+) -> list[Row]:
     """Return the results of a study of twins: a row for each twin and role, in their order.
 
     A twin is a question put another way, a role is who was asked, and a pair has the answers to
-    both versions. Twins without a pair have no row.
+    both versions. Twins without a pair have no row. Intervals are over episodes, or over the
+    `clusters`, (E,), of the E `episodes` asked about, if they have some.
     """
     by_place: dict[tuple[str, str], list[Pair]] = {}  # by twin and role
     for pair in pairs:
@@ -95,22 +102,24 @@ def rows(pairs: Sequence[Pair], twins: Sequence[Twin]) -> list[Row]:
     for twin in twins:
         for role in ROLES:
             if (twin.name, role) in by_place:
-                rows.append(_row(twin, role, by_place[twin.name, role]))
+                here = by_place[twin.name, role]
+                numbers = np.array([pair.episode for pair in here])
+                rows.append(_row(twin, role, here, units_of(numbers, episodes, clusters)))
     return rows
 
 
-def _row(twin: Twin, role: str, pairs: Sequence[Pair]) -> Row:
-    episodes = np.array([pair.episode for pair in pairs])
+def _row(twin: Twin, role: str, pairs: Sequence[Pair], units: Ints) -> Row:
+    episodes = {pair.episode for pair in pairs}
     apart = np.array([np.nan if pair.distance is None else pair.distance for pair in pairs])
     broken = [pair for pair in pairs if not pair.holds]
     broken.sort(key=lambda pair: -(pair.distance or 0.0))
     return Row(
         twin,
         role,
-        len(np.unique(episodes)),
-        rate_interval(np.array([float(pair.holds) for pair in pairs]), episodes),
-        rate_interval(apart, episodes),  # a distance is from 0 to 1, too
-        rate_interval(np.isnan(apart).astype(float), episodes),
+        len(episodes),
+        rate_interval(np.array([float(pair.holds) for pair in pairs]), units),
+        rate_interval(apart, units),  # a distance is from 0 to 1, too
+        rate_interval(np.isnan(apart).astype(float), units),
         tuple(broken),
     )
 
