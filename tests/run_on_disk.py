@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from harness.coordination.named_points import POINTS
 from harness.coordination.operating_point import OperatingPoint
+from harness.core.files import sha256_file
 from harness.core.versions import FIGURES
 from harness.radio.profiles import CHANNELS
 from harness.runs import folder, formats, writer
@@ -147,9 +148,17 @@ def _rows(
 
 
 def configure(run: Path, **values: object) -> None:
-    """Change what run.json says; it need not be possible."""
+    """Change what run.json says, and its digests of that; it need not be possible."""
     stated = msgspec.json.decode((run / "run.json").read_bytes())
     (run / "run.json").write_bytes(msgspec.json.encode(restated(stated, values)))
+    digested(run)
+
+
+def digested(run: Path) -> None:
+    """State the digests of what run.json states, as a forger can."""
+    stated = msgspec.json.decode((run / "run.json").read_bytes())
+    answers_sha256 = sha256_file(run / "answers.jsonl", "rows")
+    (run / "run.json").write_bytes(writer.record_text(stated, answers_sha256))
 
 
 def restated(manifest: Mapping[str, Any], changes: Mapping[str, object]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from run_on_disk import configure, damage, made_up, rows_of
+from run_on_disk import configure, damage, digested, made_up, rows_of
 from tiers import some
 
 import harness
@@ -263,6 +263,7 @@ def said_of(run: Path, stated: Any, compares: bool = True) -> tuple[bool, str]:
     (run / "run.json").write_text(json.dumps(stated))
     try:
         folder.read(run)
+        digested(run)
         return True, text.terminal(compare(pair(run, run)), [], 5) if compares else ""
     except UserError as error:
         return False, str(error)

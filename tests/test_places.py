@@ -9,6 +9,7 @@ import pytest
 from evaluating import FILES
 from former import DRIVE
 from reading import packed
+from run_on_disk import digested
 
 from harness.report.compare.page import beside
 from harness.runs.folder import read
@@ -89,6 +90,7 @@ def spoil(run: Path) -> None:
     }
     manifest["engine_errors"] = 1
     (run / "run.json").write_text(json.dumps(manifest))
+    digested(run)
 
 
 @pytest.mark.slow

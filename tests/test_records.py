@@ -298,11 +298,12 @@ def test_what_a_run_lacks_has_an_entry(run: str) -> None:
         {*OperatingPoint.types()} - of_extensions,
         set(records.Manifest.__struct_fields__),
     )
-    # Letters are a setting of the agent; an adapter, a price, prompts and a cost are stated where
-    # there is one.
+    # Letters are a setting of the agent; an adapter, a price, prompts, a cost and digests are stated
+    # where there are some.
     card = {field.name for field in fields(Card)} - {"letters", "adapter", "price", "prompts"}
     lacks = {
-        "MANIFEST": manifest - {*stated, *formats.AGENT, *formats.BESIDE, "settings", "cost"},
+        "MANIFEST": manifest
+        - {*stated, *formats.AGENT, *formats.BESIDE, "settings", "cost", "digests"},
         "SETTINGS": PLAIN.keys() - {formats.BESIDE[key] for key in formats.BESIDE if key in stated},
         "AGENT": set(formats.AGENT) - {*stated},
         "MODEL": card - {*stated["model"]},

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
-from run_on_disk import Row, made_up
+from run_on_disk import Row, digested, made_up
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset
@@ -321,5 +321,6 @@ def test_a_run_by_older_rules_is_held_against_these(tmp_path: Path) -> None:
             score if score is not ece else structs.replace(ece, **change) for score in scores
         ]
         (run.path / "run.json").write_bytes(msgspec.json.encode(stated))
+        digested(run.path)
         (run.path / "summary.csv").write_text(csv_text(Score, changed, stated.variant))
         assert len(list(contradictions(read(run.path)))) == found

@@ -1,8 +1,9 @@
 """A run is held against its own answers, and its tables against each other."""
 
+import copy
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from html import unescape
 from pathlib import Path
 
@@ -18,7 +19,9 @@ from harness.core import extras, resources
 from harness.core.errors import UserError
 from harness.core.extensions import extensions
 from harness.runs.contradictions import refuse
+from harness.runs.digests import LABELS, OF_ALL, digests_of
 from harness.runs.folder import read
+from harness.runs.records import AGENT
 
 Harness = Callable[..., tuple[int, str, str]]
 Tamper = Callable[[Path], object]
@@ -34,6 +37,15 @@ def run(two_run: Path, tmp_path: Path) -> Path:
 def longer(proxy_run: Path, tmp_path: Path) -> Path:
     """One of four layouts."""
     return Path(shutil.copytree(proxy_run, tmp_path / "reports/run"))
+
+
+@pytest.fixture
+def mixed(run: Path) -> Row:
+    """What the run.json of a run with a model for its helpers states."""
+    stated = json.loads((run / "run.json").read_text())
+    agent = {name: stated[name] for name in AGENT}
+    identity = {**stated["identity"], "helpers": [dict(stated["identity"])]}
+    return {**stated, "helpers": [copy.deepcopy(agent)], "identity": identity}
 
 
 def hurried(row: Row) -> None:
@@ -90,7 +102,8 @@ SOME = (
     "a figure", "success of episodes", "latency of decisions", "older rules", "a radio's name",
     "rules in another spelling", "a figure that is left out", "which layouts", "a dataset's name",
     "a latency's source", "settings beside it", "an answer that is missing", "errors of an engine",
-    "a radio's limits",
+    "a radio's limits", "a limit of its model", "what nothing computes of an answer",
+    "lists that were read reversed",
 )  # fmt: skip
 IN_TABLES = {
     "a figure": (
@@ -278,6 +291,20 @@ def unlimited(run: Path) -> None:
     configure(run, channels={**channels, "6g": {**channels["6g"], "limits": {"loss": [0, 1]}}})
 
 
+def edited(*path: str, to: object) -> Tamper:
+    """Change one thing that run.json states, and nothing else."""
+
+    def tamper(run: Path) -> None:
+        stated = json.loads((run / "run.json").read_text())
+        place = stated
+        for name in path[:-1]:
+            place = place[name]
+        place[path[-1]] = to
+        (run / "run.json").write_text(json.dumps(stated))
+
+    return tamper
+
+
 OF_THE_RUN = {
     "older rules": (older, "success_rate, low, 0.9 in 6g"),
     "older rules, without a row": (
@@ -351,6 +378,28 @@ OF_THE_RUN = {
         "run.json lacks channel profile 6g, which a condition names",
     ),
     "a radio's limits": (unlimited, "run.json has the limits of channel profile 6g otherwise than here"),
+    "a limit of its model": (
+        edited("model", "max_new_tokens", to=7),
+        "run.json has another digest of ego than what it states makes",
+    ),
+    "whether its prompt is released": (
+        edited("prompt", "released", to=False),
+        "run.json has another digest of ego than what it states makes",
+    ),
+    "a package's version": (
+        edited("versions", "numpy", to="0"),
+        "run.json has another digest of run than what it states makes",
+    ),
+    "what nothing computes of an answer": (
+        lambda run: (run / "answers.jsonl").write_text(
+            (run / "answers.jsonl").read_text().replace('"batch_size":1', '"batch_size":8')
+        ),
+        "run.json has another digest of answers.jsonl than that file makes",
+    ),
+    "lists that were read reversed": (
+        lambda run: configure(run, flip=True),
+        "answers.jsonl has no flipped, which flip True gives",
+    ),
     "a dataset's name": (called, "run.json has another name of its scenes than the dataset"),
 }  # fmt: skip
 
@@ -363,6 +412,41 @@ def test_what_a_run_states_of_itself_is_held_against_its_dataset_and_its_names(
     changed: str, run: Path, harness: Harness
 ) -> None:
     check_finds(OF_THE_RUN[changed], run, harness)
+
+
+def leaves(value: object, path: tuple[object, ...] = ()) -> Iterator[tuple[object, ...]]:
+    """Yield the path of each thing that a JSON value states."""
+    if isinstance(value, dict | list) and value:
+        for name, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(inner, (*path, name))
+    else:
+        yield path
+
+
+def test_each_thing_that_a_run_states_is_in_one_of_its_digests(mixed: Row) -> None:
+    """But for its labels, and the digests."""
+    before = digests_of(mixed, "0")
+    assert [*before] == ["ego", "helper 1", "run", "answers.jsonl"]
+    for path in leaves(mixed):
+        stated = copy.deepcopy(mixed)
+        place = stated
+        for name in path[:-1]:
+            place = place[name]
+        place[path[-1]] = "another"
+        moved = {name for name, digest in digests_of(stated, "0").items() if digest != before[name]}
+        is_held = path[0] not in (*LABELS, "digests") and path != ("world", "path")
+        assert bool(moved) == is_held, path
+        assert (path[0] in AGENT) <= ("ego" in moved), path
+        assert (path[0] in OF_ALL) <= ({"ego", "helper 1"} <= moved), path
+
+
+def test_a_run_without_digests_says_so(run: Path, harness: Harness) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    del stated["digests"]
+    (run / "run.json").write_text(json.dumps(stated))
+    code, out, _ = harness("run", "check", run)
+    assert (code, "equal where it can be checked: " in out) == (0, True)
+    assert "It has no digests of what it states" in out
 
 
 def test_answers_are_asked_of_the_rule_that_is_here(run: Path, harness: Harness) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from reading import details
+from run_on_disk import digested
 from tiers import some
 
 from harness import cli
@@ -220,6 +221,7 @@ def test_a_strangers_template_is_rendered_in_the_sandbox(project: Path, harness:
     manifest = json.loads(Path("reports/run/run.json").read_text())
     manifest["prompt"]["sha256"] = digest(texts)
     Path("reports/run/run.json").write_text(json.dumps(manifest))
+    digested(Path("reports/run"))
     code, _, err = harness("report", "reports/run", "--out", "page.html")
     assert (code, err) == (0, "")
     assert "subclasses" not in " ".join(prompts_shown(Path("page.html")))
@@ -241,6 +243,7 @@ def test_a_dataset_is_found_again(
     if moved == "both":  # the run's copy of an absolute path is of the old project
         text = (run / "run.json").read_text()
         (run / "run.json").write_text(text.replace('"own/scenes"', f'"{project}/own/scenes"'))
+        digested(run)
     if moved == "named":
         (other / "datasets").mkdir()
         (other / "own/scenes").rename(other / "datasets/small")

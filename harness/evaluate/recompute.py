@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from msgspec import structs, to_builtins
+from msgspec import UNSET, structs, to_builtins
 from msgspec.structs import astuple
 
 from harness.backends import cards
@@ -39,6 +39,7 @@ from harness.evaluate.of_run import (
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Source, Spec
 from harness.evaluate.texts import OF_TEXTS, others, same
+from harness.prompts import versions
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import MEASURED, Episode, FrozenScenes, Latency
@@ -47,6 +48,11 @@ from harness.runs.unanswered import Tally
 from harness.world import scenarios
 
 RULES = (DRIVER, "proxy")  # engines that are no models
+# Of an answer, what only a way of asking leaves: the setting of an agent, and its value then.
+SHOWN_BY: Mapping[str, tuple[str, object]] = {
+    "flipped": ("flip", True),
+    "letter_share": ("letters", "cyclic"),
+}
 REPLAY = "replay"  # the engine of stored answers
 
 
@@ -265,6 +271,7 @@ def _of_manifest(run: Run, card: Card) -> Iterator[str]:
     yield from _of_card(run, card)
     yield from _of_latency(run)
     yield from _of_agents(run)
+    yield from _of_calls(run)
     yield from records_otherwise(run)
 
 
@@ -303,6 +310,34 @@ def _of_agents(run: Run) -> Iterator[str]:
             amount_here = card.price.of(cost.read_tokens, cost.written_tokens)
             if not close(cost.amount, amount_here):
                 yield f"run.json has another cost of {printable(card.name)} than its tokens make"
+
+
+def _of_calls(run: Run) -> Iterator[str]:
+    """Yield how run.json says that its agents were asked otherwise than what is here shows.
+
+    Its answers show whether lists were read reversed and in several orders, and prompts that are
+    here whether they are released. An agent is a model, its prompt and how it is asked.
+    """
+    for record in (run.manifest.agent(0), *run.manifest.helpers):
+        version, sha256 = record["prompt"]["version"], record["prompt"]["sha256"]
+        prompt = versions.as_it_was(version, sha256)
+        if prompt and record["prompt"].get("released") and not prompt.released:
+            yield f"run.json calls prompt {printable(version)} released, and here it is a draft"
+    agents = dict[int, dict[str, Any]]()
+    with_it, without = Counter[tuple[int, str]](), Counter[tuple[int, str]]()
+    for answer in run.answers:
+        agent = run.agent(answer)
+        agents[id(agent)] = agent
+        for name in SHOWN_BY:
+            is_there = getattr(answer, name) is not UNSET
+            with_it[id(agent), name] += is_there
+            without[id(agent), name] += answer.intent is not None and not is_there
+    for place, agent in agents.items():
+        for name, (setting, value) in SHOWN_BY.items():
+            if agent[setting] != value and with_it[place, name]:
+                yield f"answers.jsonl has {name}, which {setting} {agent[setting]} gives to none"
+            elif agent[setting] == value and without[place, name] and not with_it[place, name]:
+                yield f"answers.jsonl has no {name}, which {setting} {agent[setting]} gives"
 
 
 def _of_card(run: Run, card: Card) -> Iterator[str]:

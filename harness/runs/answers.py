@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from harness.core.arrays import ROUNDING, Floats
+from harness.core.files import sha256_bytes
 from harness.runs.records import ASKED, REWRITTEN, Answer, roles
 
 _ANSWER = msgspec.json.Decoder(Answer)
@@ -41,11 +42,13 @@ class Answers:
     Attributes:
         by_scene: the answers about each scene, by the scene's id.
         errors: how many of them are an engine's error.
+        sha256: hex digest of their file.
     """
 
     def __init__(self, lines: bytes, actions: int) -> None:
         """Check the lines of a run with so many actions. Raises ValueError for a broken one."""
         self._lines, self._count, self._actions = lines, 0, actions
+        self.sha256 = sha256_bytes(lines)
         self.errors = 0
         # of lines that stand together and are of one decision point
         self._spans: list[tuple[int, int]] = []

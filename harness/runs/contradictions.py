@@ -15,7 +15,7 @@ from harness.core.figures import amount
 from harness.core.formats import SUITE
 from harness.core.versions import FIGURES
 from harness.dataset.suites import PREFIX, named
-from harness.runs import pinned
+from harness.runs import digests, pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run, read
 from harness.runs.headline import BALANCED, PAIRED
@@ -103,6 +103,7 @@ def contradictions(run: Run) -> Iterator[str]:
     if record is not None and current(run) and (rule := run.manifest.stopping_rule):
         yield from rule.contradictions(record, run.grid, run.episodes)
     yield from _of_scores(run, _scores(run))
+    yield from digests.otherwise(run)
 
 
 def of_suite(suite: SuiteRun) -> Iterator[str]:
@@ -204,6 +205,7 @@ def unchecked(run: Run) -> Iterator[str]:
     if names := dict.fromkeys(key[1] for key in figures if key not in held):
         what = "a package's metrics, or an earlier harness's"
         yield f"{_listed(names)}: as summary.csv states, and not checked, since they are {what}."
+    yield from digests.unheld(run)
     rule, record = run.manifest.stopping_rule, run.manifest.world.interim_looks
     if rule and record and (open_point := rule.unchecked(record)):
         yield open_point

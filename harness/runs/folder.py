@@ -87,6 +87,11 @@ class Run:
         )
 
     @cached_property
+    def record(self) -> dict[str, Any]:
+        """Return the content of `run.json` as it is in the file, of whatever version."""
+        return self.read_file("run.json", _record)
+
+    @cached_property
     def scores(self) -> tuple[Score, ...]:
         return self.read_file("summary.csv", scores_of)
 
@@ -318,9 +323,13 @@ def read(path: Path) -> Run:
     file = path / "run.json"
     if not file.is_file():
         raise UserError(f"{printable(path)} is {_other_than_run(path)}")
-    record: Any = whole(file, lambda file: msgspec.json.decode(text_of(file, "record")))
+    record: Any = whole(file, _record)
     formats.checked(record.get("format") if isinstance(record, dict) else None, file)
     return Run(path, whole(file, lambda file: msgspec.convert(formats.upgraded(record), Manifest)))
+
+
+def _record(file: Path) -> Any:
+    return msgspec.json.decode(text_of(file, "record"))
 
 
 def _other_than_run(path: Path) -> str:

@@ -25,6 +25,8 @@ Measured = Annotated[float, Meta(ge=0, description="seconds, 0 or more")]
 Share = Annotated[float, Meta(ge=0, le=1.001, description="a share, 0 to 1")]  # up to rounding
 # What a file states for an extension: by name, no table in it.
 Plain = dict[str, bool | int | float | str | tuple[int, ...] | None]
+# Of run.json: the model, prompt and way of answering of the ego's agent; helpers' have the same.
+AGENT = ("model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip")
 PLAIN_ROLES = ("ego", "helper", "merge")  # `merge` is the ego's fusion call
 Role = Annotated[str, Meta(pattern=r"^[a-z-]{1,40}\Z", description="a word")]  # one of `roles`
 
@@ -770,6 +772,9 @@ class Manifest(Struct, frozen=True, kw_only=True):
     cost: dict[str, Cost] | UnsetType = UNSET  # by model; unset if no model has a price
     # of the harness, Python and packages, by name
     versions: dict[str, str] = field(default_factory=dict)
+    # of what decides the answers of the ego's agent and of each of helpers, of all else that is
+    # stated here (`run`), and of `answers.jsonl`; empty where missing
+    digests: dict[str, str] = field(default_factory=dict)
 
     @property
     def scenario(self) -> Scenario:
@@ -889,5 +894,4 @@ class Manifest(Struct, frozen=True, kw_only=True):
         """
         if place and self.helpers:
             return self.helpers[(place - 1) % len(self.helpers)]
-        names = ("model", "prompt", "answer", "thinking", "image", "letters", "sums", "flip")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in AGENT}

@@ -12,11 +12,12 @@ import msgspec
 import pyarrow as pa
 from msgspec.structs import asdict
 
-from harness.core.files import replacing, write_whole
+from harness.core.files import replacing, sha256_file, write_whole
 from harness.runs import formats
 from harness.runs.decisions import DecisionFiles, Decisions
 from harness.runs.difficulty import FILE as DIFFICULTY
 from harness.runs.difficulty import Layout
+from harness.runs.digests import digests_of
 from harness.runs.folder import Record
 from harness.runs.records import (
     Answer,
@@ -57,10 +58,20 @@ def write(
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
     if layouts:
         write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
-    text = msgspec.json.format(_ENCODER.encode(manifest.as_file()), indent=1)
-    write_whole(out / "run.json", text + b"\n")
+    answers_sha256 = sha256_file(out / "answers.jsonl", "rows")
+    write_whole(out / "run.json", record_text(manifest.as_file(), answers_sha256))
     # a report often follows, which needs memory for its own tables
     pa.default_memory_pool().release_unused()
+
+
+def record_text(record: Mapping[str, Any], answers_sha256: str) -> bytes:
+    """Return the text of a `run.json`, with the digests of what it states.
+
+    `record` has its content as plain values by name, and `answers_sha256` is the digest of the
+    run's `answers.jsonl`.
+    """
+    digests = digests_of(record, answers_sha256)
+    return msgspec.json.format(_ENCODER.encode({**record, "digests": digests}), indent=1) + b"\n"
 
 
 def lines(answers: Sequence[Answer]) -> bytes:

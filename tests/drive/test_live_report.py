@@ -10,7 +10,7 @@ from driving import FROM_LEFT
 from evaluating import live_spec_of, run
 from former import NAME, SCENARIO
 from reading import Page, by_workers, details
-from run_on_disk import change, damage, rows_of
+from run_on_disk import change, damage, digested, rows_of
 
 from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
@@ -293,6 +293,7 @@ def test_a_moment_that_cannot_be_played_again_has_neither_picture_nor_prompt(dri
         "run.json",
         lambda text: text.replace('"first_seed": 6', '"first_seed": 600'),
     )
+    digested(other)
     episodes = pd.read_csv(other / "episodes.csv")
     episodes["layout_seed"] += 594
     episodes.to_csv(other / "episodes.csv", index=False)

@@ -19,7 +19,7 @@ import typer
 from evaluating import scenes_of, spec_of
 from msgspec import structs
 from reading import Page, by_workers, details, packed
-from run_on_disk import answers_of, change, configure, damage, rows_of
+from run_on_disk import answers_of, change, configure, damage, digested, rows_of
 from sample_run import write_run
 from typer.testing import CliRunner
 
@@ -330,6 +330,7 @@ def test_sweeps_in_a_runs_folder_are_in_its_page_unless_a_link_leads_out(run, tm
 
 def test_runs_on_other_scenes_are_not_reported_together(run, dataset, tmp_path):
     other = edited(run, tmp_path, "run.json", lambda t: t.replace(dataset.sha256, "f" * 64))
+    digested(other)
     with pytest.raises(UserError, match="are not of the same scenes") as error:
         gather([run, other])
     assert "report them apart" in str(error.value)
@@ -366,6 +367,7 @@ def scored(run, tmp_path, *scores, ended=None):
         manifest = json.loads((copy / "run.json").read_text())
         manifest["world"]["episodes"] = 50
         (copy / "run.json").write_text(json.dumps(manifest))
+        digested(copy)
     return read(copy)
 
 
@@ -651,6 +653,7 @@ def test_a_missing_column_is_named(run, tmp_path, column):
 
 def test_a_run_on_another_dataset_than_lies_there_is_refused(run, tmp_path):
     other = edited(run, tmp_path, "run.json", lambda t: t.replace('"sha256": "', '"sha256": "0'))
+    digested(other)
     with pytest.raises(UserError, match=r"is not the one that .* was made on"):
         gather([other])
 
@@ -696,6 +699,7 @@ def test_an_answer_of_somebody_who_is_not_in_the_scene_is_one_line(dataset, tmp_
     (run / "answers.jsonl").write_text(
         "\n".join([*answers[:-1], json.dumps(first | {"viewer": "v99"})]) + "\n"
     )
+    digested(run)
     with pytest.raises(
         UserError, match=r"answers\.jsonl has an answer of 'v99' in scene .*; make the run again"
     ):

@@ -17,6 +17,7 @@ from harness.evaluate.recompute import computed
 from harness.extensions.benchmark import edition as editions
 from harness.extensions.benchmark.edition import Edition
 from harness.extensions.benchmark.results import Contents, contents_of, unpack
+from harness.runs import digests
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode
 from harness.runs.suite import SuiteRun
@@ -132,7 +133,7 @@ def rescored(file: Path, folder: Path, progress: Callable[[int], None], here: He
             spec = edition.spec(run, source)
             computed_run, other_answers = computed(run, spec, place, progress)
             runs[source.scenario.name] = computed_run
-            differences[name] = list(differing(run, computed_run, edition))
+            differences[name] = [*differing(run, computed_run, edition), *digests.otherwise(run)]
             if other_answers:
                 answers = amount(other_answers, "answer")
                 differences[name].append(f"{answers} of a rule that is here")

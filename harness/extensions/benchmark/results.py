@@ -11,7 +11,7 @@ from pathlib import Path
 from zipfile import ZipFile, ZipInfo
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
 from harness.core.errors import UserError, printable
@@ -29,7 +29,7 @@ from harness.runs.folder import Run
 from harness.runs.listing import own_name
 from harness.runs.records import FrozenScenes, Score
 from harness.runs.settings import FrozenSettings, deciding
-from harness.runs.writer import csv_text
+from harness.runs.writer import csv_text, record_text
 
 FORMAT = "swarmdrive-results/1"
 CONTENTS = "results.json"
@@ -112,10 +112,7 @@ def _files(
             world=replace(world, path=name),
             settings=settings,
         )
-        yield (
-            f"{name}/run.json",
-            msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n",
-        )
+        yield f"{name}/run.json", record_text(to_builtins(manifest), run.answers.sha256)
         for file in ("answers.jsonl", "episodes.csv"):
             yield f"{name}/{file}", bytes_of(run.path / file, "rows")
         yield f"{name}/summary.csv", csv_text(Score, figures(run), manifest.variant).encode()

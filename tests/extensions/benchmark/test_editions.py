@@ -20,7 +20,7 @@ from run_on_disk import Row, made_up, restated
 from tiers import some
 
 from harness.core.errors import UserError
-from harness.core.files import sha256_file
+from harness.core.files import sha256_bytes, sha256_file
 from harness.core.seeds import purpose
 from harness.dataset.load import Dataset, released
 from harness.evaluate import resolve
@@ -31,6 +31,7 @@ from harness.extensions.benchmark.results import CONTENTS, FILES, FORMAT, Conten
 from harness.prompts import versions
 from harness.runs.folder import Run, read
 from harness.runs.suite import SuiteRun
+from harness.runs.writer import record_text
 
 Harness = Callable[..., tuple[int, str, str]]
 Once = Callable[[str, Callable[[Path], object]], Path]
@@ -112,6 +113,13 @@ def answers(files: dict[str, bytes], change: Callable[[dict[str, object]], objec
     each = [json.loads(line) for line in files["small/answers.jsonl"].splitlines()]
     kept = [answer for answer in each if change(answer) is not False]
     files["small/answers.jsonl"] = b"".join(json.dumps(answer).encode() + b"\n" for answer in kept)
+    digested(files)
+
+
+def digested(files: dict[str, bytes]) -> None:
+    """State the digests of what is stated, as a forger can."""
+    answers_sha256 = sha256_bytes(files["small/answers.jsonl"])
+    files["small/run.json"] = record_text(json.loads(files["small/run.json"]), answers_sha256)
 
 
 def better(files: dict[str, bytes]) -> None:
@@ -190,6 +198,7 @@ def with_run(**changes: object) -> Change:
     def change(files: dict[str, bytes]) -> None:
         stated = restated(json.loads(files["small/run.json"]), changes)
         files["small/run.json"] = json.dumps(stated).encode()
+        digested(files)
 
     return change
 

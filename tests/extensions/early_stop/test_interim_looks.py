@@ -12,6 +12,7 @@ import pytest
 from evaluating import figure, live_spec_of, run, spec_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from run_on_disk import digested
 
 from harness.backends.base import Backend
 from harness.backends.registry import open_backend
@@ -266,6 +267,7 @@ def test_a_forged_look_is_named(
     if forged:
         stated["world"]["looks"] = looks | forged
     (tmp_path / "run/run.json").write_text(json.dumps(stated))
+    digested(tmp_path / "run")
     code, out, err = harness("run", "check", tmp_path / "run")
     assert code == (2 if err else 1)
     assert says in " ".join((out + err).split())
@@ -288,6 +290,7 @@ def test_a_look_at_another_run_is_held_against_it_where_work_goes_on(
     looks = stated["world"]["looks"]
     looks["enough"] = not looks.get("enough", False)
     (tmp_path / "run/run.json").write_text(json.dumps(stated))
+    digested(tmp_path / "run")
     (tmp_path / "run/.work").mkdir(exist_ok=True)
     with pytest.raises(UserError, match=r"and run\.json says otherwise; delete that folder"):
         run(spec, tmp_path / "run")

@@ -15,6 +15,7 @@ from evaluating import Scripted, Watched, course, same_files, spec_of, sure
 from hypothesis import given
 from hypothesis import strategies as st
 from priced import priced, typed_eval
+from run_on_disk import digested
 
 from harness.backends.base import Completion, Request
 from harness.coordination.named_points import POINTS
@@ -213,6 +214,7 @@ def test_a_repeat_that_is_a_copy_of_another_is_said_to_be(
     shutil.rmtree(out / "repeat-2")
     shutil.copytree(out / "repeat-1", out / "repeat-2")
     (out / "repeat-2/run.json").write_text(record)
+    digested(out / "repeat-2")
     [caveat] = repeats_study(repeated(spec, out, 2)).caveats
     assert caveat.startswith("repeat-1 and repeat-2 have the same ")
     assert caveat.endswith("chance changed nothing there, or one is a copy of the other.")
