@@ -53,9 +53,10 @@ def command(
     ),
     as_json: options.Json = False,
 ) -> None:
-    """Import recorded or simulated traffic, and choose the moments at which episodes begin.
+    """Import recorded or simulated traffic, as scenes to decide in.
 
-    Whoever cannot be taken is left out and counted. Nothing is written if a file is wrong.
+    The moments at which episodes begin are chosen among all. Whoever cannot be taken is left out
+    and counted. Nothing is written if a file is wrong.
     """
     from harness.extensions.roads.csv_tracks import columns_of
 
