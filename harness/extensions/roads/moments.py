@@ -386,8 +386,7 @@ def _encroachments(frames: _Frames, gap: int) -> Pairs:
             near = tree.sparse_distance_matrix(seconds, radius_m, output_type="ndarray")
             first, second = block[near["i"]], later[near["j"]]
             one, other = frames.track[first], frames.track[second]
-            may = (one < other) if lag == 0 else (one != other)
-            may &= near["v"] <= reach_m[one] + reach_m[other]
+            may = (one != other) & (near["v"] <= reach_m[one] + reach_m[other])
             first, second, one, other = first[may], second[may], one[may], other[may]
             apart_m = separation_m(
                 frames.poses[first, :3],

@@ -1,13 +1,16 @@
 """Moments of recorded traffic: what is decisive, what falls and why, and that no order matters."""
 
 import itertools
+import math
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from shapely import affinity
 
 from harness.core.arrays import Floats
 from harness.extensions.roads.moments import (
@@ -24,7 +27,7 @@ from harness.extensions.roads.moments import (
     choose,
     part_of,
 )
-from harness.extensions.roads.tables import House, Lane, Scene, Track, checked
+from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track, checked
 
 HORIZON_S = 6.0
 EAST, NORTH = 0.0, np.pi / 2
@@ -213,6 +216,87 @@ def test_no_order_of_scenes_or_tracks_and_no_name_of_a_scene_moves_the_choice(
             replace(scene, tracks=tracks, lanes=dict(reversed(list(scene.lanes.items()))))
         )
     assert of(*shuffled) == of(*scenes)
+
+
+def outlines(track: Track) -> Any:
+    """Return the outline of a car in each tenth of a second, (n,)."""
+    half_m, across_m = track.length_m / 2, track.width_m / 2
+    box = shapely.box(-half_m, -across_m, half_m, across_m)
+    shapes = []
+    for x_m, y_m, heading, _ in track.poses:
+        turned = affinity.rotate(box, heading, origin=(0, 0), use_radians=True)
+        shapes.append(affinity.translate(turned, x_m, y_m))
+    return np.array(shapes)
+
+
+def meets(first: Track, second: Track, shapes: dict[str, Any], now: int, last: int) -> list[int]:
+    """Return when the second is where the first was at most 1.5 s before, unless it follows it."""
+    there, here = shapes[first.id][now : last + 1], shapes[second.id][now : last + 1]
+    is_alike = math.cos(second.poses[now, 2] - first.poses[now, 2]) > math.cos(math.pi / 4)
+    if is_alike and shapely.intersects(here, there[0]).any():
+        return []
+    frame, later = np.nonzero(shapely.intersects(there[:, None], here[None, :]))
+    return [now + int(g) for f, g in zip(frame, later, strict=True) if 0 <= g - f <= 15]
+
+
+def plainly(scene: Scene, ego: Track, shapes: dict[str, Any], now: int) -> dict[str, float]:
+    """Return who is hidden from a car and in conflict with it, and after how long, one by one."""
+    conflicts = {}
+    for other in scene.tracks.values():
+        if other is ego or math.dist(ego.poses[now, :2], other.poses[now, :2]) > 80:
+            continue
+        blocks = [shapely.Polygon(house.outline) for house in scene.houses]
+        for track in scene.tracks.values():
+            if track not in (ego, other):
+                blocks.append(shapes[track.id][now])
+        is_hidden = True
+        for end in (other.poses[now, :2], *list(shapes[other.id][now].exterior.coords)[:4]):
+            line = shapely.LineString([ego.poses[now, :2], end])
+            is_hidden = is_hidden and any(line.intersects(block) for block in blocks)
+        last = now + round(10 * HORIZON_S)
+        arrivals = meets(ego, other, shapes, now, last)
+        arrivals += meets(other, ego, shapes, now, last)
+        if is_hidden and arrivals:
+            conflicts[other.id] = (min(arrivals) - now) / 10
+    return conflicts
+
+
+@pytest.mark.exhaustive
+def test_who_is_hidden_and_in_conflict_is_as_one_by_one() -> None:
+    """Cars on straight ways through a place with a house, drawn; none brakes."""
+    draws = np.random.default_rng(3)
+    decisive_moments = 0
+    for number in range(40):
+        tracks, lanes = {}, {}
+        for key in "abcdef":
+            heading, speed_mps = draws.uniform(-np.pi, np.pi), draws.uniform(3, 12)
+            way = np.array([np.cos(heading), np.sin(heading)])
+            begin = draws.uniform(-8, 8, 2) - way * speed_mps * draws.uniform(2, 6)
+            kind = str(draws.choice(["car", "van", "truck"]))
+            tracks[key] = driven(key, (begin[0], begin[1]), heading, np.full(91, speed_mps),
+                                 kind=kind, length_m=draws.uniform(4, 12))  # fmt: skip
+            points = np.stack([begin - 5 * way, begin + 200 * way])
+            lanes[key] = Lane(key, points, 4.0, None, (), None, None)
+        corner = draws.uniform(-20, 10, 2)
+        house = House("h", corner + np.array([[0, 0], [12, 0], [12, 12], [0, 12]]))
+        scene = Scene("s", "s.xml", f"{number:064}", 0.1, False, tracks, lanes, (house,))
+        asked: list[Moment] = []
+
+        def note(scene: Scene, moment: Moment, asked: list[Moment] = asked) -> None:
+            asked.append(moment)
+
+        choose([scene], 80.0, HORIZON_S, unfit=note)
+        assert asked
+        shapes = {key: outlines(track) for key, track in tracks.items()}
+        for moment in asked:
+            now = round(10 * moment.time_s)
+            conflicts = plainly(scene, tracks[moment.vehicle], shapes, now)
+            assert (moment.hidden is not None) == bool(conflicts), (number, moment, conflicts)
+            if moment.hidden is not None:
+                decisive_moments += 1
+                assert moment.conflict_s == min(conflicts.values())
+                assert conflicts[moment.hidden] == moment.conflict_s
+    assert decisive_moments > 20
 
 
 def crowd(cars: int, seconds: int) -> Scene:
