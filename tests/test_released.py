@@ -4,6 +4,7 @@ import json
 import tomllib
 from pathlib import Path
 from shutil import copyfile
+from typing import Any
 
 import former
 import pytest
@@ -81,6 +82,7 @@ def test_a_released_dataset_that_an_installation_lacks_is_one_line(
 
 
 NEWEST = tomllib.loads((ROOT / "datasets/suites.toml").read_text())["v2v-safety-2"]["datasets"]
+LATER_KINDS, LATER_FIELDS = ("bicycle", "motorcycle", "pedestrian"), ("source", "licence")
 
 
 @pytest.mark.parametrize("name", NEWEST)
@@ -93,4 +95,15 @@ def test_the_newest_datasets_would_be_built_with_the_schemas_that_they_have(name
         ("manifest", manifest_schema()),
     ):
         released = json.loads((ROOT / "datasets" / name / f"{file}.schema.json").read_text())
-        assert json.loads(json.dumps(schema)) == released, file
+        assert _as_released(json.loads(json.dumps(schema))) == released, file
+
+
+def _as_released(schema: Any) -> Any:
+    """Return a schema without what it has learnt since: kinds of road users, and where traffic is
+    from.
+    """
+    if isinstance(schema, list):
+        return [_as_released(each) for each in schema if each not in LATER_KINDS]
+    if isinstance(schema, dict):
+        return {key: _as_released(each) for key, each in schema.items() if key not in LATER_FIELDS}
+    return schema

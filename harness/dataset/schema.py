@@ -143,8 +143,7 @@ class Manifest(Closed, frozen=True):
     """`manifest.json`: what a dataset was built from,
     and the sha256 of every file and of every tree.
 
-    Of an environment it holds the whole configuration, and of traffic from elsewhere the source
-    and its licence.
+    Of an environment it holds the whole configuration.
     """
 
     format: Literal["swarmdrive-dataset/2"]
@@ -160,6 +159,7 @@ class Manifest(Closed, frozen=True):
     files: dict[FileName, Sha256]
     trees_sha256: list[Sha256]
     environment: dict[str, Any] | None = None
+    # of traffic from elsewhere: where it is from, and on what terms
     source: Annotated[str, Meta(max_length=1000)] = ""
     licence: Annotated[str, Meta(max_length=1000)] = ""
 
