@@ -588,6 +588,13 @@ def test_a_replay_has_the_delays_that_the_replayed_model_declares(
     assert harness(*again, "--out", "again")[0] == 0
     code, out, _ = harness("run", "check", "again")
     assert (code, "again: equal: " in out) == (0, True)
+    helped = ("eval", "--dataset", two_path, "--seeds", "0", "--quiet", "--helper-model")
+    assert harness(*helped, "proxy-faulty", "--out", "helped")[0] == 0
+    of_helped = (*again[:3], "--model", "replay:helped", *again[5:])
+    assert harness(*of_helped, "--out", "of-helped")[0] == 0
+    assert harness("run", "check", "of-helped")[0] == 0
+    [helper] = read(Path("of-helped")).manifest.answerers.helpers
+    assert helper["model"]["name"] == "proxy-faulty"
 
 
 @pytest.mark.slow

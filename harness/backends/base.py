@@ -303,6 +303,9 @@ def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, A
     identity = {key: value for key, value in now.items() if key not in YOUNGER or key in stored}
     if "answers" in stored:
         identity.setdefault("answers", 1)  # of an engine from outside that states none
+    of, stored_of = identity.get("of"), stored.get("of")  # the run that a replay is of
+    if isinstance(of, Mapping) and isinstance(stored_of, Mapping):
+        identity["of"] = {key: value for key, value in of.items() if key in stored_of}
     helpers, stored_helpers = identity.get("helpers"), stored.get("helpers")
     if (
         isinstance(helpers, list | tuple)

@@ -21,6 +21,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.plugins import Plugins
 from harness.core.strangers import aside, strangers, worded
+from harness.runs.answerers import Answerers
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
@@ -205,18 +206,12 @@ def reads_prompts(engine: str) -> bool:
     return entry is None or entry.capabilities.language_model
 
 
-def is_from_file(model: Mapping[str, Any], identity: Mapping[str, Any]) -> bool:
-    """Return whether a run's answers came from a file of another program, so that none was asked.
+def is_from_file(answerers: Answerers) -> bool:
+    """Return whether a run's answers came from a file of another program, and nothing was asked.
 
-    `model` and `identity` are what the run states of its model. That of a run which replays another
-    has that of the other.
+    `answerers` says who was asked in the run, or in the first of those that it replays.
     """
-    while isinstance(earlier := identity.get("of"), Mapping):
-        records: list[Any] = [earlier.get("model"), earlier.get("identity")]
-        if not all(isinstance(record, Mapping) for record in records):
-            return False
-        model, identity = records
-    entry = ENGINES.get(str(model.get("engine")))
+    entry = ENGINES.get(str(answerers.model.get("engine")))
     return entry is not None and entry.capabilities.from_file
 
 

@@ -187,9 +187,15 @@ class Replay:
 
     def identity(self) -> dict[str, Any]:
         answers_sha256 = sha256_file(self._run.path / "answers.jsonl", "rows")
-        model = {"model": self._run.manifest.model, "identity": self._run.manifest.identity}
+        manifest = self._run.manifest
+        of = {
+            "model": manifest.model,
+            "identity": manifest.identity,
+            "helpers": list(manifest.helpers),
+            "temperature": manifest.temperature,
+        }
         ours = {"engine": "replay", "answers": BUILT_IN["replay"].answers}
-        return {**ours, "answers_sha256": answers_sha256, "of": model}
+        return {**ours, "answers_sha256": answers_sha256, "of": of}
 
 
 class LacksAnswer(UserError):

@@ -63,7 +63,7 @@ def after_run(run: "Run") -> None:
     manifest = run.manifest
     model, prompt = manifest.settings.model, manifest.prompt["version"]  # as it was typed
     failed = run.score(ALL, FAILED)
-    of_file = is_from_file(manifest.model, manifest.identity)
+    of_file = is_from_file(manifest.answerers)
     if failed and (failed.value or 0.0) >= UNREAD:
         versions = [str(each["version"]) for each in manifest.model.get("prompts", ())]
         others = [version for version in versions if version != prompt]

@@ -40,6 +40,7 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Source, Spec
 from harness.evaluate.texts import OF_TEXTS, others, same
 from harness.prompts import versions
+from harness.runs.answerers import REPLAY
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import MEASURED, Episode, FrozenScenes, Latency
@@ -53,7 +54,6 @@ SHOWN_BY: Mapping[str, tuple[str, object]] = {
     "flipped": ("flip", True),
     "letter_share": ("letters", "cyclic"),
 }
-REPLAY = "replay"  # the engine of stored answers
 
 
 class Held:
@@ -355,24 +355,10 @@ def asked_card(run: Run) -> Card:
     Of answers that are replayed it is that of the first run. Raises UserError if the run states
     none.
     """
-    model, _ = _model_asked(run)
-    return model
-
-
-def _model_asked(run: Run) -> tuple[Card, Mapping[str, Any]]:
-    """Return the card and the identity of the model that was asked, of replayed answers the first.
-
-    Raises UserError if the run states none.
-    """
-    model: Any = run.manifest.model
-    identity: Any = run.manifest.identity
-    where = printable(run.path)
-    while model["engine"] == REPLAY and isinstance(replayed := identity.get("of"), Mapping):
-        model, identity = replayed.get("model"), replayed.get("identity")
-        if not (isinstance(model, Mapping) and isinstance(identity, Mapping)):
-            raise UserError(f"{where}: run.json states no model of what it replays; make it again")
-        convert(model, Card, f"{where}: the model that it replays")
-    return convert(model, Card, f"{where}: its model"), identity
+    model, where = run.manifest.answerers.model, printable(run.path)
+    if not model:
+        raise UserError(f"{where}: run.json states no model of what it replays; make it again")
+    return convert(model, Card, f"{where}: its model")
 
 
 def of_card(run: Run) -> Iterator[str]:
@@ -387,8 +373,8 @@ def of_card(run: Run) -> Iterator[str]:
         for card in dict.fromkeys(models):
             yield from _of_card_here(card)
     replays = [manifest.model, *(helper["model"] for helper in manifest.helpers)]
-    _, identity = _model_asked(run)
-    several = manifest.model["engine"] == REPLAY and bool(identity.get("helpers"))
+    is_replay = manifest.model["engine"] == REPLAY
+    several = is_replay and bool(manifest.answerers.identity.get("helpers"))
     by_run = any(model["engine"] == REPLAY for model in replays[1:])
     if latency.source in ("card", "paper") and (several or by_run):
         times = dict.fromkeys(f"{seconds:g} s" for seconds in latency.helper_times_s())
@@ -433,9 +419,9 @@ def _of_latency(run: Run) -> Iterator[str]:
         yield f"run.json has times that are {latency.source}, and its settings do not have them"
     if latency.source in ("card", "paper"):
         others = {"a fusion call": latency.fusion_s}
-        _, identity = _model_asked(run)
+        is_replay = run.manifest.model["engine"] == REPLAY
         # Those of the run that it replays may have models of their own, whose cards are not here.
-        if run.manifest.model["engine"] == REPLAY and identity.get("helpers"):
+        if is_replay and run.manifest.answerers.identity.get("helpers"):
             pass
         elif not run.manifest.helpers:
             others["the helpers"] = latency.helper_s

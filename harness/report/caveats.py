@@ -367,7 +367,7 @@ def moved_system(run: Run) -> Iterator[str]:
 def from_file(run: Run) -> Iterator[str]:
     """Yield a sentence on a run whose answers came from a file that another program wrote."""
     model = run.manifest.model
-    if is_from_file(model, run.manifest.identity):
+    if is_from_file(run.manifest.answerers):
         yield (
             f"The answers of {printable(model['name'], 30)} came from a file that another program "
             "wrote: no model was asked here. Its name, and tokens and seconds of answers, are as "

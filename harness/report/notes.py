@@ -104,7 +104,7 @@ def answer_times(run: Shown) -> Iterator[str]:
     A role is who answered: `ego`, `helper` or `merge` (the ego after it heard messages). These
     times are not those that latency is computed from.
     """
-    from_file = is_from_file(run.manifest.model, run.manifest.identity)
+    from_file = is_from_file(run.manifest.answerers)
     source = ", as their file states" if from_file else ""
     for role, took in run.manifest.answer_times.items():
         median_ms = f"{1000 * took.median_s:.1f} ms"

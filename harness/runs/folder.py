@@ -28,6 +28,7 @@ from harness.core.formats import SUITE
 from harness.core.memory import uncollected
 from harness.core.statistics import cluster_numbers
 from harness.runs import formats
+from harness.runs.answerers import REPLAY
 from harness.runs.answers import Answered, Answers
 from harness.runs.decisions import Decisions, arrow_file
 from harness.runs.difficulty import FILE as DIFFICULTY
@@ -190,14 +191,12 @@ class Run:
         A model card, a file that describes a model, may declare that some answers take longer. None
         if this one took no longer, or so much as declared.
         """
-        model, identity = self.agent(answer)["model"], self.manifest.identity
-        while model.get("engine") == "replay" and isinstance(replayed := identity.get("of"), dict):
-            model, identity = replayed.get("model", {}), replayed.get("identity", {})
-        failures = model.get("failures")
-        tail_s = failures.get("slow_s", 0.0) if isinstance(failures, Mapping) else 0.0
-        if not (isinstance(tail_s, int | float) and 0 <= tail_s <= LONGEST_S):
-            tail_s = 0.0
-        if answer.may_take_longer(tail_s):
+        models = [self.agent(answer)["model"]]
+        if models[0]["engine"] == REPLAY:
+            earlier = self.manifest.answerers_at(self._viewer_place(answer))
+            # which of the helpers of a run that is replayed answered, nothing says
+            models = [earlier.model, *(helper["model"] for helper in earlier.helpers or ())]
+        if any(answer.may_take_longer(_slow_s(each)) for each in models):
             return None
         name = printable(answer.id)
         return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"
@@ -330,6 +329,13 @@ def read(path: Path) -> Run:
 
 def _record(file: Path) -> Any:
     return msgspec.json.decode(text_of(file, "record"))
+
+
+def _slow_s(model: Mapping[str, Any]) -> float:
+    """Return the seconds that some answers of a model take longer, as the run states its card."""
+    failures = model.get("failures")
+    tail_s = failures.get("slow_s", 0.0) if isinstance(failures, Mapping) else 0.0
+    return tail_s if isinstance(tail_s, int | float) and 0 <= tail_s <= LONGEST_S else 0.0
 
 
 def _other_than_run(path: Path) -> str:

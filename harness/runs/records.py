@@ -14,6 +14,7 @@ from harness.core.config import Seconds, Whole, convert
 from harness.core.errors import BETWEEN_NAMES, UserError, printable
 from harness.core.statistics import Estimate
 from harness.runs import formats, stopping
+from harness.runs.answerers import Answerers, answerers_of
 from harness.runs.settings import Settings
 from harness.runs.stopping import InterimLooks, StoppingRule
 from harness.runs.timers import Timer, timer
@@ -876,6 +877,25 @@ class Manifest(Struct, frozen=True, kw_only=True):
             raise ValueError(str(error)) from None
         if speeds != self.latency.speeds:
             raise ValueError(f"latency has other speeds than {its_timer.option} makes")
+
+    @property
+    def answerers(self) -> Answerers:
+        """Return who was asked: of a run that replays others, in the first of them."""
+        return self.answerers_at(0)
+
+    def answerers_at(self, place: int) -> Answerers:
+        """Return who was asked for a vehicle: of a replay, in the first of the runs.
+
+        `place` is the vehicle's index, where 0 is the ego, and the helpers follow from 1.
+        """
+        if not (place and self.helpers):
+            return answerers_of(self.model, self.identity, self.helpers, self.temperature)
+        n = (place - 1) % len(self.helpers)
+        identities = self.identity.get("helpers")
+        by_place = dict(enumerate(identities)) if isinstance(identities, list | tuple) else {}
+        identity = by_place.get(n)
+        identity = identity if isinstance(identity, dict) else {}
+        return answerers_of(self.helpers[n]["model"], identity, (), self.temperature)
 
     @property
     def variant(self) -> Variant:

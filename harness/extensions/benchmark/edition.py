@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, structs
 
-from harness.backends.card import Card
 from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import amount
@@ -21,7 +20,7 @@ from harness.evaluate import resolve
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import card_here
-from harness.evaluate.recompute import REPLAY
+from harness.evaluate.recompute import asked_card
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs import formats, pinned
@@ -182,9 +181,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             yield f"it has {amount(world.episodes, 'layout')} that were selected, and all count"
         elif world.name in others:
             yield f"another is of {printable(world.name, 40)}, too"
-        if m.model["engine"] == REPLAY:
+        answerers = m.answerers
+        if answerers.helpers is None or answerers.temperature is None:
             yield "its answers are replayed, and it does not state how they were asked"
-        if m.helpers:
+        if answerers.helpers:
             yield "its helpers are of other models, and one model answers for all"
         if changed := [key for key, value in _agent(m).items() if value != agent[key]]:
             yield (
@@ -203,7 +203,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             ("sums", m.sums, "refuse"),
             ("image", m.image, "own"),
             ("flip", m.flip, False),
-            ("temperature", m.settings.temperature, 0.0),
+            ("temperature", answerers.temperature, 0.0),
             ("sampling seed", m.settings.sampling_seed, 0),
         )
         for what, value, wanted in settings:
@@ -223,7 +223,7 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise self._differs(
                 f"prompt {prompt.version}", prompt.sha256, self.prompts[prompt.version]
             )
-        card = card_here(convert(m.model, Card, f"{printable(run.path)}: its model"))
+        card = card_here(asked_card(run))
         how: Any = (m.answer, m.thinking, m.image, m.letters, m.sums, m.flip)
         ego, points = Agent(card, prompt, *how), resolve.points(self.condition)
         decision_settings = deciding(m.settings)
@@ -239,8 +239,9 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 def _agent(m: Manifest) -> dict[str, Any]:
     """Return who answered, and how; prompts may differ by family."""
-    agent = {**m.agent(0), "temperature": m.settings.temperature}
-    agent["identity"] = formats.identity(m.identity)
+    answerers = m.answerers
+    agent = {**m.agent(0), "model": answerers.model, "temperature": answerers.temperature}
+    agent["identity"] = formats.identity(answerers.identity)
     return {key: value for key, value in agent.items() if key != "prompt"}
 
 

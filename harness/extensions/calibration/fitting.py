@@ -15,7 +15,6 @@ from harness.core.files import write_whole
 from harness.core.seeds import seeds_text
 from harness.dataset import rebuilt
 from harness.dataset.forest import Forest
-from harness.evaluate.recompute import REPLAY
 from harness.evaluate.texts import refuse_others
 from harness.extensions.calibration.calibrations import (
     COOLEST,
@@ -112,14 +111,15 @@ def calibrate(
         raise UserError(
             f"{name} was driven, and no tree says what follows; give a run of `harness eval`"
         )
-    if manifest.model["engine"] == REPLAY:  # which states neither of the run that it replays
-        raise UserError(f"{name}: it replays another run's answers; give that run")
-    if manifest.helpers or manifest.settings.temperature:
-        reason = (
-            "its helpers have a model of their own"
-            if manifest.helpers
-            else "its answers are sampled"
+    answerers = manifest.answerers
+    if answerers.helpers is None or answerers.temperature is None:
+        raise UserError(
+            f"{name}: it replays another run's answers, and does not state how they were asked; "
+            "give that run"
         )
+    if answerers.helpers or answerers.temperature:
+        of_others = "its helpers have a model of their own"
+        reason = of_others if answerers.helpers else "its answers are sampled"
         raise UserError(f"{name}: {reason}; give a run with one model, whose answers are greedy")
     data = dataset_of(run, dataset).of_episodes(run.grid.episodes)
     forest = data.forest
@@ -143,7 +143,7 @@ def calibrate(
         last,
         data.scenario.name,
         tuple(run.actions),
-        question_of(manifest.agent(0)),
+        question_of({**manifest.agent(0), "model": answerers.model}),
         corrections["ego"],
         corrections.get("helper"),
     )

@@ -375,6 +375,29 @@ def test_who_sees_everything_is_known_here_whatever_a_file_says(project: Harness
     assert "holds no answer for" in err, "that driver comes to other scenes"
 
 
+@pytest.mark.slow
+def test_a_replay_is_an_entry_of_the_model_that_was_asked(project: Harness, made: Path) -> None:
+    usual = ("--dataset", "small", "--seeds", "0:2", "--latency", "paper", "--quiet")
+    conditions = ("--condition", "single-local", "--condition", "6g")
+    replay = ("--model", "replay:entry/small", *usual, *conditions, "--out", "again")
+    assert project("eval", *replay)[0] == 0
+    assert project("benchmark", "pack", "again", "--edition", "mine-1")[0] == 0
+    code, out, err = project("benchmark", "board", "again.zip", "--json")
+    [line] = json.loads(out)
+    assert (code, err, line["equal"], line["agents"]) == (
+        0,
+        "",
+        True,
+        "proxy-faulty · a rule",
+    )
+    changed(Path("again.zip"), lambda files: answers(files, spoil))
+    assert project("benchmark", "verify", "again.zip", "--quiet")[0] == 1, "the rule is asked"
+
+
+def spoil(answer: dict[str, object]) -> None:
+    answer["raw"] = str(answer["raw"]).replace("0.1", "0.2")
+
+
 @pytest.mark.exhaustive
 def test_a_driver_is_computed_again_from_its_own_answers(project: Harness) -> None:
     code, _, err = project(

@@ -17,6 +17,7 @@ from run_on_disk import configure, damage
 from harness.core.errors import UserError
 from harness.core.resources import MARKER
 from harness.dataset.build import build
+from harness.dataset.load import load
 from harness.extensions.calibration.calibrations import (
     OF_QUESTION,
     Calibration,
@@ -198,14 +199,24 @@ def test_nothing_is_fitted_on_an_intent_that_no_text_states(
         calibrate(run, "L1", two_path, "")
 
 
-def test_a_replay_is_refused_since_it_does_not_state_who_was_asked(
+def test_of_a_replay_is_fitted_what_is_fitted_of_the_run_that_was_asked(
     two_run: Path, two_path: Path, tmp_path: Path
 ) -> None:
-    run = Path(shutil.copytree(two_run, tmp_path / "run"))
-    model = json.loads((run / "run.json").read_text())["model"]
-    configure(run, model={**model, "name": "replay:r", "engine": "replay", "weights": "r"})
-    with pytest.raises(UserError, match="it replays another run's answers; give that run"):
-        calibrate(run, "L1", two_path, "")
+    """Its helpers and temperature are those of that run; earlier replays do not state them."""
+    again = tmp_path / "again"
+    run(spec_of(load(two_path), f"replay:{two_run}"), again)
+    fitted, replayed = (calibrate(each, "L1", two_path, "") for each in (two_run, again))
+    assert fitted[1] == replayed[1]
+    assert fitted[0].question == replayed[0].question
+    identity = read(again).manifest.identity
+    for change, said in (
+        ({"temperature": 0.7}, "its answers are sampled"),
+        ({"helpers": [{"model": {}}]}, "its helpers have a model of their own"),
+        ({"helpers": None}, "does not state how they were asked; give that run"),
+    ):
+        configure(again, identity={**identity, "of": {**identity["of"], **change}})
+        with pytest.raises(UserError, match=said):
+            calibrate(again, "L1", two_path, "")
 
 
 @pytest.mark.slow
