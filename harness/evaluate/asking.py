@@ -17,8 +17,9 @@ import numpy as np
 from msgspec import UNSET
 
 from harness.backends import cards
-from harness.backends.base import Backend, Request, Served, forget, served, window
+from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
 from harness.backends.card import Card
+from harness.backends.token_counts import least_tokens
 from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
@@ -310,7 +311,8 @@ class Asker:
 
     def _answers(self, backend: Backend, chunk: Sequence[Request]) -> dict[str, Answer]:
         forget(backend)  # so that a run that resumes, and one of several repeats, answer alike
-        answers = [answer_of(r, c) for r, c in zip(chunk, backend.complete(chunk), strict=True)]
+        pairs = zip(chunk, backend.complete(chunk), strict=True)
+        answers = [self._answer(request, completion) for request, completion in pairs]
         repairs, flips = {}, {}
         for place, (request, answer) in enumerate(zip(chunk, answers, strict=True)):
             if flip.wanted(request, answer):
@@ -321,7 +323,7 @@ class Asker:
                 repairs[place] = repair.repair_request(request, answer, prompt, words)
         completions = backend.complete(list(repairs.values())) if repairs else []
         for place, completion in zip(repairs, completions, strict=True):
-            answers[place] = repair.together(answers[place], answer_of(chunk[place], completion))
+            answers[place] = repair.together(answers[place], self._answer(chunk[place], completion))
         completions = backend.complete(list(flips.values())) if flips else []
         for place, completion in zip(flips, completions, strict=True):
             answers[place] = flip.compared(answers[place], answer_of(flips[place], completion))
@@ -330,6 +332,20 @@ class Asker:
             if agent is not UNSET:
                 answers[place] = msgspec.structs.replace(answers[place], agent=agent)
         return {request.id: answer for request, answer in zip(chunk, answers, strict=True)}
+
+    def _answer(self, request: Request, completion: Completion) -> Answer:
+        """Return the answer that a completion gives, as what times answers by tokens takes it.
+
+        A server may state fewer tokens of a prompt than its text can have; they are unknown then,
+        or time and energy would follow from them.
+        """
+        answer = answer_of(request, completion)
+        if self.spec.timer is None or answer.prompt_tokens is None:
+            return answer
+        characters = sum(len(message["content"]) for message in request.messages)
+        if answer.prompt_tokens >= least_tokens(characters):
+            return answer
+        return msgspec.structs.replace(answer, prompt_tokens=None)
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
         """Return what every viewer intends; NaN if it has no request or its answer failed."""

@@ -307,9 +307,18 @@ def test_an_engines_error_is_no_answer_to_be_timed(counted: Callable[..., folder
         counted(ALONE, more={"00001-0/v1": broken})
 
 
-def test_tokens_that_nobody_counted_are_refused(small: Dataset, tmp_path: Path,
-                                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: Scripted({}))
+class Undercounted(Scripted):
+    """It states fewer tokens of its prompts than these can have."""
+
+    def _say(self, request: Request) -> Completion:
+        return replace(super()._say(request), prompt_tokens=0, completion_tokens=10)
+
+
+@pytest.mark.parametrize("engine", [Scripted, Undercounted])
+def test_tokens_that_nobody_counted_are_refused(
+    engine: type[Scripted], small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "open_backend", lambda *_, **__: engine({}))
     with pytest.raises(
         UserError, match=r"/v1 has no token counts, so no device profile can time it; use"
     ):
