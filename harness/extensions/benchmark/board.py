@@ -83,11 +83,21 @@ def lines(entries: Sequence[Rescored]) -> list[Line]:
             rank = _rank(suite, contestants, edition, metric)
         success = {condition: suite.score(condition, metric) for condition in conditions}
         board.append(Line(entry, rank, success, _gain(suite, edition, metric)))
-    count = Counter(line.name for line in board)
-    named = [
-        replace(line, file=line.entry.file) if count[line.name] > 1 else line for line in board
-    ]
-    return sorted(named, key=lambda line: -_value(line.success[edition.ranked_by]))
+    return sorted(_apart(board), key=lambda line: -_value(line.success[edition.ranked_by]))
+
+
+def _apart(board: Sequence[Line]) -> list[Line]:
+    """Return the lines, each of another name: of its file where models and prompts are the same.
+
+    Files whose names and folders are the same are numbered; a page names no other folder.
+    """
+    count, numbers, lines = Counter(line.name for line in board), Counter[str](), list[Line]()
+    for line in board:
+        named = replace(line, file=line.entry.file) if count[line.name] > 1 else line
+        numbers[named.name] += 1
+        number = numbers[named.name]
+        lines.append(named if number == 1 else replace(named, file=f"{named.file} ({number})"))
+    return lines
 
 
 def _privileged(suite: SuiteRun) -> bool:

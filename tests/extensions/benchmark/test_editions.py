@@ -695,6 +695,9 @@ def test_entries_of_one_name_are_named_by_their_files_as_well(tmp_path: Path) ->
     assert [line.name for line in board.lines([one])] == ["made-up · a rule"]
     names = {line.name for line in board.lines([one, other])}
     assert names == {"made-up · a rule · a.zip", "made-up · a rule · b.zip"}
+    alike = board.lines([one, replace(other, file=one.file)])
+    numbered = [line.name for line in alike]
+    assert numbered == ["made-up · a rule · a.zip", "made-up · a rule · a.zip (2)"]
 
 
 def test_the_next_edition_tells_apart_what_the_first_does_not(tmp_path: Path) -> None:
