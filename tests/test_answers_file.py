@@ -233,6 +233,16 @@ def test_rounds_go_on_in_the_folder_of_their_own_and_no_file_is_taken_for_one(
     assert (code, err) == (2, "harness: --out a.jsonl is no folder; give another name\n")
 
 
+def test_questions_with_pictures_are_not_written_without_them(
+    two_path: Path, harness: Harness
+) -> None:
+    typed = ("eval", "--model", "swarm-tiny-vl", "--prompt", "v8", "--dataset", two_path)
+    code, out, err = harness(*typed, "--dry-run", "--out", "asked")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "--out: prompt v8 shows a picture, and questions are written as text" in err
+    assert not Path("asked").exists()
+
+
 OPTIONS = {
     (): "name what answered, such as --model my-model",
     ("--model", "m", "--engine", "openai"): "no engine answers here; leave --engine out",

@@ -83,6 +83,9 @@ def command(
         from harness.evaluate.dry_run import count
 
         pairs = list(zip(specs, datasets, strict=True))
+        by_id: dict[str, Question] = {}
+        for pair in pairs if out else ():
+            by_id |= questions.first(*pair)
         counts = [count(spec, dataset, tokenizer) for spec, dataset in pairs]
         if as_json:
             echo_json(counts if named_suite else counts[0])
@@ -90,9 +93,6 @@ def command(
             for spec, counted in zip(specs, counts, strict=True):
                 show_counted(spec, counted)
         if out:
-            by_id: dict[str, Question] = {}
-            for pair in pairs:
-                by_id |= questions.first(*pair)
             file = questions.write(by_id.values(), out)
             if not silent:
                 typer.echo(f"wrote {amount(len(by_id), 'question')} to {printable(file)}")

@@ -102,8 +102,15 @@ def write(questions: Iterable[Question], out: Path) -> Path:
 def first(spec: Spec, dataset: Dataset) -> dict[str, Question]:
     """Return the questions of an evaluation on the reference drivers' courses, by id.
 
-    They are those that a dry run counts. Which others follow depends on the answers.
+    They are those that a dry run counts. Which others follow depends on the answers. Raises
+    UserError if a prompt shows a picture, which no line of text can hold.
     """
+    for agent in spec.agents:
+        if agent.prompt.image and agent.image != "none":
+            raise UserError(
+                f"--out: prompt {agent.prompt.version} shows a picture, and questions are written "
+                "as text; leave --out out, or give another prompt, or --image none"
+            )
     return {question.id: question for question in _planned(spec, dataset)}
 
 
