@@ -25,6 +25,7 @@ Lane = tuple[str, str, int]  # highway-env's lane index: two nodes, and a number
 STEP_M = 0.25  # distance between the points of a path
 STRAIGHT_M = 1e-6  # a path is straight if no point is farther from the line through its first two
 ONE_LANE_M = 1.0  # ways nearer to each other than this share a lane
+KEPT = 1024  # results of a path's look-ups that stay in memory
 BEND_M = 3.0  # distance before and after a point over which its curvature is measured
 STRIPED = 1  # highway-env's LineType of a line that may be crossed
 NORTH = np.array([1.0, -1.0])  # factors from this frame to that of pictures
@@ -133,15 +134,18 @@ class Path:
         return float(np.abs(np.diff(np.unwrap(self.headings_rad))).max())
 
     # Cached, since every viewer of a scene looks at the same vehicles, and branches of a scene
-    # share most.
-    @lru_cache(maxsize=8192)  # noqa: B019 paths live as long as their road, which is never freed
-    def project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
-        """Project a position on the path: arc length (m), unsigned lateral offset (m), heading.
+    # share most; by path, so that a road that is let go takes its cache along.
+    @cached_property
+    def project(self) -> Callable[[float, float], tuple[float, float, float]]:
+        """Return the function that projects a position on the path, which keeps its last results.
 
-        `x_m` and `y_m` are m to the east and south of the road's origin; the arc length is the
-        distance along the path from its beginning. The heading is that of the path there, rad from
-        +x (east) towards +y (south).
+        It takes m to the east and south of the road's origin, and returns arc length (m), unsigned
+        lateral offset (m) and heading. The arc length is the distance along the path from its
+        beginning; the heading is that of the path there, rad from +x (east) towards +y (south).
         """
+        return lru_cache(maxsize=KEPT)(self._project)
+
+    def _project(self, x_m: float, y_m: float) -> tuple[float, float, float]:
         arc, lateral, heading = self.project_all(np.array([x_m]), np.array([y_m]))[:, 0].tolist()
         return arc, lateral, heading
 
@@ -183,13 +187,16 @@ class Path:
     def _tree(self) -> shapely.STRtree:
         return shapely.STRtree(shapely.points(self.points))
 
-    @lru_cache(maxsize=8192)  # noqa: B019
-    def at(self, arc_m: float) -> tuple[float, float, float]:
-        """Return x (m), y (m) and heading (rad) of the path at an arc length.
+    @cached_property
+    def at(self) -> Callable[[float], tuple[float, float, float]]:
+        """Return the function that gives x (m), y (m) and heading (rad) of the path somewhere.
 
-        `arc_m` is the distance from the path's beginning, m. x is to the east and y to the south of
-        the road's origin.
+        It takes an arc length, the distance from the path's beginning, m, and keeps its last
+        results. x is to the east and y to the south of the road's origin.
         """
+        return lru_cache(maxsize=KEPT)(self._at)
+
+    def _at(self, arc_m: float) -> tuple[float, float, float]:
         x, y, heading = self.places(np.array(arc_m))
         return float(x), float(y), float(heading)
 
