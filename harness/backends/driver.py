@@ -14,15 +14,17 @@ from harness.world.drivers import (
     DRIVERS,
     OPEN_LOOP,
     OPEN_LOOPS,
+    RECORDED,
     UNIFORM,
     choices,
     constant,
+    drivers_of,
     open_loop,
 )
 from harness.world.precedence import RULES
 from harness.world.scenario import Scenario
 
-REFERENCES = (*DRIVERS, *RULES, UNIFORM, CONSTANT, OPEN_LOOP)
+REFERENCES = (*DRIVERS, *RULES, UNIFORM, CONSTANT, OPEN_LOOP, RECORDED)
 # What the choice of those that look at nothing follows from, by name
 CHOSEN = {CONSTANT: ("constants", CONSTANTS), OPEN_LOOP: ("open_loops", OPEN_LOOPS)}
 
@@ -55,6 +57,11 @@ class DriverBackend:
         scenario = requests[0].scenario
         if scenario is None:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
+        if self.driver == RECORDED and RECORDED not in drivers_of(scenario):
+            raise UserError(
+                f"driver {RECORDED}: nobody was recorded in {printable(scenario.name)}; take a "
+                "dataset of a recording"
+            )
         if self.driver == UNIFORM:
             return [self._answer(request, request.actions) for request in requests]
         cases = [

@@ -45,7 +45,7 @@ from harness.dataset.schema import (
 )
 from harness.dataset.verify import level_name, read_manifest, tree_name
 from harness.world import scenarios
-from harness.world.drivers import DRIVERS
+from harness.world.drivers import drivers_of
 from harness.world.families import keep
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
@@ -151,6 +151,7 @@ def build(
     if start := work.start_of(out, work.WorkStart):
         work.same(out, {**config, "shard": part}, {**start.settings, "shard": start.shard})
     elif scenario.world:
+        scenario.at(seed + episodes - 1)  # where layouts are finite, this may be none of them
         scenario.world.examine(scenario, seed)
     with work.working(out, start or work.WorkStart(settings=config, shard=part)) as place:
         own_files = _write_own_files(scenario, out)
@@ -385,7 +386,7 @@ def _check(scenario: Scenario, trees: Sequence[Tree]) -> None:
     """
     forest = Forest.of(trees, scenario.actions, scenario.parameters)
     layouts = drive_all(scenario, forest.seeds.tolist())
-    for driver in DRIVERS:
+    for driver in drivers_of(scenario):
         last_edges = forest.last_edge(forest.drivers[driver]).tolist()
         success = forest.driver_success(driver).tolist()
         for n, outcomes in enumerate(layouts):

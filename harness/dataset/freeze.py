@@ -17,7 +17,7 @@ from harness.dataset.schema import Branching, Danger, Edge, End, Record, scene_i
 from harness.world import lockstep
 from harness.world.beacons import state_by_beacon
 from harness.world.conflict_measures import rounded
-from harness.world.drivers import DRIVERS, choices
+from harness.world.drivers import choices, drivers_of
 from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
@@ -146,11 +146,11 @@ def _drivers(
     scenario: Scenario, states: Sequence[WorldState], ego_graphs: Sequence[SceneGraph]
 ) -> list[dict[str, str]]:
     """Return each reference driver's action at some decision points, by the driver's name."""
-    cases = []
+    drivers, cases = drivers_of(scenario), []
     for graph, truth in zip(ego_graphs, truth_graphs(scenario, states), strict=True):
-        cases += [(driver, graph, truth) for driver in DRIVERS]
+        cases += [(driver, graph, truth) for driver in drivers]
     actions = iter(choices(scenario, cases))
-    return [dict(zip(DRIVERS, actions, strict=False)) for _ in states]
+    return [dict(zip(drivers, actions, strict=False)) for _ in states]
 
 
 def record_of(

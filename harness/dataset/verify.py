@@ -29,7 +29,7 @@ from harness.dataset.schema import (
     scene_id,
 )
 from harness.world import scenarios
-from harness.world.drivers import DRIVERS
+from harness.world.drivers import drivers_of
 from harness.world.families import keep
 from harness.world.scenario import Scenario
 from harness.world.state import Snapshot
@@ -273,6 +273,7 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
     Types are checked elsewhere.
     """
     actions = Counter(manifest.actions)
+    drivers = set(drivers_of(scenarios.get(manifest.scenario)))
     points = [point for level in tree.levels for point in level]
     edges = [edge for point in points for edge in point.edges]
     ids = [point.scene for point in points]
@@ -296,9 +297,7 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
         "there is not a digest a level": len(tree.scenes_sha256) == len(tree.levels),
         "two decision points have one id": len(set(ids)) == len(ids),
         "an id is not <episode>-<step>-<digest>": ids_fit,
-        "a reference driver is missing": all(
-            point.drivers.keys() == set(DRIVERS) for point in points
-        ),
+        "a reference driver is missing": all(point.drivers.keys() == drivers for point in points),
         "a reference driver's action is not one of the manifest's": chosen <= actions.keys(),
         "the edges of a decision point are not one an action": one_edge_an_action,
         "an edge leads nowhere, or goes on after the end": all(

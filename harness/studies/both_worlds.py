@@ -12,7 +12,7 @@ from harness.core.statistics import Estimate
 from harness.dataset.load import Dataset
 from harness.runs.estimates import difference, over_episodes
 from harness.runs.headline import SUCCESS
-from harness.world.drivers import DRIVERS
+from harness.world.drivers import drivers_of
 
 COMPARED = ("frozen", "closed", "difference", "agreement")
 
@@ -51,7 +51,7 @@ def rank(
     ends = drive_apart(dataset.scenario, dataset.seeds, workers, progress)
     frozen = dataset.reference_success()
     standings = {}
-    for driver in DRIVERS:
+    for driver in drivers_of(dataset.scenario):
         closed = np.array([float(of_episode[driver].success) for of_episode in ends])
         standings[driver] = compared(frozen[driver][None], closed[None], dataset.clusters)
     return standings

@@ -4,6 +4,9 @@
 and `full-view` plans with everything in view. `right-hand` and `first-come` know what `local-view`
 knows, and keep a rule of the road with those who keep it, too (`precedence`).
 
+`recorded` is of worlds that replay a recording alone (`OwnWorld.drivers`), and reads no more than
+the ego's own place in what `local-view` knows.
+
 Three references look at nothing at all. `uniform` holds every action for equally likely. `constant`
 always takes the action that did best in a scenario's tune layouts: `constants.csv` has what each
 clears, and `benchmarks/constants.py` writes it. Where `limits` is 2, best is success balanced over
@@ -28,6 +31,7 @@ ALWAYS = {"cruise": "IDLE", "brake": "SLOWER"}
 PRIVILEGED = "full-view"  # the only one that may read the truth
 LOOKING = ("local-view", PRIVILEGED, *RULES)  # decide by a scene graph
 UNIFORM, CONSTANT, OPEN_LOOP = "uniform", "constant", "open-loop"
+RECORDED = "recorded"  # who was recorded as the ego; only worlds that replay a recording have it
 BLIND = (*ALWAYS, UNIFORM, CONSTANT, OPEN_LOOP)  # look at nothing
 CONSTANTS = Path(__file__).with_name("constants.csv")
 OPEN_LOOPS = Path(__file__).with_name("open_loop.csv")
@@ -60,10 +64,26 @@ def choices(
     `scenario`. Raises ValueError if a driver was not given the graph that it reads.
     """
     always = {**{action: action for action in scenario.actions}, **ALWAYS}
-    planned = iter(
-        plans(scenario, [_read(scenario, *each) for each in requests if each[0] not in always])
-    )
-    return [always.get(driver) or next(planned) for driver, *_ in requests]
+    of_world = scenario.world.drivers() if scenario.world else {}
+    looking = [each for each in requests if each[0] not in always and each[0] not in of_world]
+    planned = iter(plans(scenario, [_read(scenario, *each) for each in looking]))
+    actions = []
+    for driver, graph, _ in requests:
+        if driver in of_world and driver not in always:
+            if graph is None:
+                raise ValueError(f"driver {driver!r} was not given the graph that it reads")
+            actions.append(of_world[driver](scenario, graph))
+        else:
+            actions.append(always.get(driver) or next(planned))
+    return actions
+
+
+def drivers_of(scenario: Scenario) -> tuple[str, ...]:
+    """Return the reference drivers whose actions the decision trees of a scenario have.
+
+    They are those of `DRIVERS`, and those that only its worlds have (`OwnWorld.drivers`).
+    """
+    return (*DRIVERS, *(scenario.world.drivers() if scenario.world else ()))
 
 
 def constant(scenario: Scenario) -> str | None:

@@ -1,10 +1,11 @@
 """Define a world that something beside the harness's simulator plays."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
 from harness.world.state import ActionsTaken, WorldState
 from harness.world.world import World
 
@@ -69,5 +70,14 @@ class OwnWorld(World):
 
         It is the content of each file by its name, such as the traffic that was recorded; a reader
         of scenario names finds them in the dataset's folder (`Family.kept_in`). Empty for nothing.
+        """
+        return {}
+
+    @classmethod
+    def drivers(cls) -> Mapping[str, Callable[[Scenario, SceneGraph], str]]:
+        """Return the reference drivers that only such worlds have, by name; mostly none.
+
+        A driver takes a scenario and the ego's scene graph and returns the action that it takes,
+        such as `SLOWER`; for its name there is a model card. One is who was recorded as the ego.
         """
         return {}

@@ -10,7 +10,7 @@ from harness.core.arrays import Ints
 from harness.core.parallel import Workers, spread
 from harness.core.statistics import Estimate, cluster_numbers, mean_of, rate_interval
 from harness.world import lockstep
-from harness.world.drivers import DRIVERS, LOOKING, PRIVILEGED, choices
+from harness.world.drivers import BLIND, PRIVILEGED, choices, drivers_of
 from harness.world.outcome import Outcome
 from harness.world.perception.graph import scene_graphs, truth_graphs
 from harness.world.scenario import Scenario
@@ -57,7 +57,7 @@ def _graphs(
     """Return the graphs of the agents whose drivers look, all of whom have one scenario."""
     sensing, truthful = dict[Place, WorldState](), dict[Place, WorldState]()
     for n, agent in places:
-        if drivers[n] in LOOKING:
+        if drivers[n] not in (*BLIND, *scenario.actions):
             states = truthful if drivers[n] == PRIVILEGED else sensing
             states[n, agent] = worlds[n].state(agent)
     looks = [(state, state.ego.id) for state in sensing.values()]
@@ -117,8 +117,8 @@ def take_turn(worlds: Sequence[World], actions: Sequence[Mapping[int, str]]) -> 
 def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
     """Drive the episode of a layout seed with a reference driver, and return the ego's outcome.
 
-    The seed draws the episode's start in `scenario`. `driver` is a name of `DRIVERS`, such as
-    `full-view`, which sees everything. Success is not yet judged for being `late`
+    The seed draws the episode's start in `scenario`. `driver` is a name of `drivers_of`, such
+    as `full-view`, which sees everything. Success is not yet judged for being `late`
     (`Outcome.judged`).
     """
     [outcome] = finish([World.start(scenario, seed)], [driver])
@@ -126,18 +126,19 @@ def drive(scenario: Scenario, driver: str, seed: int) -> Outcome:
 
 
 def drive_all(scenario: Scenario, seeds: Sequence[int]) -> list[dict[str, Outcome]]:
-    """Drive each seed's episode with every driver of `DRIVERS`; return outcomes by driver.
+    """Drive each seed's episode with every driver of its trees; return outcomes by driver.
 
     There is one dict for each of `seeds`, layout seeds that draw the episodes' starts in
     `scenario`; a driver is a rule such as `brake`. An outcome is `late` if that driver reached the
     goal too long after `full-view`, which sees everything.
     """
-    worlds = [World.start(scenario, seed) for seed in seeds for _ in DRIVERS]
-    outcomes = finish(worlds, DRIVERS * len(seeds))
+    drivers = drivers_of(scenario)
+    worlds = [World.start(scenario, seed) for seed in seeds for _ in drivers]
+    outcomes = finish(worlds, drivers * len(seeds))
     layouts: list[dict[str, Outcome]] = []
-    for begin in range(0, len(worlds), len(DRIVERS)):
+    for begin in range(0, len(worlds), len(drivers)):
         danger = worlds[begin].layout.danger
-        unjudged = dict(zip(DRIVERS, outcomes[begin : begin + len(DRIVERS)], strict=True))
+        unjudged = dict(zip(drivers, outcomes[begin : begin + len(drivers)], strict=True))
         full_view, judged = unjudged[PRIVILEGED], {}
         for driver, outcome in unjudged.items():
             judged[driver] = outcome.judged(full_view, danger, scenario.parameters)
@@ -197,7 +198,7 @@ def check(
     dangerous = [scenario.layout(each, scenario.parameters).danger is not None for each in seeds]
     clusters = cluster_numbers([scenario.cluster_of(each) for each in seeds])
     summaries = {}
-    for driver in DRIVERS:
+    for driver in drivers_of(scenario):
         outcomes = [by_driver[driver] for by_driver in layouts]
         summaries[driver] = summary(outcomes, dangerous, clusters)
     return summaries
