@@ -71,6 +71,7 @@ ORDINARY = {
     "proxy": "the rule that stands for a model",
     "random": "of draws",
     "read-outs": "of a policy from a model's probabilities",
+    "recording": "what layouts may be cut from, and what a card denies",
     "repeats": "a verb, and evaluations alike",
     "risk": "an answer's level, and errors by confidence",
     "roads": "what lanes are on",

@@ -111,9 +111,15 @@ class EnvironmentWorld(OwnWorld):
         helpers = [v for v in nearest if _kind(v) in BROAD][: p.helpers]
         for v in nearest:
             world._enter(v, "helper" if v in helpers else "other")
+        danger, danger_id = world._danger()
+        world.layout = replace(layout, danger=danger, danger_id=danger_id)
         poses = beacons.lead_in(p, world._in_road_frame(world._poses()))
         world._broadcast(poses, 1 - len(poses))
         return world
+
+    def _danger(self) -> tuple[str | None, str | None]:
+        """Return the sector and the id of the dangerous vehicle; None where no danger is known."""
+        return None, None
 
     @classmethod
     def environment(cls, name: str, parameters: Parameters | None = None) -> Any:

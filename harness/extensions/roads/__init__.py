@@ -7,5 +7,8 @@ _HERE = "harness.extensions.roads"
 EXTENSION = Extension(
     name="roads",
     commands={"dataset import": f"{_HERE}.importing:command"},
-    adds={"channel_models": {"transmissions": f"{_HERE}.transmissions:from_profile"}},
+    adds={
+        "channel_models": {"transmissions": f"{_HERE}.transmissions:from_profile"},
+        "families": {"recording": f"{_HERE}.family:RECORDINGS"},
+    },
 )

@@ -1,0 +1,115 @@
+"""The family `recording`: scenarios that are recordings, found in folders by their digest."""
+
+import os
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from harness.core.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from harness.extensions.roads.tables import Recording
+    from harness.world.scenario import Scenario
+
+PREFIX, OPTION = "recording:", "recording"
+DIGITS = 12  # of a recording's digest, in its scenario's name
+FOLDERS = "SWARMDRIVE_RECORDINGS"  # environment variable: folders that may hold recordings
+
+
+class Recordings:
+    """Make scenarios of recordings, by names such as `recording:crossing@0123456789ab`.
+
+    A name has the digest of the recording, so its content is the same wherever it lies. `options`
+    are those of commands that take a scenario, by name, with their help. Methods are those of
+    `Family`.
+    """
+
+    heading = "Recordings"
+    options: ClassVar[Mapping[str, str]] = {
+        OPTION: "Folder of a recording to use instead of a scenario; `harness dataset import` "
+        "writes one.",
+    }
+
+    def named(self, typed: Mapping[str, str]) -> str:
+        from harness.extensions.roads.tables import read
+
+        text, settings = self.split(typed[OPTION])
+        folder = Path(text).absolute()
+        recording = read(folder)
+        _remember(folder)
+        name = f"{PREFIX}{recording.name}@{recording.digest[:DIGITS]}"
+        return self.joined(name, [settings] if settings else [])
+
+    def scenario(self, name: str) -> "Scenario":
+        from harness.extensions.roads.world import scenario  # imports highway-env
+
+        return scenario(name)
+
+    def split(self, text: str) -> tuple[str, str | None]:
+        name, _, settings = text.rpartition(":")
+        return (name, settings) if "=" in settings else (text, None)
+
+    def joined(self, name: str, settings: Sequence[str]) -> str:
+        return ":".join([name, *([",".join(settings)] if settings else [])])
+
+    def allow(self, name: str) -> str | None:
+        return None  # a dataset has the recording of its scenario
+
+    def kept_in(self, name: str, folder: Path) -> None:
+        from harness.extensions.roads.tables import FACTS
+
+        if (folder / FACTS).is_file():
+            _remember(folder.absolute())
+
+
+def _remember(folder: Path) -> None:
+    """Look for recordings in a folder, too, here and in worker processes."""
+    folders = _folders()
+    if str(folder) not in folders:
+        os.environ[FOLDERS] = os.pathsep.join([*folders, str(folder)])
+
+
+def _folders() -> list[str]:
+    return [folder for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
+
+
+def recording_of(name: str) -> "Recording":
+    """Return the recording of a scenario's name, from a folder that was typed or of a dataset.
+
+    Raises UserError where no such folder has one with the digest that the name has.
+    """
+    return _recording(name.removeprefix(PREFIX), tuple(_folders()))
+
+
+@lru_cache(maxsize=16)
+def _recording(name: str, folders: Sequence[str]) -> "Recording":
+    from harness.core.files import bytes_of, sha256_bytes
+    from harness.extensions.roads.tables import FACTS
+
+    _, at, digest = name.partition("@")
+    for folder in folders if at and len(digest) == DIGITS else ():
+        try:
+            whole = sha256_bytes(bytes_of(Path(folder) / FACTS, "record"))
+        except (OSError, ValueError):
+            continue
+        if whole.startswith(digest):
+            return _kept(folder, whole)
+    raise UserError(
+        f"recording {printable(name, 80)} is in no folder that is known; type its folder: "
+        f"--{OPTION} FOLDER, or set {FOLDERS}=FOLDER"
+    )
+
+
+@lru_cache(maxsize=16)
+def _kept(folder: str, digest: str) -> "Recording":
+    """Return the recording in a folder, the same object as long as its digest is the same."""
+    from harness.extensions.roads.tables import read
+
+    recording = read(Path(folder))
+    if recording.digest != digest:
+        raise UserError(f"recording {printable(folder)} changes; read it when it is written")
+    return recording
+
+
+RECORDINGS = Recordings()

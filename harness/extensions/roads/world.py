@@ -1,0 +1,195 @@
+"""Simulate an episode at a moment of a recording; make a scenario of a recording."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from typing import Any, cast
+
+import numpy as np
+
+from harness.core.files import bytes_of
+from harness.extensions.environments import place as environments
+from harness.extensions.environments.place import LIMIT
+from harness.extensions.environments.world import EnvironmentScenario, EnvironmentWorld
+from harness.extensions.environments.world import scenario as scenario_of_environment
+from harness.extensions.roads import driver
+from harness.extensions.roads.family import recording_of
+from harness.extensions.roads.tables import FACTS, SCHEMAS
+from harness.extensions.roads.traffic import LIMITS_MPS2, Recorded, nth
+from harness.world.parameters import DIALS
+from harness.world.road import PathKey
+from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
+from harness.world.simulator import LAMPS_MPS2
+from harness.world.state import Part
+
+
+@dataclass(frozen=True)
+class Parameters(environments.Parameters):
+    """Hold the parameters of a recording as a scenario.
+
+    Times are those of the recording; an ego that reaches its goal within the time limit is never
+    late, for the goal is where its recorded driver was.
+    """
+
+    braking_mps2: float = -LIMITS_MPS2[0]
+    acceleration_mps2: float = LIMITS_MPS2[1]
+    # whether the others react to who is off the recording; else they replay, whatever happens
+    react: bool = True
+
+
+@dataclass
+class RecordedWorld(EnvironmentWorld):
+    """Simulate one episode at a moment of a recording, frame by frame."""
+
+    env: Any = None  # a `Recorded`
+
+    @classmethod
+    def environment(cls, name: str, parameters: environments.Parameters | None = None) -> Recorded:
+        recording = recording_of(name)
+        if parameters is None:
+            return Recorded(recording)
+        p = cast("Parameters", parameters)
+        return Recorded(recording, p.react, p.time_limit_s)
+
+    @classmethod
+    def configuration(cls, scenario: Scenario) -> dict[str, Any]:
+        """Return how the recording's moments were chosen, for a dataset's manifest."""
+        recording = recording_of(scenario.name)
+        return {
+            "recording": recording.name,
+            "sha256": recording.digest,
+            "window_m": recording.window_m,
+            "choice": dict(recording.choice),
+        }
+
+    @classmethod
+    def files(cls, scenario: Scenario) -> Mapping[str, bytes]:
+        folder = recording_of(scenario.name).folder
+        return {name: bytes_of(folder / name, "rows") for name in (FACTS, *SCHEMAS)}
+
+    @classmethod
+    def drivers(cls) -> Mapping[str, Callable[[Scenario, SceneGraph], str]]:
+        return {driver.NAME: driver.action}
+
+    def _danger(self) -> tuple[str | None, str | None]:
+        """Return the sector and the id of the hidden road user of the moment; None for none."""
+        hidden = self.env.setting.moment.hidden
+        v = next((v for v in self.everybody[1:] if v.track.id == hidden), None)
+        if v is None:
+            return None, None
+        sectors = self.here.road.sectors
+        # who comes on no path that meets the ego's is on that, or beside
+        sector = v.spawn.approach if v.spawn.approach in sectors else next(iter(sectors))
+        return sector, v.spawn.id
+
+    def _enter(self, v: Any, part: Part) -> None:
+        number = getattr(v, "number", 0)
+        if number:
+            helpers = self.env.helpers(self.scenario.parameters.helpers)  # type: ignore[attr-defined]
+            part = "helper" if number in helpers and not self.frame else "other"
+        super()._enter(v, part)
+        v.spawn = replace(v.spawn, id=f"v{number + 1}")
+
+    def _place(self, v: Any) -> None:
+        number = getattr(v, "number", 0)
+        if not number:
+            super()._place(v)
+            return
+        play = self.env.road.play
+        approach, route = self._key(number, int(play.place[number]))
+        if (approach, route) != (v.spawn.approach, v.spawn.route):
+            v.spawn = replace(v.spawn, approach=approach, route=route)
+
+    def _key(self, number: int, frame: int) -> PathKey:
+        """Return the path on which a road user is recorded in a frame."""
+        setting = self.env.setting
+        frame = setting.looked_at(number, frame)
+        if (number, frame) not in setting.keys:
+            lane, road = setting.lanes(number)[frame], self.here.road
+            keys: list[PathKey] = [road.ego]
+            if lane is not None:
+                keys = self.here.routes.keys(lane, setting.plan(number, frame)) or keys
+            setting.keys[number, frame] = keys[0]
+        return cast("PathKey", setting.keys[number, frame])
+
+    def branch(self) -> "RecordedWorld":
+        env = self.env.branch()
+        journeys = {agent: replace(journey) for agent, journey in self.journeys.items()}
+        everybody = [env.vehicle, *[env.road.puppets[v.number] for v in self.everybody[1:]]]
+        return replace(self, env=env, road=env.road, everybody=everybody, journeys=journeys)
+
+    def _solid(self) -> list[Any]:
+        """Return who is on the road; who enters does so when periods end."""
+        if self.frame % self.period == 0:
+            return list(self.road.vehicles)
+        known_ids = {id(v) for v in self.everybody}
+        return [v for v in self.road.vehicles if id(v) in known_ids]
+
+    def _move(self) -> None:
+        self.constants.restore()
+        road, ego = self.env.road, self.everybody[0]
+        before = ego.position.copy()
+        road.act()
+        ego.braking = ego.action["acceleration"] < -LAMPS_MPS2
+        road.step(1 / self.scenario.parameters.simulation_hz)
+        ego.to_go_m -= float(np.hypot(*(ego.position - before)))
+
+
+class RecordedScenario(EnvironmentScenario):
+    """Describe a recording as a scenario; each layout is a moment of it, with its road."""
+
+    def __post_init__(self, start: Any) -> None:
+        super().__post_init__(start)
+        if self.layouts is not None:
+            object.__setattr__(self, "layouts", Moments(self.name))
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Return, when called with a layout seed, the scenario whose place becomes that moment's."""
+
+    name: str  # the scenario's name
+
+    def __call__(self, seed: int) -> Scenario:
+        nth(recording_of(self.name), seed)
+        return scenario(self.name)
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Return, when called with a layout seed, the scene from which its layout is cut."""
+
+    name: str  # the scenario's name
+
+    def __call__(self, seed: int) -> str:
+        return nth(recording_of(self.name), seed).scene
+
+
+@lru_cache(maxsize=16)
+def scenario(name: str) -> Scenario:
+    """Return a recording as a scenario, by its name, such as `recording:crossing@0123456789ab`.
+
+    Raises UserError if no folder that is known has the recording, or it has no moments.
+    """
+    recording = recording_of(name)
+    facts = recording.facts
+    base = scenario_of_environment(name, RecordedWorld)
+    values = {field.name: getattr(base.parameters, field.name) for field in fields(base.parameters)}
+    values |= {
+        "decisions": facts.decisions,
+        "time_limit_s": (facts.decisions + LIMIT) * facts.period_s,
+        "delay_allowance_s": (facts.decisions + LIMIT) * facts.period_s,
+        "braking_mps2": -LIMITS_MPS2[0],
+        "acceleration_mps2": LIMITS_MPS2[1],
+    }
+    parts = {field.name: getattr(base, field.name) for field in fields(Scenario)}
+    parts |= {
+        "description": f"Scenario {name}: moments of recorded traffic.\n",
+        "parameters": Parameters(**values),
+        "dials": (*DIALS, "react", "decisions", "helpers", "time_limit_s", "delay_allowance_s"),
+        "source": recording.source,
+        "licence": recording.licence,
+        "cluster": Scenes(name),
+    }
+    return RecordedScenario(**parts)

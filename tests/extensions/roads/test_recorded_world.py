@@ -1,0 +1,324 @@
+"""Recorded traffic: replayed to the centimetre, or reacting to an ego that drives otherwise."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from harness.backends import driver as driver_backend
+from harness.backends.base import Request
+from harness.core.errors import UserError
+from harness.core.seeds import FIRST
+from harness.dataset.build import build
+from harness.dataset.load import load
+from harness.dataset.verify import check
+from harness.extensions.roads import family, tables
+from harness.extensions.roads.family import RECORDINGS, recording_of
+from harness.extensions.roads.network import ground, streets
+from harness.extensions.roads.replay import HARDEST_MPS2, Cast, Play
+from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track
+from harness.extensions.roads.traffic import Recorded, box, frames_a_second, nth, setting
+from harness.extensions.roads.world import RecordedWorld
+from harness.world import scenarios
+from harness.world.reference import drive_all, finish
+from harness.world.scenario import Scenario
+from harness.world.world import World
+
+TIMES = np.arange(0.0, 20.01, 0.1)
+QUARTER = np.pi / 2
+Drive = Callable[[float], tuple[float, float, float, float]]
+
+
+def track(
+    key: str, drive: Drive, kind: str = "car", size: tuple[float, float] = (4.6, 1.8)
+) -> Track:
+    """Return who is at x, y, heading and speed for 20 seconds, as a function of the time says."""
+    return Track(key, kind, *size, TIMES, np.array([drive(time_s) for time_s in TIMES.tolist()]))
+
+
+def lane(key: str, ends: object, after: tuple[str, ...] = (), **beside: str) -> Lane:
+    points = np.array(ends, dtype=float)
+    return Lane(key, points, 3.5, 14.0, after, beside.get("left"), beside.get("right"))
+
+
+def crossing() -> Scene:
+    """Return a road of two lanes to the east that another crosses from the south, behind a house.
+
+    Five cars follow each other at 10 m/s; `x` comes from the south and passes between them. `p` is
+    parked beside the road, `w` waits in its left lane, and `b` cycles along the road to the south.
+    """
+    lanes = [
+        lane("a0", [(0, 0), (300, 0)], ("b0",), left="a1"),
+        lane("a1", [(0, 3.5), (300, 3.5)], ("b1",), right="a0"),
+        lane("b0", [(300, 0), (500, 0)], left="b1"),
+        lane("b1", [(300, 3.5), (500, 3.5)], right="b0"),
+        lane("c0", [(200, -200), (200, 200)]),
+    ]
+
+    def following(n: int) -> Track:
+        return track(f"e{n}", lambda time_s: (150 - 30 * n + 10 * time_s, 0, 0, 10))
+
+    tracks = [
+        *map(following, range(5)),
+        track("x", lambda time_s: (200, -69 + 8 * time_s, QUARTER, 8)),
+        track("p", lambda _: (180, 7.2, 0, 0)),
+        track("w", lambda time_s: (120 + 5 * max(0.0, time_s - 12), 3.5, 0, 5.0 * (time_s > 12))),
+        track("b", lambda time_s: (196, -60 + 4 * time_s, QUARTER, 4), "bicycle", (1.6, 0.65)),
+    ]
+    corner = np.array([(175.0, -30.0), (193, -30), (193, -8), (175, -8)])
+    houses = (House("h", corner),)
+    by_id = {each.id: each for each in tracks}
+    return Scene(
+        "s", "s.xml", "0" * 64, 0.1, False, by_id, {each.id: each for each in lanes}, houses
+    )
+
+
+MOMENTS = (
+    Moment("s", "e1", 2.0, None, None, "tune"),
+    Moment("s", "w", 3.0, None, None, "tune"),
+    Moment("s", "e2", 3.0, "x", 5.6, "report"),
+)
+
+
+@pytest.fixture(autouse=True)
+def no_folders(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(family.FOLDERS, "")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("hand-made")
+    speeds_mps = (0.0, 5.0, 10.0, 15.0)
+    facts = {"rule": "by hand", "candidates": 3, "left_out": {}}
+    tables.write(
+        place, "hand", "made by hand", "CC0-1.0", 80.0, [crossing()], MOMENTS, facts, speeds_mps
+    )
+    return place
+
+
+@pytest.fixture
+def scenario(folder: Path) -> Scenario:
+    return scenarios.get(RECORDINGS.named({"recording": str(folder)}))
+
+
+def cast_of(folder: Path, seed: int = 0) -> Cast:
+    recording = tables.read(folder)
+    return setting(recording, nth(recording, seed), 10, 8.0).cast
+
+
+@pytest.mark.parametrize("react", [False, True])
+@pytest.mark.parametrize("seed", [0, 1, FIRST["report"]])
+def test_as_long_as_nobody_is_off_it_is_the_recording(folder: Path, seed: int, react: bool) -> None:
+    cast = cast_of(folder, seed)
+    play, came = Play.start(cast, react), 0
+    for frame in range(80):
+        play.move(cast.poses[0, frame])
+        there = np.flatnonzero(play.there)[1:]
+        expected = cast.poses[there, frame + 1]
+        assert np.abs(play.poses[there] - expected).max() < 0.01
+        assert set(there) == {
+            n for n in range(1, len(cast.tracks)) if cast.enters[n] <= frame + 1 <= cast.leaves[n]
+        }
+        came += len(there)
+    assert came > 80
+
+
+def driven(folder: Path, react: bool, actions: dict[int, str]) -> tuple[Recorded, list[np.ndarray]]:
+    """Drive the first moment's ego by actions at frames; return where all are after each frame."""
+    env = Recorded(tables.read(folder), react)
+    env.reset(seed=0)
+    places = []
+    for frame in range(80):
+        if frame in actions:
+            env.vehicle.act(actions[frame])
+        env.road.act()
+        env.road.step(0.1)
+        places.append(env.road.play.poses.copy())
+    return env, places
+
+
+BRAKES = {0: "SLOWER", 10: "SLOWER"}
+
+
+@pytest.mark.parametrize(("react", "crashes"), [(True, False), (False, True)])
+def test_a_braking_ego_is_struck_by_who_replays(folder: Path, react: bool, crashes: bool) -> None:
+    env, places = driven(folder, react, BRAKES)
+    names = [each.id for each in env.setting.cast.tracks]
+    assert bool(env.vehicle.crashed) == crashes
+    follower = np.array([each[names.index("e2"), :4] for each in places])
+    stands = bool((follower[-1, 3] < 1.0) and not crashes)
+    assert stands == react
+    if react:
+        speeds = np.array([each[:, 3] for each in places])
+        assert np.nanmax((speeds[:-1] - speeds[1:]) * 10) <= HARDEST_MPS2 + 1e-6
+        ahead = np.array([each[names.index("e0"), 0] for each in places])
+        assert np.allclose(ahead, 150 + 10 * (2.1 + 0.1 * np.arange(80)))  # who is ahead drives on
+        recorded = env.setting.cast.poses[names.index("e2"), 1:81, 0]
+        assert (follower[:, 0] <= recorded + 1e-6).all()  # nobody is ahead of the recording
+        assert (np.diff(follower[:, 0]) >= -1e-9).all()
+
+
+def test_who_crosses_stops_for_an_ego_that_stands_on_its_path(folder: Path) -> None:
+    ends = {}
+    for react in (True, False):
+        play = Play.start(cast_of(folder), react)
+        x = [each.id for each in play.cast.tracks].index("x")
+        stands = np.array([200.0, 0.0, 0.0, 0.0])  # where the other road crosses, seen from above
+        for _ in range(75):
+            play.move(stands)
+        ends[react] = play.poses[x, 1], play.speed_mps[x]
+    assert ends[False] == pytest.approx((-7.0, 8.0), abs=0.1)  # it has gone through
+    assert ends[True][0] > (4.6 + 1.8) / 2 + 0.5
+    assert ends[True][1] < 3.0
+
+
+def test_who_was_late_catches_up_and_is_the_recording_again(folder: Path) -> None:
+    play = Play.start(cast_of(folder), True)
+    cast = play.cast
+    follower = [each.id for each in cast.tracks].index("e2")
+    for frame in range(75):
+        pose = cast.poses[0, frame].copy()
+        if 5 <= frame < 15:
+            pose[0] -= 8.0  # the ego is behind for a second
+        play.move(pose)
+        if frame == 14:
+            assert play.late[follower]
+    behind_m = cast.poses[follower, 75, 0] - play.poses[follower, 0]
+    assert 0 <= behind_m < 2.0
+
+
+def test_a_world_at_a_moment(scenario: Scenario) -> None:
+    world = World.start(scenario, 0)
+    assert isinstance(world, RecordedWorld)
+    ids = {v.track.id: v.spawn.id for v in world.vehicles[1:]}
+    parts = {v.track.id: v.spawn.part for v in world.vehicles[1:]}
+    kinds = {v.track.id: v.spawn.kind for v in world.vehicles[1:]}
+    assert [v.id for v in world.state().vehicles] == ["v1", *ids.values()]
+    assert parts == {key: "helper" if key in ("w", "e0", "e2") else "other" for key in parts}
+    assert kinds["b"] == "bicycle"
+    assert "p" in parts
+    [house] = world.state().buildings
+    size_m = house.east_m - house.west_m, house.south_m - house.north_m
+    assert size_m == pytest.approx((18, 22))
+    assert world.state().ego.speed_mps == pytest.approx(10)
+    assert (world.layout.danger, world.layout.danger_id) == (None, None)
+
+
+def test_dangers_goals_and_seeds(scenario: Scenario) -> None:
+    goals = {seed: scenario.at(seed).road().facts["goal"] for seed in (0, 1, FIRST["report"])}
+    assert goals == {0: "50m", 1: "5s", FIRST["report"]: "50m"}
+    dangerous = World.start(scenario, FIRST["report"])
+    [hidden] = [v for v in dangerous.vehicles if v.spawn.id == dangerous.layout.danger_id]
+    assert hidden.track.id == "x"
+    assert dangerous.layout.danger == hidden.spawn.approach
+    assert dangerous.layout.danger in dangerous.scenario.road().sectors
+    assert scenario.cluster is not None
+    assert scenario.cluster(0) == "s"
+    with pytest.raises(
+        UserError, match=r"hand has 2 moments to tune \(seeds 0 to 1\), and no seed 2"
+    ):
+        World.start(scenario, 2)
+    with pytest.raises(UserError, match=r"0 moments to train \(none\)"):
+        scenario.at(FIRST["train"])
+
+
+def test_a_branch_is_as_a_fresh_drive(scenario: Scenario) -> None:
+    for seed, actions in ((0, ["SLOWER", "FASTER"]), (FIRST["report"], ["LANE_LEFT", "SLOWER"])):
+        first = World.start(scenario, seed)
+        first.act(actions[0])
+        branch = first.branch()
+        branch.act(actions[1])
+        before = first.state()
+        other = first.branch()
+        other.act("IDLE")
+        assert first.state() == before
+        thawed = World.thaw(scenario, before, first.snapshot())
+        assert thawed.state() == before
+        thawed.act(actions[1])
+        assert thawed.state() == branch.state()
+        assert branch.state() != other.state()
+
+
+def test_the_recorded_driver_arrives_and_waits(scenario: Scenario) -> None:
+    for seed in (0, 1, FIRST["report"]):
+        world = World.start(scenario, seed)
+        [outcome] = finish([world], ["recorded"])
+        assert outcome.result == "cleared"
+        assert outcome.time_s == pytest.approx(5.0, abs=0.3)
+
+
+def test_nobody_was_recorded_elsewhere() -> None:
+    backend = driver_backend.DriverBackend("recorded")
+    scenario = scenarios.get("blind-merge")
+    request = Request("1", "ego", (), ("IDLE",), 100, scenario=scenario)
+    with pytest.raises(UserError, match=r"nobody was recorded in blind-merge"):
+        backend.complete([request])
+
+
+@pytest.mark.slow
+def test_a_dataset_is_sound_and_has_its_recording(
+    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None)
+    monkeypatch.setenv(family.FOLDERS, "")  # from here on it has its own
+    assert not check(tmp_path / "set")
+    dataset = load(tmp_path / "set")
+    assert dataset.manifest.source == "made by hand"
+    success = dataset.reference_success()
+    assert success["recorded"].tolist() == [1, 1]
+    [closed] = drive_all(dataset.scenario, [0])
+    assert {name: bool(success[name][0]) for name in closed} == {
+        name: outcome.success for name, outcome in closed.items()
+    }
+
+
+def test_a_recording_is_found_by_its_digest_alone(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    typed = RECORDINGS.named({"recording": f"{folder}:react=false"})
+    name, settings = RECORDINGS.split(typed)
+    assert settings == "react=false"
+    monkeypatch.setenv(family.FOLDERS, "")
+    (tmp_path / "recording.json").write_text("{}")
+    RECORDINGS.kept_in(name, tmp_path)
+    with pytest.raises(UserError, match="is in no folder that is known"):
+        recording_of(name)
+    RECORDINGS.kept_in(name, folder)
+    assert recording_of(name).folder == folder
+    for text in (name, f"{name}:decisions=2,react=false"):
+        title, settings = RECORDINGS.split(text)
+        assert RECORDINGS.joined(title, settings.split(",") if settings else []) == text
+
+
+def test_lanes_side_by_side_are_one_street(folder: Path) -> None:
+    scene = crossing()
+    rows = [street.lanes for street in streets(scene)]
+    assert rows == [("a1", "a0"), ("b1", "b0"), ("c0",)]
+    whole = ground(scene, np.array([250.0, 0.0]), 400.0)
+    assert sorted(whole.lanes) == [("n1", "n2", 0), ("n1", "n2", 1), ("n2", "n3", 0), ("n2", "n3", 1),
+        ("n4", "n5", 0)]  # fmt: skip
+    left = whole.lanes["n1", "n2", 0]
+    assert left.position(10.0, 0.0).tolist() == [10.0, -3.5]  # y is to the south
+    assert left.local_coordinates(np.array([20.0, -2.5])) == pytest.approx((20.0, 1.0))
+    near = ground(scene, np.array([250.0, 0.0]), 60.0)
+    assert near.lanes["n1", "n2", 1].length == pytest.approx(110.0, abs=2.0)
+    diagonal = np.stack([np.linspace(280, 320, 9), np.linspace(0, -3.5, 9), *np.zeros((2, 9))], 1)
+    changes = whole.matched(diagonal)
+    assert changes[0] == ("n1", "n2", 1)
+    assert changes[-1] == ("n2", "n3", 0)
+
+
+def test_a_house_that_stands_askew_hides_only_what_it_does() -> None:
+    turned = House("h", np.array([(0.0, 10.0), (10, 0), (20, 10), (10, 20)]))
+    low, high = box(turned)
+    assert ((high - low) > 7).all()
+    assert ((high - low) < 11).all()
+    assert (np.abs((low + high) / 2 - [10, -10]) < 2).all()
+
+
+@pytest.mark.parametrize(
+    ("step_s", "hz"), [(0.1, 10), (0.04, 10), (1.0, 10), (0.08, 10), (1 / 15, 15)]
+)
+def test_frames_fall_on_recorded_times(step_s: float, hz: int) -> None:
+    assert frames_a_second(step_s) == hz
