@@ -14,6 +14,7 @@ OPTIONAL = Plugins[tuple[str, str]]("swarmdrive.extras", tuple, {
     "highway_env": ("highway-env", "sim"),
     "matplotlib": ("matplotlib", "report"),
     "PIL": ("pillow", "report"),
+    "libsumo": ("libsumo", "sumo"),
     "ray": ("ray", "ray"),
     "llama_cpp": ("llama-cpp-python", "llama-cpp"),
     "sparrow_decider": ("sparrow-decider", "sparrow"),

@@ -373,8 +373,8 @@ def _scene(path: Path, net: Map, types: Mapping[str, VehicleType]) -> Scene:
             continue
         size_m = kind.length_m, kind.width_m
         named = KINDS.get(kind.vehicle_class, "car")
-        centres = _centres(values[:, 1:], kind.length_m)
-        for track in tracks_of(key, named, size_m, values[:, 0], centres, step_s):
+        middles = centres(values[:, 1:], kind.length_m)
+        for track in tracks_of(key, named, size_m, values[:, 0], middles, step_s):
             once(tracks, track.id, "road users", path)
             tracks[track.id] = track
     _refuse_degrees(path, tracks, net)
@@ -393,7 +393,7 @@ def _scene(path: Path, net: Map, types: Mapping[str, VehicleType]) -> Scene:
     )
 
 
-def _centres(poses: Floats, length_m: float) -> Floats:
+def centres(poses: Floats, length_m: float) -> Floats:
     """Return poses (n, 4) of centres, given x, y, degrees from north clockwise, and speed."""
     heading_rad = np.pi / 2 - np.radians(poses[:, 2])
     heading_rad = (heading_rad + np.pi) % (2 * np.pi) - np.pi
