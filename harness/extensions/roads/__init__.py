@@ -9,6 +9,9 @@ EXTENSION = Extension(
     commands={"dataset import": f"{_HERE}.importing:command"},
     adds={
         "channel_models": {"transmissions": f"{_HERE}.transmissions:from_profile"},
-        "families": {"recording": f"{_HERE}.family:RECORDINGS"},
+        "families": {
+            "recording": f"{_HERE}.family:RECORDINGS",
+            "sumo": f"{_HERE}.sumo:FRESH",
+        },
     },
 )

@@ -18,13 +18,20 @@ LOOK_PERIODS = 2  # periods ahead in which places are compared
 def action(scenario: Scenario, graph: SceneGraph) -> str:
     """Return the action that brings the ego nearest to where its recorded driver is later.
 
-    `scenario` is that of a layout, and `graph` the ego's scene graph. It changes to the lane in
-    which the recording is one period later; else that counts which is nearest in two periods, if
-    the target speed is kept, and at the last decision whether the goal is reached. It does not look
-    at others.
+    `scenario` is that of a layout, and `graph` the ego's scene graph.
+    """
+    return follow(scenario, graph, setting_of(scenario))
+
+
+def follow(scenario: Scenario, graph: SceneGraph, recorded: Setting) -> str:
+    """Return the action that brings the ego nearest to where the track of its place is later.
+
+    `scenario` is that of a layout, `graph` the ego's scene graph, and `recorded` has the track. It
+    changes to the lane in which the track is one period later; else that counts which is nearest in
+    two periods, if the target speed is kept, and at the last decision whether the goal is reached.
+    It does not look at others.
     """
     p, road = scenario.parameters, scenario.road()
-    recorded = setting_of(scenario)
     route = graph.ego.route or road.ego[1]
     way, now_s = (road.ego[0], route), graph.step * p.decision_period_s
     at_m = road.zone_arc_m - graph.ego.zone_m

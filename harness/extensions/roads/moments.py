@@ -150,6 +150,11 @@ class Chooser:
             else:
                 self._fit.append(candidate)
 
+    @property
+    def moments(self) -> list[Moment]:
+        """Return the moments at which an episode may begin, in the order of the draw."""
+        return [each.moment for each in sorted(self._fit, key=lambda each: each.draw)]
+
     def choice(self) -> Choice:
         """Deal what is left to the purposes, and draw as many moments with a conflict as without.
 

@@ -20,9 +20,10 @@ import numpy as np
 
 from harness.core.errors import UserError, one_line, printable
 from harness.core.extras import need
-from harness.core.files import sha256_bytes
+from harness.core.files import canonical_bytes, sha256_bytes
+from harness.extensions.roads import sumo_files
 from harness.extensions.roads.sources import elements, no_use
-from harness.extensions.roads.sumo_files import KINDS, centres
+from harness.extensions.roads.sumo_files import KINDS, Map, centres
 from harness.extensions.roads.tables import Track
 
 STEP_S = 0.1
@@ -41,6 +42,8 @@ IN_ROUTES = (
     "routes additional vTypeDistribution vType routeDistribution route flow vehicle trip stop "
     "person personFlow walk"
 )
+IN_BUILDINGS = "additional poly location param"
+NET_FILE, ROUTES_FILE, BUILDINGS_FILE = "net.xml", "routes.xml", "buildings.xml"
 ROUTES_TOO = "routes", "additional"  # routes may stand in an additional file
 OPTIONS = {
     "--step-length": f"{STEP_S}",
@@ -65,19 +68,36 @@ class Command(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Hold a net and routes whose elements were checked, as SUMO reads them."""
+    """Hold a net, routes and buildings whose elements were checked, as SUMO reads them."""
 
     net: bytes
     routes: bytes
+    buildings: bytes = b""  # empty without any
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """Return the content of each file by its name in a folder."""
+        files = {NET_FILE: self.net, ROUTES_FILE: self.routes}
+        return files | ({BUILDINGS_FILE: self.buildings} if self.buildings else {})
 
     @property
     def digest(self) -> str:
-        return sha256_bytes(self.net + b"\0" + self.routes)
+        """Return the hex SHA-256 of all files."""
+        digests = {name: sha256_bytes(content) for name, content in self.files.items()}
+        return sha256_bytes(canonical_bytes(digests))
 
 
-def inputs_of(net: Path, routes: Path) -> Inputs:
-    """Read a net and routes, and refuse what could make SUMO read or write another file."""
-    return Inputs(_plain(net, IN_NETS, "net"), _plain(routes, IN_ROUTES, "routes"))
+def inputs_of(net: Path, routes: Path, buildings: Path | None = None) -> Inputs:
+    """Read a net, routes and buildings; refuse what makes SUMO read or write another file."""
+    polygons = _plain(buildings, IN_BUILDINGS, "additional") if buildings else b""
+    return Inputs(_plain(net, IN_NETS, "net"), _plain(routes, IN_ROUTES, "routes"), polygons)
+
+
+def kept_inputs(folder: Path) -> Inputs:
+    """Read the files of `Inputs` from a folder that holds them by their names."""
+    buildings = folder / BUILDINGS_FILE
+    parts = folder / NET_FILE, folder / ROUTES_FILE, buildings if buildings.is_file() else None
+    return inputs_of(*parts)
 
 
 def _plain(path: Path, allowed: str, root: str) -> bytes:
@@ -130,12 +150,19 @@ def _sumo() -> Any:
 
 
 @lru_cache(maxsize=8)
+def map_of(inputs: Inputs) -> Map:
+    """Return the lanes and houses of inputs."""
+    folder = _folder(inputs)
+    return sumo_files.map_of(*[folder / name for name in inputs.files])
+
+
+@lru_cache(maxsize=8)
 def _folder(inputs: Inputs) -> Path:
     """Return a folder of this process with the files of inputs."""
     folder = Path(mkdtemp(prefix="harness-sumo-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    (folder / "net.xml").write_bytes(inputs.net)
-    (folder / "routes.xml").write_bytes(inputs.routes)
+    for name, content in inputs.files.items():
+        (folder / name).write_bytes(content)
     return folder
 
 
@@ -161,7 +188,7 @@ def run(
     Raises UserError if SUMO refuses the files, or there are too many vehicles.
     """
     sumo, folder = _sumo(), _folder(inputs)
-    files = ["-n", str(folder / "net.xml"), "-r", str(folder / "routes.xml")]
+    files = ["-n", str(folder / NET_FILE), "-r", str(folder / ROUTES_FILE)]
     options = [text for option in OPTIONS.items() for text in option]
     try:
         sumo.start(["sumo", *files, *options, "--seed", str(seed)])

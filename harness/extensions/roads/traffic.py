@@ -474,7 +474,7 @@ class Recorded(AbstractEnv):  # type: ignore[misc]
         self.road.show()
         self.road.objects = [Wall(low, high) for low, high in setting.boxes]
 
-    def _ego(self) -> Ego:
+    def _ego(self, kind: type[Ego] = Ego) -> Ego:
         """Return the ego at the recorded place, with the recorded route."""
         setting = self.setting
         x_m, y_m, heading, speed_mps = setting.cast.poses[0, 0].tolist()
@@ -485,7 +485,7 @@ class Recorded(AbstractEnv):  # type: ignore[misc]
                 f"scene {printable(setting.moment.scene)}: it is on no lane; import the recording "
                 "again"
             )
-        ego = Ego(
+        ego = kind(
             None,
             (x_m, y_m),
             heading,
