@@ -122,11 +122,12 @@ def guarded(name: str, env: Any) -> Iterator[None]:
         return importlib.import_module(module)
 
     # through this name every copy of `class_from_path` imports
+    outer = utils.importlib
     utils.importlib = SimpleNamespace(import_module=import_allowed)
     try:
         yield
     finally:
-        utils.importlib = importlib
+        utils.importlib = outer
 
 
 def _texts(value: Any) -> Iterator[str]:
