@@ -1,7 +1,8 @@
 """The family `recording`: scenarios that are recordings, found in folders by their digest."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -38,8 +39,7 @@ class Recordings:
         folder = Path(text).absolute()
         recording = read(folder)
         _remember(folder)
-        name = f"{PREFIX}{recording.name}@{recording.digest[:DIGITS]}"
-        return self.joined(name, [settings] if settings else [])
+        return self.joined(name_of(recording), [settings] if settings else [])
 
     def scenario(self, name: str) -> "Scenario":
         from harness.extensions.roads.world import scenario  # imports highway-env
@@ -74,11 +74,35 @@ def _folders() -> list[str]:
     return [folder for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
 
 
+_IN_MEMORY: dict[str, "Recording"] = {}
+
+
+@contextmanager
+def in_memory(recording: "Recording") -> Iterator[str]:
+    """Enter a context in which a recording that is in no folder makes a scenario; yield its name.
+
+    It holds in this process alone.
+    """
+    name = name_of(recording)
+    _IN_MEMORY[name] = recording
+    try:
+        yield name
+    finally:
+        del _IN_MEMORY[name]
+
+
+def name_of(recording: "Recording") -> str:
+    """Return the name of the scenario that a recording is."""
+    return f"{PREFIX}{recording.name}@{recording.digest[:DIGITS]}"
+
+
 def recording_of(name: str) -> "Recording":
     """Return the recording of a scenario's name, from a folder that was typed or of a dataset.
 
     Raises UserError where no such folder has one with the digest that the name has.
     """
+    if name in _IN_MEMORY:
+        return _IN_MEMORY[name]
     return _recording(name.removeprefix(PREFIX), tuple(_folders()))
 
 

@@ -341,11 +341,11 @@ def _chosen(
 ) -> "tuple[Sequence[Moment], Mapping[str, Any]]":
     """Return the moments of a recording, and how they were chosen."""
     from harness.extensions.environments.place import AFTER
-    from harness.extensions.roads.moments import choose
+    from harness.extensions.roads.fitness import choose_fit
 
     facts = recording.facts
     horizon_s = (facts.decisions + AFTER) * facts.period_s
-    choice = choose(_counted(recording.scenes(), progress), recording.window_m, horizon_s)
+    choice = choose_fit(recording, _counted(recording.scenes(), progress), horizon_s)
     return choice.moments, {**choice.record, "horizon_s": horizon_s}
 
 

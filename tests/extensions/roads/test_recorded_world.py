@@ -1,6 +1,7 @@
 """Recorded traffic: replayed to the centimetre, or reacting to an ego that drives otherwise."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from harness.dataset.load import load
 from harness.dataset.verify import check
 from harness.extensions.roads import family, tables
 from harness.extensions.roads.family import RECORDINGS, recording_of
+from harness.extensions.roads.fitness import is_mastered
 from harness.extensions.roads.network import ground, streets
 from harness.extensions.roads.replay import HARDEST_MPS2, Cast, Play
 from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track
@@ -246,6 +248,17 @@ def test_the_recorded_driver_arrives_and_waits(scenario: Scenario) -> None:
         [outcome] = finish([world], ["recorded"])
         assert outcome.result == "cleared"
         assert outcome.time_s == pytest.approx(5.0, abs=0.3)
+
+
+def test_a_moment_that_its_recorded_driver_does_not_master_is_none(tmp_path: Path) -> None:
+    scene = crossing()
+    far = lane("d0", [(0, 400), (900, 400)])
+    fast = track("f", lambda time_s: (40 * time_s, 400, 0, 40))  # as fast as no ego can drive
+    scene = replace(scene, lanes={**scene.lanes, "d0": far}, tracks={**scene.tracks, "f": fast})
+    recording = tables.write(tmp_path, "fast", "", "", 80.0, [scene], (), {})
+    moments = {name: Moment("s", name, 2.0, None, None, "") for name in ("f", "e1")}
+    mastered = {name: is_mastered(recording, moment) for name, moment in moments.items()}
+    assert mastered == {"f": False, "e1": True}
 
 
 def test_nobody_was_recorded_elsewhere() -> None:
