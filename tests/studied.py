@@ -35,6 +35,7 @@ from harness.dataset import rebuilt
 from harness.evaluate import lifecycle
 from harness.evaluate import run as evaluation
 
+Once = Callable[..., Path]  # fills a folder of a name once, as `conftest.once` does
 BOTH = "--condition single-local --condition 6g"
 PROMPT = "{% block system -%}\n"
 CHOICE = "{% either pace %}Creep.{% or %}Go.{% endeither %}\n"
@@ -55,6 +56,7 @@ class Trial:
     beside: Collection[str] = ()  # what else it writes
     dry: bool = False  # whether it has --dry-run
     ends: bool = True  # whether the same command ends at once where it is done, or is refused
+    lays: Callable[[Path, Once], object] = lambda here, once: None  # lays out what it alone needs
 
     @property
     def names(self) -> list[str]:
@@ -272,17 +274,22 @@ Tries = Callable[[str], Tried]
 
 
 @pytest.fixture(scope="session")
-def lay(once: Callable[..., Path], proxy_run: Path, small_path: Path) -> Callable[[Path], None]:
-    """Lays out a project that studies are tried in."""
+def lay(once: Once, proxy_run: Path, small_path: Path) -> Callable[[Path, Trial], None]:
+    """Lays out a project that a study is tried in."""
     points = (POINTS["single-local"], POINTS["6g"])
     spec = live_spec_of(episodes=2, first_seed=100, points=points)
     driven = once("driven-to-study", lambda out: run(spec, out))
-    return lambda here: laid(here, proxy_run, driven, small_path)
+
+    def lay(here: Path, trial: Trial) -> None:
+        laid(here, proxy_run, driven, small_path)
+        trial.lays(here, once)
+
+    return lay
 
 
 @pytest.fixture(scope="session")
 def tries(
-    lay: Callable[[Path], None], once: Callable[..., Path],
+    lay: Callable[[Path, Trial], None], once: Once,
     shared_work: Callable[[], AbstractContextManager[None]],
 ) -> Tries:  # fmt: skip
     """Types what is typed of a kind, once for all tests."""
@@ -293,7 +300,7 @@ def tries(
 
     def filled(folder: Path, trial: Trial) -> None:
         here = folder / "here"  # at the same place as one that is killed, since manifests name it
-        lay(here)
+        lay(here, trial)
         typed = {"before": Said(0, "", "", 0, digests(here))}
         with stands_still():
             for name in trial.names:

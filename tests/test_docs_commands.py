@@ -175,6 +175,8 @@ NOT_RUN = {
     "harness eval --model swarm-tiny --latency measured": "a busy machine is refused",
     "harness run export reports/proxy-v2-occluded-intersection-v3 --inspect "
     "logs/run.eval": "needs inspect",
+    "harness study reaction datasets/lanes datasets/lanes-replayed": "needs a recording; tests of "
+    "every study have one",
 }
 OTHER_PROGRAMS = {
     "inspect": "serves until it is interrupted",

@@ -214,7 +214,7 @@ HOSTILE: dict[str, Sequence[str]] = {
     "file": ["evil.txt"], "files": ["evil.txt", "reports/served"], "pilots": RUNS,
     "eval file": list(SETTINGS), "drive file": list(SETTINGS), "names": ["evil"],
     "study grid model": ["proxy,evil", "proxy,models/evil-weights"], "study closed-loop model": ["evil"],
-    "run history dataset": [],
+    "with_reaction": DATASETS, "without_reaction": DATASETS, "run history dataset": [],
     "radio show name": ["evil"], "radio check name": ["evil"], "model check name": ["evil", "mine"],
     "model pull name": ["evil"], "prompt compare a": ["evil"], "prompt compare b": ["evil"],
 }  # fmt: skip
@@ -222,6 +222,7 @@ HOSTILE: dict[str, Sequence[str]] = {
 PLAIN: dict[str, str] = {
     "run": "reports/served", "runs": "reports/served", "a": "base/run", "b": "base/run",
     "folders": "reports/served", "tune": "reports/served", "folder": "reports", "dataset": "base/dataset",
+    "with_reaction": "base/dataset", "without_reaction": "base/dataset",
     "version": "v2", "file": "evil.txt", "episode": "0", "scenario": "occluded-intersection",
     "names": "evil", "scene": "00000-0", "files": "evil.txt", "rate": "75",
     "prompt compare a": "v2", "prompt compare b": "v4", "init folder": "new",

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import studied
 from starlette.testclient import TestClient
-from studied import MORE, Tries, digests, laid, said, stands_still, trials
+from studied import MORE, Trial, Tries, digests, laid, said, stands_still, trials
 
 from harness.core import formats
 from harness.core.extensions import joined
@@ -156,11 +156,11 @@ def test_a_dry_run_counts_questions_and_writes_nothing(kind: str, tries: Tries) 
 
 @pytest.mark.parametrize("kind", KILLED)
 def test_one_that_is_killed_and_typed_again_has_the_bytes_of_one_that_ran_through(
-    kind: str, tries: Tries, lay: Callable[[Path], None]
+    kind: str, tries: Tries, lay: Callable[[Path, Trial], None]
 ) -> None:
     of = tries(kind)
     whole, here = of.said["whole"], of.path.with_name("here")
-    lay(here)
+    lay(here, of.trial)
     with stands_still():
         killed = said(of.trial.typed("whole"), here, whole.writes // 2)
         resumed = said(of.trial.typed("whole"), here)

@@ -6,7 +6,11 @@ _HERE = "harness.extensions.roads"
 
 EXTENSION = Extension(
     name="roads",
-    commands={"dataset import": f"{_HERE}.importing:command"},
+    commands={
+        "dataset import": f"{_HERE}.importing:command",
+        "study reaction": f"{_HERE}.reaction.command:command",
+    },
+    studies={"reaction": "reaction"},
     adds={
         "channel_models": {"transmissions": f"{_HERE}.transmissions:from_profile"},
         "families": {
