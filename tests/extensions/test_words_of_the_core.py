@@ -214,6 +214,7 @@ OTHER_THINGS = {
     ("evaluate/walk.py", "objects"): "of the world, which lists them",
     ("evaluate/walk.py", "text"): "of a reply, in bytes",
     ("coordination/exchange.py", "messages"): "how many were sent",
+    ("evaluate/asking.py", "messages"): "of a chat, whose length bounds its tokens",
     ("coordination/operating_point.py", "messages"): "what is done to those of a fusion call",
     ("evaluate/spec.py", "messages"): "what a prompt shows",
 }

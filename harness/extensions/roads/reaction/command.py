@@ -24,7 +24,7 @@ def command(
     as_json: options.Json = False,
     verbose: options.Verbose = False,
 ) -> None:
-    """Compare how every course ends where recorded others react, and where they only replay.
+    """Compare courses where others react and where they replay.
 
     Give two datasets of one recording that differ in react alone.
     """
