@@ -15,10 +15,11 @@ from harness.extensions.environments.world import scenario as scenario_of_enviro
 from harness.extensions.roads import driver
 from harness.extensions.roads.family import recording_of
 from harness.extensions.roads.tables import FACTS, SCHEMAS
-from harness.extensions.roads.traffic import LIMITS_MPS2, Recorded, nth
+from harness.extensions.roads.traffic import LIMITS_MPS2, Recorded, nth, setting
 from harness.world.parameters import DIALS
+from harness.world.parameters import Parameters as Common
 from harness.world.road import PathKey
-from harness.world.scenario import Scenario
+from harness.world.scenario import Names, Scenario
 from harness.world.scene_graph import SceneGraph
 from harness.world.simulator import LAMPS_MPS2
 from harness.world.state import Part
@@ -142,18 +143,25 @@ class RecordedScenario(EnvironmentScenario):
     def __post_init__(self, start: Any) -> None:
         super().__post_init__(start)
         if self.layouts is not None:
-            object.__setattr__(self, "layouts", Moments(self.name))
+            object.__setattr__(self, "layouts", Moments(self.name, self.parameters))
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Return, when called with a layout seed, the scenario whose place becomes that moment's."""
+    """Return, when called with a layout seed, the scenario whose place becomes that moment's.
+
+    It has the names that the recording has for vehicles.
+    """
 
     name: str  # the scenario's name
+    parameters: Common
 
     def __call__(self, seed: int) -> Scenario:
-        nth(recording_of(self.name), seed)
-        return scenario(self.name)
+        recording, p = recording_of(self.name), self.parameters
+        moment = nth(recording, seed)
+        cast = setting(recording, moment, p.simulation_hz, p.time_limit_s).cast
+        by_id = {f"v{number}": track.id for number, track in enumerate(cast.tracks, 1)}
+        return replace(scenario(self.name), names=Names(moment.time_s, by_id))
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from harness.extensions.roads.world import RecordedWorld
 from harness.world import scenarios
 from harness.world.reference import drive_all, finish
 from harness.world.scenario import Scenario
+from harness.world.sight_lines import site
 from harness.world.world import World
 
 TIMES = np.arange(0.0, 20.01, 0.1)
@@ -223,6 +224,17 @@ def test_dangers_goals_and_seeds(scenario: Scenario) -> None:
         World.start(scenario, 2)
     with pytest.raises(UserError, match=r"0 moments to train \(none\)"):
         scenario.at(FIRST["train"])
+
+
+def test_a_radio_is_told_the_names_and_the_time_of_the_recording(scenario: Scenario) -> None:
+    layout, world = scenario.at(FIRST["report"]), World.start(scenario, FIRST["report"])
+    state, moment = world.state(), world.env.setting.moment  # type: ignore[attr-defined]
+    ids = [vehicle.id for vehicle in (state.ego, *state.helpers)]
+    links = site([(state, ids)], names=[layout.names])
+    tracks = {v.spawn.id: v.track.id for v in world.vehicles[1:]}
+    assert links.names[0].tolist() == [moment.vehicle, *(tracks[id_] for id_ in ids[1:])]
+    assert len(ids) > 1
+    assert links.time_s.tolist() == [moment.time_s]
 
 
 def test_a_branch_is_as_a_fresh_drive(scenario: Scenario) -> None:
