@@ -3,6 +3,7 @@ exported to a GGUF file.
 """
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from contextlib import closing
@@ -32,10 +33,11 @@ from harness.backends.llama_cpp.backend import LlamaBackend
 from harness.backends.llama_cpp.engine import LlamaEngine, LlamaSession, open_here
 from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.registry import missing, open_backend
-from harness.backends.weights import find_gguf
+from harness.backends.weights import check_digest, find_gguf, sha256_weights
 from harness.core import resources
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
+from harness.core.files import sha256_bytes, sha256_file
 from harness.dataset.load import Dataset
 from harness.evaluate.requests import requests
 from harness.prompts import readout
@@ -431,6 +433,32 @@ def test_a_file_that_is_nowhere_says_what_to_give_or_to_run(tmp_path: Path) -> N
         open_backend(hub)
 
 
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda part: None, None),
+        (lambda part: part.write_bytes(b"other weights"), "is not what its card says"),
+        (lambda part: part.unlink(), r"no file .*m-00002-of-00002\.gguf, of the model's 2 files"),
+        (lambda part: (part.unlink(), os.mkfifo(part)), r"no file .*m-00002-of-00002\.gguf"),
+    ],
+)
+def test_a_file_that_was_split_is_known_by_all_of_it(
+    tmp_path: Path, spoil: Callable[[Path], object], said: str | None
+) -> None:
+    first, second = (tmp_path / f"m-0000{part}-of-00002.gguf" for part in (1, 2))
+    first.write_bytes(b"what llama.cpp opens, ")
+    second.write_bytes(b"and what that opens")
+    card = card_of(first, sha256=sha256_bytes(first.read_bytes() + second.read_bytes()))
+    spoil(second)
+    if said is None:
+        assert check_digest(card, find_gguf(card)) == first
+        assert sha256_weights(first) == card.sha256
+        return
+    with pytest.raises(UserError, match=said) as caught:
+        check_digest(card, find_gguf(card))
+    assert "\n" not in str(caught.value)
+
+
 def test_a_file_in_the_hubs_cache_is_known_by_its_commit(
     tiny: Path, backend: LlamaBackend, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -451,8 +479,6 @@ def test_a_file_in_the_hubs_cache_is_known_by_its_commit(
 def test_a_file_of_ones_own_is_known_by_its_content_and_by_what_reads_it(
     tiny: Path, backend: LlamaBackend
 ) -> None:
-    from harness.core.files import sha256_file
-
     identity = backend.identity()
     assert json.loads(json.dumps(identity)) == identity
     assert identity["file_sha256"] == sha256_file(tiny / "F32.gguf")

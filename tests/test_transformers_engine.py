@@ -432,6 +432,40 @@ def test_a_local_checkpoint_is_known_by_its_files_whatever_else_lies_beside_them
     assert open_tiny(tiny, dtype="bfloat16").identity()["dtype"] == "bfloat16"
 
 
+def split_into_folders(folder: Path) -> Path:
+    """Split a checkpoint's weights: half of them into a folder of it. Return that half's file."""
+    from safetensors.torch import load_file, save_file
+
+    tensors = load_file(folder / "model.safetensors")
+    (folder / "model.safetensors").unlink()
+    (folder / "part").mkdir()
+    files = ["model-1.safetensors", "part/model-2.safetensors"]
+    weight_map = {name: files[number % 2] for number, name in enumerate(tensors)}
+    for file in files:
+        part = {name: tensor for name, tensor in tensors.items() if weight_map[name] == file}
+        save_file(part, folder / file, {"format": "pt"})
+    index = {"metadata": {}, "weight_map": weight_map}
+    (folder / "model.safetensors.index.json").write_text(json.dumps(index))
+    return folder / files[1]
+
+
+def test_a_checkpoint_is_known_by_the_shards_in_its_folders_too(tiny: Path, tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    folder = shutil.copytree(tiny, tmp_path / "split")
+    shard = split_into_folders(folder)
+    whole = open_tiny(folder)
+    digest = whole.identity()["files_sha256"]
+    assert said(whole.complete(REQUESTS[:1])) == said(open_tiny(tiny).complete(REQUESTS[:1]))
+    halved = {name: tensor / 2 for name, tensor in load_file(shard).items()}
+    save_file(halved, shard, {"format": "pt"})
+    assert open_tiny(folder).identity()["files_sha256"] != digest
+    shard.unlink()
+    os.mkfifo(shard)
+    with pytest.raises(UserError, match=r"model-2\.safetensors cannot be read: it is no file"):
+        open_tiny(folder)
+
+
 def test_a_hub_checkpoint_is_found_in_the_cache_and_known_by_its_commit(
     tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -76,6 +76,12 @@ def find_adapter(card: Card) -> Path | None:
             f"{card.shown}: no adapter in {printable(folder)} ({CONFIG}); put its folder beside "
             "the card, or leave adapter out"
         )
+    for file in (folder / TENSORS, *sorted(folder.glob("*.gguf"))):
+        if file.exists() and not file.is_file():
+            raise UserError(
+                f"{card.shown}: its adapter's {printable(file)} is no file, but a folder, pipe or "
+                "device; give a file"
+            )
     return folder
 
 

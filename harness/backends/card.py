@@ -157,7 +157,8 @@ class Card:
     # name of the GGUF file inside `weights`; None if `weights` is the file itself
     file: str | None = None
     revision: str | None = None  # branch, tag or commit on the hub; None means its default branch
-    sha256: Sha256 | None = None  # of the GGUF file or model.safetensors, checked on loading
+    # of the GGUF file, of all that it was split into, or of model.safetensors; checked on loading
+    sha256: Sha256 | None = None
     # whether the hub gives the weights only to those who have accepted their licence
     gated: bool = False
     dtype: Dtype = "auto"  # number format of a checkpoint's weights; `auto` is the checkpoint's own

@@ -22,7 +22,7 @@ from harness.backends.registry import (
     registration,
 )
 from harness.core.errors import UserError, printable
-from harness.core.files import opened, sha256_file, text_of
+from harness.core.files import opened, sha256_files, text_of
 from harness.core.resources import find
 
 # Without one of these AutoTokenizer silently builds an empty tokenizer.
@@ -33,6 +33,7 @@ _SMALL, _LARGE = {".json", ".jinja", ".model", ".txt"}, {".safetensors"}
 _SHARDS = "model.safetensors.index.json"
 # The files that transformers loads; a repository may hold the same weights in other formats as
 # well.
+_FIRST_SPLIT = re.compile(r"-00001-of-(\d{5})\.gguf$")  # llama.cpp opens the others by itself
 _FETCHED = ["*.json", "*.jinja", "*.model", "*.safetensors", "*.txt"]
 
 
@@ -53,7 +54,10 @@ def find_checkpoint(card: Card) -> Path:
         )
     _check_files(card, where)
     required = {"config.json": ("config.json",), "weights": _WEIGHTS, "tokenizer": _TOKENIZERS}
-    required |= {f"shard {printable(name)}": (name,) for name in _shards(where)}
+    for shard in shards(where):
+        if not (where / shard).is_file():
+            fault = f"{card.shown} in {where} has no shard {printable(shard)}"
+            raise UserError(f"{fault}; {fetching(card)}")
     for what, patterns in required.items():
         if not any(path.is_file() for pattern in patterns for path in where.glob(pattern)):
             names = " or ".join(patterns)
@@ -65,7 +69,8 @@ def _check_files(card: Card, checkpoint: Path) -> None:
     """Raise UserError if a file that the engine would open by itself is none,
     or is too large to be it.
     """
-    for path in checkpoint.iterdir():
+    in_subfolders = [checkpoint / name for name in shards(checkpoint) if "/" in name]
+    for path in (*checkpoint.iterdir(), *in_subfolders):
         try:
             if path.suffix in _SMALL or path.suffix in _LARGE:
                 opened(path, "record" if path.suffix in _SMALL else "weights").close()
@@ -101,7 +106,32 @@ def find_gguf(card: Card) -> Path:
             f"{card.shown}: no projector {printable(beside)}; put it beside the model's "
             f"file, or run `harness model pull {printable(card.name)}` where it is on the hub"
         )
+    for part in gguf_files(where)[1:]:
+        if not part.is_file():
+            raise UserError(
+                f"{card.shown}: no file {printable(part)}, of the model's {len(gguf_files(where))} "
+                f"files; {hint}"
+            )
     return where
+
+
+def gguf_files(file: Path) -> list[Path]:
+    """Return the files of a GGUF model, given its first: one, or all into which it was split."""
+    split = _FIRST_SPLIT.search(file.name)
+    if split is None:
+        return [file]
+    stem, count = file.name[: split.start()], split[1]
+    names = [f"{stem}-{number:05}-of-{count}.gguf" for number in range(1, int(count) + 1)]
+    return [file.with_name(name) for name in names]
+
+
+def sha256_weights(file: Path) -> str:
+    """Return the hex SHA-256 digest of a file of weights.
+
+    Of a GGUF model in several files it is that of all, one after another, as of
+    `cat NAME-*.gguf | sha256sum`; `file` is the first.
+    """
+    return sha256_files(gguf_files(file))
 
 
 def is_gguf(card: Card) -> bool:
@@ -124,11 +154,13 @@ def find_weights(card: Card) -> Path:
 def check_digest(card: Card, file: Path) -> Path:
     """Return `file`, after comparing its SHA-256 with that in its model card, if any.
 
+    The digest is that of `sha256_weights`.
+
     A model card is the TOML file that describes a model. Raises UserError if they differ.
     """
     if (
         card.sha256
-        and (digest := sha256_file(file) if file.is_file() else "no such file") != card.sha256
+        and (digest := sha256_weights(file) if file.is_file() else "no such file") != card.sha256
     ):
         raise UserError(
             f"{card.shown}: {printable(file)} is not what its card says: sha256 {digest}, "
@@ -199,7 +231,8 @@ def _download(card: Card) -> None:
     logging.set_verbosity_error()
     if not sys.stderr.isatty():
         disable_progress_bars()
-    patterns = [name for name in (card.file, card.projector) if name] if card.file else _FETCHED
+    named = [name for name in (card.file, card.projector) if name]
+    patterns = [_FIRST_SPLIT.sub(r"-*-of-\1.gguf", name) for name in named] or _FETCHED
     at = f"{printable(constants.ENDPOINT)}/{printable(card.weights)}"
     try:
         snapshot_download(card.weights or "", revision=card.revision, allow_patterns=patterns)
@@ -267,12 +300,13 @@ def _snapshot(card: Card) -> Path | None:
     return snapshot if snapshot.is_dir() else None
 
 
-def _shards(checkpoint: Path) -> list[str]:
-    """Return the names of the files that weights are split into;
-    an interrupted download lacks some.
+def shards(checkpoint: Path) -> list[str]:
+    """Return the files that a checkpoint's weights are split into, by their paths within it.
+
+    They may lie in folders of it, and an interrupted download lacks some.
     """
     try:
         index = json.loads(text_of(checkpoint / _SHARDS, "record"))
-        return sorted(set(index["weight_map"].values()))
+        return sorted(map(str, set(index["weight_map"].values())))
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return []

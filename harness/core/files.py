@@ -12,7 +12,7 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache, wraps
 from glob import escape
@@ -185,8 +185,20 @@ def sha256_file(path: Path, kind: Kind = "weights") -> str:
     `kind`, a key of `LARGEST`, says how large it may be. Raises OSError, and Refused if it is not a
     regular file or too large.
     """
-    with opened(path, kind) as f:
-        return hashlib.file_digest(f, "sha256").hexdigest()
+    return sha256_files([path], kind)
+
+
+def sha256_files(paths: Iterable[Path], kind: Kind = "weights") -> str:
+    """Return the hex SHA-256 digest of the content of several files, one after another.
+
+    `kind`, a key of `LARGEST`, says how large each may be. Raises OSError, and Refused if one is
+    not a regular file or too large.
+    """
+    total = hashlib.sha256()
+    for path in paths:
+        with opened(path, kind) as file:
+            hashlib.file_digest(file, lambda: total)
+    return total.hexdigest()
 
 
 def digest(value: Any) -> str:

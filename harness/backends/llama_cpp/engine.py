@@ -25,7 +25,7 @@ from harness.backends.llama_cpp.context import LlamaContext, Logits
 from harness.backends.llama_cpp.model import LlamaModel
 from harness.backends.llama_cpp.projector import Projector
 from harness.backends.registry import BUILT_IN
-from harness.backends.weights import hub_commit
+from harness.backends.weights import hub_commit, sha256_weights
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import sha256_bytes, sha256_file
@@ -232,7 +232,7 @@ class LlamaEngine:
 
     @cached_property
     def _sha256(self) -> str:
-        return sha256_file(self._file)
+        return sha256_weights(self._file)
 
     @cached_property
     def _projector_identity(self) -> dict[str, Any]:

@@ -21,6 +21,8 @@ from harness.backends.weights import (
     find_gguf,
     hub_commit,
     is_gguf,
+    sha256_weights,
+    shards,
 )
 from harness.core.cores import threads
 from harness.core.errors import UserError, one_line, printable
@@ -248,9 +250,10 @@ class TransformersEngine:
 
     @cached_property
     def _files_sha256(self) -> str:
-        files = sorted(p for p in self.where.iterdir() if p.is_file() and p.suffix in _HASHED)
-        return digest({path.name: sha256_file(path) for path in files})
+        files = [p.name for p in self.where.iterdir() if p.is_file() and p.suffix in _HASHED]
+        names = {*files, *shards(self.where)}
+        return digest({name: sha256_file(self.where / name) for name in names})
 
     @cached_property
     def _gguf_sha256(self) -> str:
-        return sha256_file(find_gguf(self.card))
+        return sha256_weights(find_gguf(self.card))

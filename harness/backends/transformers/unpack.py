@@ -18,9 +18,10 @@ from harness.backends.card import Card
 from harness.backends.gguf import read_metadata
 from harness.backends.registry import BUILT_IN
 from harness.backends.tokens import tokenizer
+from harness.backends.weights import sha256_weights
 from harness.core import kept
 from harness.core.errors import UserError, one_line, printable
-from harness.core.files import alone, digest, sha256_file, write_whole
+from harness.core.files import alone, digest, write_whole
 
 _PATIENCE_S = 3600.0  # for another process that unpacks the same file
 _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
@@ -35,7 +36,7 @@ def unpack_checkpoint(card: Card, file: Path) -> Path:
     from transformers import __version__
 
     made_by = [__version__, BUILT_IN["transformers"].answers]
-    to = kept.folder() / "checkpoints" / digest([sha256_file(file), *made_by])[:16]
+    to = kept.folder() / "checkpoints" / digest([sha256_weights(file), *made_by])[:16]
     subject = f"{card.shown} in {printable(file)}"
     try:
         to.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 """A published model is taught: small ones stand for it, a Qwen3 and a Llama."""
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -221,6 +222,16 @@ def test_an_adapter_that_would_spoil_its_model_is_refused(
             open_backend(replace(BASE, adapter=str(tmp_path)), device="cpu")
         assert words in str(told.value)
         assert "\n" not in str(told.value)
+
+
+def test_a_pipe_in_an_adapters_folder_is_one_line_and_nobody_waits(tmp_path: Path) -> None:
+    (tmp_path / adapters.CONFIG).write_text("{}")
+    card = replace(BASE, adapter=str(tmp_path))
+    for name in (adapters.TENSORS, "adapter.gguf"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(UserError, match=rf"adapter's .*{name} is no file, but .*give a file"):
+            adapters.find_adapter(card)
+        (tmp_path / name).unlink()
 
 
 def test_a_card_without_its_adapter_lacks_weights() -> None:

@@ -17,9 +17,8 @@ from harness.backends.cards import argument
 from harness.backends.chat import Chat, HubTokenizer
 from harness.backends.engine import common_length
 from harness.backends.transformers.engine import checkpoint, load
-from harness.backends.weights import find_gguf, hub_commit, is_gguf
+from harness.backends.weights import find_gguf, hub_commit, is_gguf, sha256_weights
 from harness.core.errors import UserError, printable
-from harness.core.files import sha256_file
 from harness.extensions.learn.training import low_rank
 
 WEIGHTS = "model.safetensors"
@@ -148,7 +147,7 @@ def _digest(card: Card, where: Path) -> str:
     of its GGUF file or its only shard, else its commit.
     """
     file = find_gguf(card) if is_gguf(card) else where / WEIGHTS
-    return sha256_file(file) if file.is_file() else str(hub_commit(where))
+    return sha256_weights(file) if file.is_file() else str(hub_commit(where))
 
 
 def model_card(name: str, facts: Mapping[str, Any]) -> str:
