@@ -70,6 +70,7 @@ ORDINARY = {
     "paper": "the one whose method this is",
     "proxy": "the rule that stands for a model",
     "random": "of draws",
+    "reaction": "of a human, in seconds",
     "read-outs": "of a policy from a model's probabilities",
     "recording": "what layouts may be cut from, and what a card denies",
     "repeats": "a verb, and evaluations alike",
