@@ -17,5 +17,6 @@ EXTENSION = Extension(
             "recording": f"{_HERE}.family:RECORDINGS",
             "sumo": f"{_HERE}.sumo:FRESH",
         },
+        "sections": {"recorded-driver": f"{_HERE}.page:section"},
     },
 )
