@@ -150,6 +150,8 @@ class Drive:
         self.braking = here.braking[:, at]
         self.there = (here.enters <= at) & (at <= here.leaves) & ~np.isnan(self.poses[:, 0])
         self.there[0] = True
+        gone = ~self.there
+        self.poses[gone] = before[gone]  # who has left stays where it was, for who still looks
 
     def off(self) -> Bools:
         """Return who counts where two touch, (N,): the ego; what else they do is SUMO's."""
@@ -236,14 +238,9 @@ class Fresh(Recorded):
 
     def _reset(self) -> None:
         setting = cast("FreshSetting", self.setting)
-        drive = Drive.start(setting)
-        puppets = [
-            Puppet(n, track, pose)
-            for n, (track, pose) in enumerate(zip(setting.cast.tracks, drive.poses, strict=True))
-        ]
-        self.road = FreshStage(setting.ground.network, cast("Any", drive), puppets)
-        for puppet in puppets:
-            puppet.road = self.road
+        self.road = FreshStage(setting.ground.network, cast("Any", Drive.start(setting)))
+        tracks = setting.cast.tracks
+        self.road.puppets = [Puppet(self.road, n, track) for n, track in enumerate(tracks)]
         self.vehicle = self._ego(ToldEgo)
         self.road.vehicles = [self.vehicle]
         self.road.show()

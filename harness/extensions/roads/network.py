@@ -55,6 +55,8 @@ class Line(AbstractLane):  # type: ignore[misc]
         self._headings = np.concatenate([turned[:1], inner, turned[-1:]])
         self._least = np.concatenate([[-np.inf], np.zeros(len(steps) - 1)])
         self._most = np.concatenate([lengths[:-1], [np.inf]])
+        # the place that was asked for last, and what it was: one is asked for several times a frame
+        self._asked: tuple[tuple[float, float], tuple[float, float]] = (np.nan, np.nan), (0.0, 0.0)
 
     def position(self, longitudinal: float, lateral: float) -> Floats:
         n = int(np.clip(self.arc_m.searchsorted(longitudinal) - 1, 0, len(self._ways) - 1))
@@ -69,8 +71,11 @@ class Line(AbstractLane):  # type: ignore[misc]
         return self.width
 
     def local_coordinates(self, position: Floats) -> tuple[float, float]:
-        along, lateral = self.places(np.asarray(position)[None])
-        return float(along[0]), float(lateral[0])
+        place = float(position[0]), float(position[1])
+        if self._asked[0] != place:
+            along, lateral = self.places(np.array([place]))
+            self._asked = place, (float(along[0]), float(lateral[0]))
+        return self._asked[1]
 
     def places(self, positions: Floats) -> tuple[Floats, Floats]:
         """Return how far along the lane and to its right n positions (n, 2) are, each (n,) m."""

@@ -271,20 +271,34 @@ def interaction(speed_mps: Floats, ahead_mps: Floats, gap_m: Floats) -> Floats:
 
 
 class Puppet(Vehicle):  # type: ignore[misc]
-    """Show a recorded road user as a vehicle of highway-env; `Play` says where it is."""
+    """Show a recorded road user as a vehicle of highway-env: it is where `stage.play` has it."""
 
-    def __init__(self, number: int, track: Track, pose: Floats) -> None:
-        super().__init__(None, pose[:2], float(pose[2]), float(pose[3]))
-        self.number, self.track, self.kind = number, track, track.kind
+    def __init__(self, stage: Any, number: int, track: Track) -> None:
+        self.stage, self.number = stage, number
+        self.track, self.kind = track, track.kind
+        super().__init__(None, (0.0, 0.0))  # with a road it would search all lanes
+        self.road = stage
         self.LENGTH, self.WIDTH = track.length_m, track.width_m
         self.diagonal = float(np.hypot(track.length_m, track.width_m))
-        self.braking = False
 
     def act(self, action: Any = None) -> None:
         """Take no action: it is moved."""
 
     def step(self, dt: float) -> None:
         """Stay: it is moved."""
+
+    def _of_play(name: str, of_pose: int | slice | None = None) -> Any:
+        """Return a property that is read from the play, and never written to."""
+
+        def value(self: Any) -> Any:
+            values = getattr(self.stage.play, name)[self.number]
+            return values if of_pose is None else values[of_pose]
+
+        return property(value, lambda self, value: None)
+
+    position = _of_play("poses", slice(0, 2))
+    heading, speed = _of_play("poses", 2), _of_play("poses", 3)
+    crashed, braking = _of_play("crashed"), _of_play("braking")
 
 
 @dataclass(eq=False)
@@ -372,8 +386,10 @@ class Play:
             self.place[n] = cast.frame_at(n, float(arc[n]))
             poses[n] = cast.pose_at(n, float(self.place[n]))
             poses[n, 3] = speed[n]
-        self.poses = poses
+        before_m, self.poses = self.poses, poses
         self._come_and_go(frame, np.flatnonzero(off))
+        gone = ~self.there
+        self.poses[gone] = before_m[gone]  # who has left stays where it was, for who still looks
 
     def _free(self) -> Floats:
         """Return the speeds in the next frame of who is late, if nobody were in the way, (N,)."""
@@ -468,11 +484,16 @@ def touching(poses: Floats, before: Floats, sizes_m: Floats, pairs: Ints) -> Boo
     `poses` and `before` are x, y and heading of N road users now and then, (N, >=3), `sizes_m`
     their sizes, (N, 2) m, and `pairs` the numbers of two each, (P, 2).
     """
-    first, second = pairs.T
-    shares = np.linspace(0, 1, SWEEPS + 1)[1:, None, None]
-    at = before[:, :3] + shares * (poses[:, :3] - before[:, :3])
-    sizes = np.tile(sizes_m[first], (SWEEPS, 1)), np.tile(sizes_m[second], (SWEEPS, 1))
-    apart_m = separation_m(
-        at[:, first].reshape(-1, 3), sizes[0], at[:, second].reshape(-1, 3), sizes[1]
-    )
-    return np.asarray((apart_m.reshape(SWEEPS, -1) < 0).any(axis=0))
+    sizes, its_sizes = sizes_m[pairs[:, 0]], sizes_m[pairs[:, 1]]
+    moves = poses[:, :3] - before[:, :3]
+    gaps_m = separation_m(poses[pairs[:, 0], :3], sizes, poses[pairs[:, 1], :3], its_sizes)
+    touch = np.asarray(gaps_m < 0)
+    steps_m = np.hypot(*moves[:, :2].T) + np.abs(moves[:, 2]) * np.hypot(*sizes_m.T) / 2
+    # who is farther apart than both have moved cannot have touched
+    may = np.flatnonzero((gaps_m >= 0) & (gaps_m <= steps_m[pairs].sum(axis=1)))
+    first, second = pairs[may].T
+    for share in np.linspace(0, 1, SWEEPS + 1)[1:-1].tolist():
+        at = before[:, :3] + share * moves
+        apart_m = separation_m(at[first], sizes[may], at[second], its_sizes[may])
+        touch[may] |= apart_m < 0
+    return touch

@@ -308,11 +308,11 @@ class Ego(MDPVehicle):  # type: ignore[misc]
 class Stage(Road):  # type: ignore[misc]
     """Move an ego, by its actions, and recorded road users, frame by frame."""
 
-    def __init__(self, network: Any, play: Play, puppets: Sequence[Puppet]) -> None:
+    def __init__(self, network: Any, play: Play) -> None:
         super().__init__(network, np_random=np.random.RandomState(0))
-        # everybody by number, those included who are not there; the first stands for the ego's
-        # recorded self
-        self.play, self.puppets = play, list(puppets)
+        self.play = play
+        # everybody by number, those included who are not there; the first stands for the ego
+        self.puppets: list[Puppet] = []
 
     @property
     def ego(self) -> Any:
@@ -326,28 +326,21 @@ class Stage(Road):  # type: ignore[misc]
         play, ego = self.play, self.ego
         before = play.poses.copy()
         before[0] = self._pose(ego)
+        there = play.there.copy()
         play.move(before[0])
         ego.step(dt)
         play.poses[0] = self._pose(ego)
-        self.show()
+        if not np.array_equal(there, play.there):
+            self.show()
         self._collide(before)
 
     def _pose(self, ego: Any) -> Floats:
         return np.array([*ego.position, ego.heading, ego.speed])
 
     def show(self) -> None:
-        """Place the puppets where the play has them; those who are there are on the road."""
-        play = self.play
-        present = np.flatnonzero(play.there).tolist()[1:]
-        headings, speeds = play.poses[:, 2].tolist(), play.poses[:, 3].tolist()
-        braking, crashed = play.braking.tolist(), play.crashed.tolist()
-        vehicles = [self.ego]
-        for n in present:
-            puppet = self.puppets[n]
-            puppet.position, puppet.heading = play.poses[n, :2], headings[n]
-            puppet.speed, puppet.braking, puppet.crashed = speeds[n], braking[n], crashed[n]
-            vehicles.append(puppet)
-        self.vehicles = vehicles
+        """Put on the road who is there now."""
+        present = np.flatnonzero(self.play.there).tolist()[1:]
+        self.vehicles = [self.ego, *[self.puppets[n] for n in present]]
 
     def _collide(self, before: Floats) -> None:
         """Let those crash that touch, of whom one is off the recording.
@@ -378,7 +371,7 @@ class Stage(Road):  # type: ignore[misc]
         for first, second in pairs[met].tolist():
             for n in (first, second):
                 play.crashed[n] = True
-                (self.puppets[n] if n else ego).crashed = True
+        ego.crashed |= bool(play.crashed[0])
 
     def branch(self) -> "Stage":
         """Return a copy that goes on by itself."""
@@ -386,7 +379,7 @@ class Stage(Road):  # type: ignore[misc]
         new.play = self.play.branch()
         new.puppets = [copy(puppet) for puppet in self.puppets]
         for puppet in new.puppets:
-            puppet.road = new
+            puppet.road = puppet.stage = new
         ego = copy(self.ego)
         ego.position, ego.action, ego.road = ego.position.copy(), dict(ego.action), new
         ego.route = list(ego.route or ())
@@ -461,14 +454,8 @@ class Recorded(AbstractEnv):  # type: ignore[misc]
     def _reset(self) -> None:
         setting = self.setting
         cast, play = setting.cast, Play.start(setting.cast, self.react)
-        puppets = [
-            Puppet(n, track, pose)
-            for n, (track, pose) in enumerate(zip(cast.tracks, cast.poses[:, 0], strict=True))
-        ]
-        network = setting.ground.network
-        self.road = Stage(network, play, puppets)
-        for puppet in puppets:
-            puppet.road = self.road
+        self.road = Stage(setting.ground.network, play)
+        self.road.puppets = [Puppet(self.road, n, track) for n, track in enumerate(cast.tracks)]
         self.vehicle = self._ego()
         self.road.vehicles = [self.vehicle]
         self.road.show()

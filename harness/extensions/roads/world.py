@@ -114,6 +114,9 @@ class RecordedWorld(EnvironmentWorld):
             setting.keys[number, frame] = keys[0]
         return cast("PathKey", setting.keys[number, frame])
 
+    def _poses(self) -> Any:
+        return self.env.road.play.poses[[0, *[v.number for v in self.everybody[1:]]]]
+
     def branch(self) -> "RecordedWorld":
         env = self.env.branch()
         journeys = {agent: replace(journey) for agent, journey in self.journeys.items()}
