@@ -24,6 +24,7 @@ RATINGS: Mapping[str, Rating] = {
     "time_out": "stuck",
 }
 
+SAME_WAY = np.sqrt(0.5)  # the cosine of 45°, up to which one drives into the other's back
 ROUNDING_S = 0.01  # half a frame: keeps rounding out of comparing times
 
 
@@ -142,7 +143,7 @@ def fault(ego: VehicleState, other: VehicleState, paths: Mapping[PathKey, Path])
     the lower right of way. The states are those at the moment of the collision, and `paths` are the
     road's, by approach and route.
     """
-    if np.cos(ego.heading_rad - other.heading_rad) > np.sqrt(0.5):
+    if np.cos(ego.heading_rad - other.heading_rad) > SAME_WAY:
         dx, dy = other.x_m - ego.x_m, other.y_m - ego.y_m
         ahead = dx * np.cos(ego.heading_rad) + dy * np.sin(ego.heading_rad)
         return "ego" if ahead > 0 else "other"

@@ -1,6 +1,6 @@
 """Simulate an episode at a moment of a recording; make a scenario of a recording."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, cast
@@ -16,6 +16,7 @@ from harness.extensions.roads import driver
 from harness.extensions.roads.family import recording_of
 from harness.extensions.roads.tables import FACTS, SCHEMAS
 from harness.extensions.roads.traffic import LIMITS_MPS2, Recorded, nth, setting
+from harness.world.outcome import SAME_WAY
 from harness.world.parameters import DIALS
 from harness.world.parameters import Parameters as Common
 from harness.world.road import PathKey
@@ -83,6 +84,17 @@ class RecordedWorld(EnvironmentWorld):
         # who comes on no path that meets the ego's is on that, or beside
         sector = v.spawn.approach if v.spawn.approach in sectors else next(iter(sectors))
         return sector, v.spawn.id
+
+    def _collision(self, ego: Any, wrecks: Sequence[Any]) -> dict[str, str]:
+        """Return whom the ego hit, and how; without a fault where nobody drove into a back.
+
+        Recordings do not say who has the right of way.
+        """
+        how = super()._collision(ego, wrecks)
+        partner = next((v for v in wrecks if v.spawn.id == how.get("partner")), None)
+        if partner is not None and np.cos(ego.heading - partner.heading) <= SAME_WAY:
+            del how["fault"]
+        return how
 
     def _enter(self, v: Any, part: Part) -> None:
         number = getattr(v, "number", 0)

@@ -226,6 +226,20 @@ def test_dangers_goals_and_seeds(scenario: Scenario) -> None:
         scenario.at(FIRST["train"])
 
 
+def test_right_of_way_is_unknown_but_for_who_drives_into_a_back(scenario: Scenario) -> None:
+    """Crossing, nobody is said to be at fault; behind one another, who is behind is."""
+    world = World.start(scenario, FIRST["report"])
+    ego, other = world.vehicles[:2]
+    for turn_rad, at_fault in ((np.pi / 2, None), (0.0, "ego")):
+        ahead = *(ego.position + 4 * direction(ego.heading)), ego.heading + turn_rad
+        world.env.road.play.poses[other.number, :3] = ahead  # type: ignore[attr-defined]
+        assert world._collision(ego, [other]).get("fault") == at_fault
+
+
+def direction(heading: float) -> np.ndarray:
+    return np.array([np.cos(heading), np.sin(heading)])
+
+
 def test_a_radio_is_told_the_names_and_the_time_of_the_recording(scenario: Scenario) -> None:
     layout, world = scenario.at(FIRST["report"]), World.start(scenario, FIRST["report"])
     state, moment = world.state(), world.env.setting.moment  # type: ignore[attr-defined]
