@@ -55,8 +55,8 @@ class Site:
     # the sites of antennas on no vehicle, by antenna: each site has the antenna in the ego's place,
     # then the ego and the helpers, so its `xy_m` is `(..., 2+H, 2)`
     antennas: Mapping[Antenna, "Site"] = field(default_factory=dict)
-    # what the source of the traffic calls each vehicle, `(..., 1+H)`, empty for one without a name;
-    # None where the scenario's vehicles have no names but those of this harness
+    # what the source of the traffic calls each vehicle, as `SCENE/NAME`, `(..., 1+H)`, empty for
+    # one without a name; None where the scenario's vehicles have no names but those of this harness
     names: Texts | None = None
     # what the clock of that source shows, s, `(...)`; None without names
     time_s: Floats | None = None

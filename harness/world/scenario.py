@@ -114,7 +114,8 @@ class Names(NamedTuple):
     """Say what the source of a layout's traffic calls its vehicles, and what its clock shows."""
 
     begin_s: float  # what that clock shows at the start of the episode, s
-    by_id: Mapping[str, str]  # the name there of each vehicle, by its id here, such as `v2`
+    # `SCENE/NAME` of each vehicle there, by its id here, such as `v2`; a scene has one clock
+    by_id: Mapping[str, str]
 
 
 @dataclass(frozen=True)

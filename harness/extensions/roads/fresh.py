@@ -339,7 +339,8 @@ class Layouts:
     def __call__(self, seed: int) -> Scenario:
         p = self.parameters
         layout = setting(inputs_named(self.name), seed, p.warm_up_s, p.time_limit_s)
-        by_id = {f"v{n}": track.id for n, track in enumerate(layout.cast.tracks, 1)}
+        scene = layout.scene.name
+        by_id = {f"v{n}": f"{scene}/{track.id}" for n, track in enumerate(layout.cast.tracks, 1)}
         return replace(scenario(self.name), names=Names(layout.moment.time_s, by_id))
 
 

@@ -2,9 +2,10 @@
 
 The table is a CSV or Parquet file with the columns `time_s`, `delay_ms` and `received` (1 or 0),
 and `tx` and `rx`, the names of sender and receiver in the source of the traffic, or `distance_m`,
-or all three; other columns are not read. Where the scene's cars have these names, a message does
-what the transmission of that pair did that is nearest in time. Any other message does what one of
-those transmissions did whose distance fits best, drawn by the link.
+or all three. A column `scene` says of which scene of a recording the names are, where there are
+several; other columns are not read. Where the scene's cars have these names, a message does what
+the transmission of that pair did that is nearest in time. Any other message does what one of those
+transmissions did whose distance fits best, drawn by the link.
 """
 
 import math
@@ -33,9 +34,12 @@ from harness.radio.channel import (
     Way,
 )
 
-NAMES, DISTANCE = ("tx", "rx"), "distance_m"
+NAMES, SCENE, DISTANCE = ("tx", "rx"), "scene", "distance_m"
 NUMBERS = ("time_s", "delay_ms", "received")
-TYPES = {**dict.fromkeys(NAMES, pa.string()), **dict.fromkeys((*NUMBERS, DISTANCE), pa.float64())}
+TYPES = {
+    **dict.fromkeys((*NAMES, SCENE), pa.string()),
+    **dict.fromkeys((*NUMBERS, DISTANCE), pa.float64()),
+}
 FAR_S = 1.0  # from here on a pair's transmission says nothing of this time
 DRAWN_OF = 50  # transmissions of the best fitting distances
 MOST_ROWS, MOST_DELAY_MS, MOST_M = 20_000_000, 1e6, 1e6
@@ -50,6 +54,7 @@ class Columns(NamedTuple):
     delay_s: Floats  # (n,), from the wish to send until reception; the median where it is lost
     received: Bools  # (n,)
     pairs: Mapping[tuple[str, str], slice]  # the rows of each sender and receiver
+    has_scenes: bool  # whether their names have the scene in front, as those of a site have
     distance_m: Floats | None  # (n,)
     by_distance: Ints  # (n,) rows in the order of distance; empty without distances
 
@@ -141,7 +146,8 @@ class Transmissions:
         if site.names is None or site.time_s is None or not columns.pairs:
             return rows
         for at in np.ndindex(*rows.shape):
-            ends = str(site.names[(*at[:-1], 0)]), str(site.names[(*at[:-1], at[-1] + 1)])
+            names = str(site.names[(*at[:-1], 0)]), str(site.names[(*at[:-1], at[-1] + 1)])
+            ends = names if columns.has_scenes else (_alone(names[0]), _alone(names[1]))
             pair = columns.pairs.get(ends if way == REQUEST else ends[::-1])
             if pair is not None:
                 rows[at] = _nearest(columns.time_s, pair, float(site.time_s[at[:-1]]))
@@ -183,6 +189,11 @@ class Transmissions:
     def _is_beyond(self, distance_m: Floats) -> Bools:
         distances_m = self.table.transmitted.distance_m
         return np.greater(distance_m, math.inf if distances_m is None else distances_m.max())
+
+
+def _alone(name: str) -> str:
+    """Return the name of a vehicle without the scene in front of it."""
+    return name.partition("/")[2]
 
 
 def _nearest(time_s: Floats, pair: slice, at_s: float) -> int:
@@ -263,8 +274,8 @@ def _wanted(names: Sequence[str], file: str) -> list[str]:
             f"{file}: has neither tx and rx nor {DISTANCE}; add them: nothing else says whose a "
             "transmission is"
         )
-    wanted = [*NUMBERS, *(NAMES if named else ()), *([DISTANCE] if DISTANCE in names else ())]
-    return wanted
+    further = [name for name in (SCENE, DISTANCE) if name in names and (named or name != SCENE)]
+    return [*NUMBERS, *(NAMES if named else ()), *further]
 
 
 def _columns(table: pa.Table, file: str) -> Columns:
@@ -280,14 +291,16 @@ def _columns(table: pa.Table, file: str) -> Columns:
     delay_s = delay_ms[order] / 1000
     delay_s = np.where(is_received, delay_s, _median(delay_s[is_received]))
     pairs = _pairs(senders[order], receivers[order]) if NAMES[0] in table.column_names else {}
+    has_scenes = SCENE in table.column_names
     if DISTANCE not in table.column_names:
-        return Columns(time_s[order], delay_s, is_received, pairs, None, np.zeros(0, dtype=int))
+        nothing = np.zeros(0, dtype=int)
+        return Columns(time_s[order], delay_s, is_received, pairs, has_scenes, None, nothing)
     distance_m = table[DISTANCE].to_numpy()
     is_no_distance = ~((distance_m >= 0) & (distance_m <= MOST_M))
     _refuse(file, DISTANCE, distance_m, is_no_distance, f"metres, 0 to {MOST_M:g}")
     distance_m = distance_m[order]
     by_distance = np.argsort(distance_m, kind="stable")
-    return Columns(time_s[order], delay_s, is_received, pairs, distance_m, by_distance)
+    return Columns(time_s[order], delay_s, is_received, pairs, has_scenes, distance_m, by_distance)
 
 
 def _refuse(file: str, name: str, values: Floats, is_wrong: Bools, allowed: str) -> None:
@@ -302,12 +315,14 @@ def _texts(table: pa.Table, file: str) -> tuple[Any, Any]:
     if NAMES[0] not in table.column_names:
         nobody = np.full(len(table), "")
         return nobody, nobody
-    for name in NAMES:
+    has_scenes = SCENE in table.column_names
+    for name in (*NAMES, SCENE) if has_scenes else NAMES:
         if table[name].null_count:
-            raise UserError(
-                f"{file}: {name} is unknown in some rows; name each sender and receiver"
-            )
+            raise UserError(f"{file}: {name} is unknown in some rows; name it in all")
     senders, receivers = (table[name].to_numpy().astype(str) for name in NAMES)
+    if has_scenes:
+        scenes = np.char.add(table[SCENE].to_numpy().astype(str), "/")
+        senders, receivers = np.char.add(scenes, senders), np.char.add(scenes, receivers)
     return senders, receivers
 
 

@@ -175,7 +175,10 @@ class Moments:
         recording, p = recording_of(self.name), self.parameters
         moment = nth(recording, seed)
         cast = setting(recording, moment, p.simulation_hz, p.time_limit_s).cast
-        by_id = {f"v{number}": track.id for number, track in enumerate(cast.tracks, 1)}
+        by_id = {
+            f"v{number}": f"{moment.scene}/{track.id}"
+            for number, track in enumerate(cast.tracks, 1)
+        }
         return replace(scenario(self.name), names=Names(moment.time_s, by_id))
 
 

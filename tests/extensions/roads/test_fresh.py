@@ -64,7 +64,8 @@ def test_a_branch_is_the_drive_with_the_same_actions_and_nobody_else_is_moved_at
     layout = scenario.at(2)
     world = World.start(layout, 2)
     begun = world.state()
-    assert layout.names.by_id["v1"] == world.env.setting.moment.vehicle  # type: ignore[attr-defined]
+    ego_id = world.env.setting.moment.vehicle  # type: ignore[attr-defined]
+    assert layout.names.by_id["v1"] == f"seed-2/{ego_id}"
     other = world.branch()
     hz = layout.parameters.simulation_hz
     for branch, action in ((world, "SLOWER"), (other, "FASTER")):

@@ -246,7 +246,8 @@ def test_a_radio_is_told_the_names_and_the_time_of_the_recording(scenario: Scena
     ids = [vehicle.id for vehicle in (state.ego, *state.helpers)]
     links = site([(state, ids)], names=[layout.names])
     tracks = {v.spawn.id: v.track.id for v in world.vehicles[1:]}
-    assert links.names[0].tolist() == [moment.vehicle, *(tracks[id_] for id_ in ids[1:])]
+    names = [moment.vehicle, *(tracks[id_] for id_ in ids[1:])]
+    assert links.names[0].tolist() == [f"s/{name}" for name in names]
     assert len(ids) > 1
     assert links.time_s.tolist() == [moment.time_s]
 

@@ -37,7 +37,8 @@ def links(distances_m: list[float], names: list[str] | None, time_s: float) -> L
     xy_m = np.stack([np.array([0.0, *distances_m]), np.zeros(1 + n)], axis=-1)
     site = Site(xy_m, np.zeros(n, int), np.zeros(n), np.full((n, 2), np.nan))
     if names:
-        site = replace(site, names=np.array(names), time_s=np.array(time_s))
+        in_scene = [f"s/{name}" for name in names]
+        site = replace(site, names=np.array(in_scene), time_s=np.array(time_s))
     asked, ready_s = np.full(n, True), np.full(n, 0.1)
     return Links(asked, ready_s, ready_s, ready_s, asked, asked, 400.0, site)
 
@@ -62,6 +63,17 @@ def test_cars_with_names_of_the_table_do_what_it_says_of_them_at_that_time(tmp_p
     assert up.tolist() == [False, False]
     assert delay_s[0] == pytest.approx(0.105)
     assert loss[0] == 0.5
+
+
+def test_names_may_be_of_a_scene_each(tmp_path):
+    lines = NAMED.splitlines()
+    rows = [f"{line},{scene}" for scene in "st" for line in lines[1:]]
+    rows = [row.replace("5.0,a,b,2", "5.0,a,b,9") if row.endswith("t") else row for row in rows]
+    channel = load(tmp_path, "\n".join([lines[0] + ",scene", *rows]) + "\n")
+    here = links([10.0], ["a", "b"], 5.0)
+    there = replace(here.where, names=np.array(["t/a", "t/b"]))
+    for site, delay_s in ((here.where, 0.002), (there, 0.009)):
+        assert channel.latencies_s(site, draws(0.5, 1), REQUEST) == pytest.approx(delay_s)
 
 
 def test_others_draw_among_those_whose_distance_fits(tmp_path):
@@ -104,11 +116,11 @@ def test_it_is_a_channel_and_parquet_says_the_same(tmp_path):
         assert np.array_equal(one, two, equal_nan=True)
     named = load(tmp_path, NAMED)
     where, _ = links_and_draws((4, 2))
-    names = np.array([["a", "b", "c"], ["b", "a", ""], ["c", "", "a"], ["", "b", "a"]])
+    names = np.array([["s/a", "s/b", "s/c"], ["s/b", "s/a", ""], ["s/c", "", "s/a"], [""] * 3])
     site = replace(where.where, names=names, time_s=np.full(4, 5.0))
     picked = site.of_helpers(np.array([[1, 1], [0, 1], [1, 0], [0, 0]]))
-    assert picked.names[0].tolist() == ["a", "c", "c"]
-    assert site.select(slice(1, 2)).names[0].tolist() == ["a", "c"]
+    assert picked.names[0].tolist() == ["s/a", "s/c", "s/c"]
+    assert site.select(slice(1, 2)).names[0].tolist() == ["s/a", "s/c"]
     assert named._of_pairs(site.take([0]), REQUEST).tolist() == [
         named._of_pairs(site, REQUEST)[0].tolist()
     ]
