@@ -234,8 +234,11 @@ def _imported(
                 scenes = _watched(_unique(scenes_of(sources, columns)), taken, progress)
                 recording = tables.write(part, *texts, scenes, (), {}, decisions=decisions)
             with bar("choosing moments", len(recording.scenes_stated), quiet) as progress:
+                # the recorded driver must reach the goal with the speeds that the ego will have
+                speeds_mps = taken.targets_mps()
+                recording = tables.chosen(recording, speeds_mps, (), {})
                 moments, choice = _chosen(recording, progress)
-            recording = tables.chosen(recording, taken.targets_mps(), moments, choice)
+            recording = tables.chosen(recording, speeds_mps, moments, choice)
             if show:
                 _draw(recording, show)
     except OSError as error:

@@ -4,13 +4,14 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import road_files as files
 
 from harness.core.errors import UserError
-from harness.extensions.roads import importing, tables
+from harness.extensions.roads import fitness, importing, moments, tables
 from harness.extensions.roads.importing import Sources, kind_of
 from harness.extensions.roads.tables import Lane, Moment, Scene, Track
 
@@ -98,6 +99,25 @@ def test_a_street_whose_moments_are_known(harness: Callable[..., Said]) -> None:
     assert all(pair in [{f"east{k}", f"north{k}"} for k in range(0, 16, 2)] for pair in conflicts)
     assert len(conflicts) == len(recording.moments) / 2 > 0
     assert recording.choice["horizon_s"] == 6
+
+
+@pytest.mark.slow
+def test_who_reaches_the_goal_is_judged_with_the_speeds_that_the_ego_will_have(
+    harness: Callable[..., Said], source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("tracks.csv", "lanes.csv", "houses.csv"):
+        (source / name).unlink()
+    choose_fit, judged = fitness.choose_fit, []
+
+    def watched(recording: tables.Recording, *given: Any) -> moments.Choice:
+        judged.append(recording.speeds_mps)
+        return choose_fit(recording, *given)
+
+    monkeypatch.setattr(fitness, "choose_fit", watched)
+    monkeypatch.setattr(importing._Taken, "targets_mps", lambda taken: (0.0, 7.0, 14.0))
+    command = ("dataset", "import", source, "--out", "mine", "--licence", "CC0-1.0")
+    assert harness(*command)[0] == 0
+    assert judged == [tables.read(Path("mine")).speeds_mps] == [(0.0, 7.0, 14.0)]
 
 
 @pytest.mark.slow
