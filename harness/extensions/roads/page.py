@@ -17,6 +17,10 @@ from harness.runs.success import Success
 
 REGRET = "regret_rate"
 SHOWN = 20  # layouts that the page lists
+REPLAYED = (
+    "The others do not react (react=false): they drive as they were recorded to, and strike an ego "
+    "that is slower than the recorded driver was. `harness study reaction` says what that is worth."
+)
 HEADS = ("who", "success %", "regret %", "minus the recorded driver", "better", "worse")
 
 
@@ -31,7 +35,8 @@ def section(run: Run) -> Section | None:
         return None
     from harness.extensions.roads.driver import NAME  # imports highway-env
 
-    forest = dataset_of(run).of_episodes(run.grid.episodes).forest
+    dataset = dataset_of(run).of_episodes(run.grid.episodes)
+    forest, reacts = dataset.forest, dataset.manifest.parameters.get("react", True)
     if NAME not in forest.drivers:
         return None
     success_of = dict(zip(forest.episodes.tolist(), forest.driver_success(NAME), strict=True))
@@ -60,6 +65,7 @@ def section(run: Run) -> Section | None:
             "over what layouts are cut from."
         ],
         tables,
+        caveats=() if reacts else (REPLAYED,),
     )
 
 
