@@ -233,8 +233,7 @@ def reaction_study(result: Reaction, manifest: Mapping[str, Any]) -> "Study":
             counts = [f"{row[f'{name}_replay']} / {row[f'{name}_react']}" for name in COUNTED]
             cells.append((row[head], str(row["courses"]), share, *counts, str(row["n"])))
         heads = (head, "courses", "otherwise %", *HEADS, "n")
-        note = "Numbers of crashes are without reaction / with it."
-        return Table(title, heads, cells, note, terminal=(0, 1, 2, 3, 4), total=total)
+        return Table(title, heads, cells, terminal=(0, 1, 2, 3, 4), total=total)
 
     whole = result.courses.to_dict("records")[-1]
     share = percent(whole, "otherwise", "otherwise_low", "otherwise_high")
@@ -255,10 +254,10 @@ def reaction_study(result: Reaction, manifest: Mapping[str, Any]) -> "Study":
             "result: at the goal, in a collision, off the road, or too late. A number of crashes "
             "is that of courses, and of others that of vehicles; a vehicle that crashes in one "
             "course may crash in all.",
-            f"n is the number of layouts; 95 % intervals are over the {over} that these are cut "
-            "from. All is conditional on the moments of this recording, and on the model by which "
-            "others react: they brake for whoever is off the recording, by the Intelligent Driver "
-            "Model.",
+            "n is the number of layouts, and crashes are counted without reaction / with it; "
+            f"95 % intervals are over the {over} that layouts are cut from. All is conditional on "
+            "the moments of this recording, and on the model by which others react: they brake for "
+            "whoever is off the recording, by the Intelligent Driver Model.",
         ],
         [
             table("All courses, by how often the ego slows down", "slower", result.courses, True),
