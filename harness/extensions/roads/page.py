@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
+from harness.core.errors import printable
 from harness.core.figures import POINTS, interval_of
 from harness.core.statistics import Estimate, rate_interval
 from harness.dataset.forest import Forest
@@ -52,7 +53,7 @@ def section(run: Run) -> Section | None:
     if layouts:
         tables.append(_listed(run, layouts))
     return Section(
-        "The recorded driver",
+        f"The recorded driver beside {printable(run.manifest.variant, 80)}",
         [
             f"The recorded driver succeeds in {reached} % of the layouts, and {regret} % of his "
             f"decisions give success away; n = {len(his)} layouts."

@@ -35,6 +35,7 @@ def test_he_stands_beside_every_condition(runs: dict[str, Path]) -> None:
         run = read(folder)
         shown = section(run)
         assert shown.headline[0].startswith("The recorded driver succeeds in 100.0 [20.7, 100.0] %")
+        assert shown.title == f"The recorded driver beside {model} · v4 · json"
         assert "do not react" in shown.caveats[0]
         his, *rows = shown.tables[0].rows
         success = np.array([episode.success for episode in run.episodes]).reshape(run.grid.shape)
