@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from evaluating import FILES, run, same_files, spec_of, walked, with_ego
 from killed_run import PLACES, TREES_AT_ONCE, WALKS_AT_ONCE, at, killed_at, spec_to_kill
+from msgspec.structs import replace
 from run_on_disk import answers_of, change
 from tiers import some
 
@@ -436,7 +437,7 @@ def test_a_run_that_was_stopped_while_it_tidied_up_asks_and_writes_nothing(
     again = run(spec_of(small), tmp_path / "run")
     assert {p: (p.read_bytes(), p.stat().st_mtime_ns) for p in files} == before
     assert not (tmp_path / "run" / ".work").exists(), "tidy"
-    assert again.manifest == first.manifest
+    assert replace(again.manifest, digests={}) == first.manifest
     assert list(again.scores) == list(first.scores)
 
 
