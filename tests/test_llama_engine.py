@@ -489,6 +489,8 @@ def test_a_file_of_ones_own_is_known_by_its_content_and_by_what_reads_it(
     assert {key for key in identity if identity[key] != other[key]} == {
         "weights", "file_sha256", "dtype", "kv_cache",
     }  # fmt: skip
+    card = card_of(tiny / "F32.gguf", system="first-user")
+    assert open_backend(card).identity() == {**identity, "system_text": "first-user"}
 
 
 def test_nothing_is_said_on_stderr(tiny: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -225,7 +225,7 @@ class LlamaEngine:
             "chat_template_sha256": sha256_bytes(self.chat.template.encode()),
         }
         if self.chat.system:
-            identity["system"] = self.chat.system
+            identity["system_text"] = self.chat.system
         if self._model.adapter_file:
             identity["adapter_sha256"] = sha256_file(self._model.adapter_file)
         return identity
