@@ -486,27 +486,13 @@ class Spec:
         Values are plain, by name.
         """
         settings = msgspec.to_builtins(self.settings)
-        profiles = [point.radio.profile for point in self.points]
-        schedules = {
-            point.ask.schedule: SCHEDULES.file_sha256(point.ask.schedule) for point in self.points
-        }
-        kept = {}
-        for folder, by_name in kept_of(self.points).items():
-            kept[folder] = {name: each.record for name, each in by_name.items()}
         return {
             **self.ego.settings(),
             "helpers": [agent.settings() for agent in self.helpers],
             "world": msgspec.to_builtins(self.world),
             "actions": list(self.actions),
             "conditions": [point.record() for point in self.points],
-            "channels": {name: CHANNELS.record(name) for name in profiles if name},
-            "networks": {
-                point.cloud.round_trip: asdict(point.network)
-                for point in self.points
-                if point.network
-            },
-            "schedules": {name: sha256 for name, sha256 in schedules.items() if sha256},
-            "kept": kept,
+            **files_of(self.points),
             "seeds": list(self.seeds),
             "beside": self.timer.record() if self.timer else {},
             **{key: settings[name] for key, name in formats.BESIDE.items()},
@@ -607,6 +593,26 @@ class Spec:
             agent.letters == replace(agent, letters=None).letters for agent in reads
         )
         return None if is_cards_choice else reads[0].letters
+
+
+def files_of(points: Sequence[OperatingPoint]) -> dict[str, Any]:
+    """Return a record of every file that operating points name, by folder and name.
+
+    An operating point is the settings of radio, asking and fusion. They are channel profiles,
+    networks, schedules, and what extensions keep, such as calibrations.
+    """
+    profiles = [point.radio.profile for point in points]
+    networks = {point.cloud.round_trip: point.network for point in points}
+    schedules = {point.ask.schedule: SCHEDULES.file_sha256(point.ask.schedule) for point in points}
+    kept = {}
+    for folder, by_name in kept_of(points).items():
+        kept[folder] = {name: each.record for name, each in by_name.items()}
+    return {
+        "channels": {name: CHANNELS.record(name) for name in profiles if name},
+        "networks": {name: asdict(network) for name, network in networks.items() if network},
+        "schedules": {name: sha256 for name, sha256 in schedules.items() if sha256},
+        "kept": kept,
+    }
 
 
 def replayed(ego: Agent) -> Manifest | None:

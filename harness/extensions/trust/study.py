@@ -29,8 +29,8 @@ from harness.core.progress import Progress
 from harness.core.statistics import Estimate, negative_log_likelihood, resampled, resampled_estimate
 from harness.core.versions import versions
 from harness.dataset.load import Scene
+from harness.evaluate.spec import files_of
 from harness.evaluate.walk import Decided
-from harness.radio.profiles import CHANNELS
 from harness.report.document import Table, strong
 from harness.runs.alike import setup
 from harness.runs.estimates import over_episodes
@@ -438,7 +438,7 @@ def run_bench(
         sha256_file(run.run.path / "answers.jsonl", "rows"),
         point.record(),
         list(seeds),
-        point.radio.profile and CHANNELS.record(point.radio.profile),
+        files_of([under(point, *key) for key in every]),
         versions(),
     ]
     kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()

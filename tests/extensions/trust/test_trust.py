@@ -120,6 +120,26 @@ def test_finished_cells_are_kept_and_a_torn_one_is_played_again(
     assert len(again) == len(lines)
 
 
+@pytest.mark.slow
+def test_cells_are_of_what_the_conditions_files_say(
+    done: Evaluated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(resources.MARKER).touch()
+    Path("networks").mkdir()
+    stored, success = ReplayedRun(done.out), {}
+    for round_trip_ms in (10, 3000, 10):
+        Path("networks/mine.toml").write_text(
+            'description = "x"\nsource = "x"\nstatus = "assumed"\n'
+            f"[quantiles_ms]\n0 = {round_trip_ms}\n100 = {round_trip_ms}\n"
+        )
+        on = (stored, "6g:round_trip=mine", ("linear",), ("liar",), (THIRD,), stored.seeds)
+        played_again = run_bench(*on, tmp_path / "bench", Watched())
+        ends = success.setdefault(round_trip_ms, played_again.cells["linear", PEACE, 0.0].success)
+        assert np.array_equal(ends, played_again.cells["linear", PEACE, 0.0].success)
+    assert not np.array_equal(success[10], success[3000])
+
+
 def test_its_folder_has_a_page_figures_and_a_picture(bench: Bench, tmp_path: Path) -> None:
     page = write_study(trust_study(bench), tmp_path).read_text()
     assert "liar+spoof" in page
