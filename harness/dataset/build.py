@@ -32,8 +32,10 @@ from harness.core.seals import is_sealed, say_unsealed, write_seal
 from harness.core.seeds import LAST_EPISODE, LAST_SEED, purpose, seeds_text
 from harness.core.shards import Shard
 from harness.core.strangers import worded
+from harness.dataset import rebuilt
 from harness.dataset.forest import Forest
 from harness.dataset.freeze import freeze
+from harness.dataset.load import Dataset, load
 from harness.dataset.schema import (
     FILE_NAME,
     LAYOUTS,
@@ -43,7 +45,7 @@ from harness.dataset.schema import (
     record_type,
     tree_schema,
 )
-from harness.dataset.verify import level_name, read_manifest, tree_name
+from harness.dataset.verify import level_name, tree_name
 from harness.world import scenarios
 from harness.world.drivers import drivers_of
 from harness.world.families import keep
@@ -141,11 +143,14 @@ def build(
                 f"--out {printable(out)} already holds a finished dataset; choose another folder "
                 "or delete it"
             )
-        # A build was stopped while it tidied up.
-        finished: dict[str, Any] = msgspec.to_builtins(read_manifest(out)[0])
-        work.same(out, config, {key: finished[key] for key in config})
+        # A build was stopped while it tidied up, or somebody made a folder that looks so.
+        dataset = dataset_of_stopped(scenario, out, episodes, seed)
+        for difference in rebuilt.differences(dataset):
+            raise UserError(
+                f"--out {printable(out)}: {difference}; delete it, or choose another folder"
+            )
         work.tidy(out)
-        return finished
+        return dict(msgspec.to_builtins(dataset.manifest))
     part = str(shard or "")
     own_episodes = shard.part(range(episodes)) if shard else range(episodes)
     if start := work.start_of(out, work.WorkStart):
@@ -163,6 +168,18 @@ def build(
         )
         work.tidy(out)
     return manifest
+
+
+def dataset_of_stopped(scenario: Scenario, out: Path, episodes: int, seed: int) -> Dataset:
+    """Return the dataset that a stopped command left in the folder `out`, which anybody may fill.
+
+    Raises UserError unless its files have its manifest's digests, and it states that `scenario`,
+    `episodes` layouts (start situations), and `seed` as the layout seed of the first.
+    """
+    dataset, config = load(out), _settings(scenario, episodes, seed)
+    manifest = msgspec.to_builtins(dataset.manifest)
+    work.same(out, config, {key: manifest.get(key) for key in config})
+    return dataset
 
 
 def _settings(scenario: Scenario, episodes: int, seed: int) -> dict[str, Any]:

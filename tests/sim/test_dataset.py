@@ -17,6 +17,7 @@ import msgspec
 import pytest
 from evaluating import scenes_of
 from former import SCENARIO
+from relabelling import relabel
 from together import act_together
 
 from harness.core.errors import UserError
@@ -114,6 +115,35 @@ def test_a_finished_dataset_is_not_built_over(small_folder):
     with pytest.raises(UserError, match="already holds a finished dataset"):
         build(SCENARIO, small_folder, 6, FIRST_SEED, 1, lambda done: None)
     assert contents(small_folder) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: None, None),
+        (
+            lambda folder: (folder / "layouts.zip").write_bytes(bytes(1000)),
+            r"layouts\.zip: cannot be read",
+        ),
+        (lambda folder: relabel(folder, {0: 7, 1: 8}), "another seed; repeat its settings"),
+    ],
+)
+def test_a_folder_that_was_stopped_as_it_tidied_is_held_to_what_it_states(
+    three_decisions, tmp_path, spoil, said
+):
+    out = shutil.copytree(three_decisions, tmp_path / three_decisions.name)
+    (out / ".work").mkdir()
+    spoil(out)
+    if said is None:
+        assert build(FEW, out, 2, 5, 1, lambda done: None)["seed"] == 5
+        assert contents(out) == contents(three_decisions)
+        return
+    with pytest.raises(UserError, match=said):
+        build(FEW, out, 2, 5, 1, lambda done: None)
+    if "another seed" in said:
+        with pytest.raises(UserError, match="layout 0 is not what layout seed 7 gives"):
+            build(FEW, out, 2, 7, 1, lambda done: None)
 
 
 def test_a_folder_with_other_files_a_file_and_an_odd_name_are_refused_untouched(tmp_path):

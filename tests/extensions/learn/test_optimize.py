@@ -19,10 +19,12 @@ from harness.core.resources import folder
 from harness.dataset.load import Dataset, find, load
 from harness.extensions.learn.optimize.candidate import chosen, rewritten, space, systems
 from harness.extensions.learn.optimize.feedback import of_course, of_decision
+from harness.extensions.learn.optimize.layouts import built
 from harness.extensions.learn.optimize.search import looks
 from harness.extensions.learn.optimize.tuning import TIE, Decision, Played
 from harness.prompts import versions as prompts
 from harness.prompts.alternatives import counts, resolved
+from harness.studies.replayed_run import SILENT
 
 pytestmark = pytest.mark.usefixtures("unrebuilt")
 
@@ -336,6 +338,24 @@ def test_a_stopped_search_goes_on_and_comes_to_the_same(
     for name in ("tried", "chosen", "questions", "tokens", "certificate", "sha256"):
         assert again[name] == whole[name], name
     assert len(model.chats) == asked, "nothing was asked twice"
+
+
+def test_tune_layouts_that_a_stopped_search_left_are_those_that_were_asked_for(
+    small: Dataset, small_path: Path, tmp_path: Path
+) -> None:
+    stated, scenario = small.manifest, small.scenario
+    out = shutil.copytree(small_path, tmp_path / f"tune-{scenario.name}")
+    [source] = built([scenario], tmp_path, stated.episodes, stated.seed, 1, SILENT)
+    assert source.dataset.sha256 == small.sha256
+    for layouts, seed, said in (
+        (stated.episodes - 1, stated.seed, "begun with another episodes"),
+        (stated.episodes, stated.seed + 1, "begun with another seed"),
+    ):
+        with pytest.raises(UserError, match=said):
+            built([scenario], tmp_path, layouts, seed, 1, SILENT)
+    (out / "layouts.zip").write_bytes(bytes(1000))
+    with pytest.raises(UserError, match=r"layouts\.zip: cannot be read"):
+        built([scenario], tmp_path, stated.episodes, stated.seed, 1, SILENT)
 
 
 @pytest.mark.exhaustive

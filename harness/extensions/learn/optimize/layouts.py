@@ -77,9 +77,10 @@ def built(
     """Return a dataset of tune layouts for each scenario, built in the folder `place` if missing.
 
     Each has `layouts` layouts (start situations), with seeds from `first_seed` on. `progress` is
-    told how many there are, and called with the number just built.
+    told how many there are, and called with the number just built. Raises UserError if one that a
+    stopped search left is not what its seeds give, or has a layout that numbers are reported of.
     """
-    from harness.dataset.build import build
+    from harness.dataset.build import build, dataset_of_stopped
 
     sources = []
     for scenario in scenarios:
@@ -87,7 +88,11 @@ def built(
         if not (out / "manifest.json").is_file() or (out / WORK).is_dir():
             progress.more(layouts)
             build(scenario, out, layouts, first_seed, workers, progress, audits=False)
-        sources.append(FrozenSource(load.load(out)))
+            dataset = load.load(out)
+        else:
+            dataset = dataset_of_stopped(scenario, out, layouts, first_seed)
+            rebuilt.refuse(dataset)
+        sources.append(FrozenSource(dataset))
     return sources
 
 
