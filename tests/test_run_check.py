@@ -22,6 +22,7 @@ from harness.runs.contradictions import refuse
 from harness.runs.digests import LABELS, OF_ALL, digests_of
 from harness.runs.folder import read
 from harness.runs.records import AGENT
+from harness.studies.replayed_run import ReplayedRun
 
 Harness = Callable[..., tuple[int, str, str]]
 Tamper = Callable[[Path], object]
@@ -184,7 +185,9 @@ def test_tables_that_contradict_each_other_are_neither_shown_nor_compared(
 ) -> None:
     said = check_finds(IN_TABLES["success of episodes"], run, harness)
     junit = ("run", "export", run, "--junit", "junit.xml")
-    for typed in (("report", run), ("compare", proxy_run, run), ("compare", run, proxy_run), junit):
+    swept = ("study", "sweep", run, "--over", "tau", "--grid", "0")
+    compared = ("compare", proxy_run, run), ("compare", run, proxy_run)
+    for typed in (("report", run), *compared, junit, swept):
         gate = ("--fail-if", "success_rate < 1") if typed[0] == "compare" else ()
         code, out, error = harness(*typed, *gate)
         assert (code, out, error.count("\n")) == (2, "", 1)
@@ -192,6 +195,13 @@ def test_tables_that_contradict_each_other_are_neither_shown_nor_compared(
         assert said in error
     assert not (run / "report.html").exists()
     assert not Path("junit.xml").exists()
+
+
+def test_a_study_takes_no_time_that_is_not_its_sources(run: Path) -> None:
+    """Though every digest is in order."""
+    latency(run, ego_s=0.02, helper_s=0.02, fusion_s=0.02)
+    with pytest.raises(UserError, match=r"has another latency than .*, which it names as the s"):
+        ReplayedRun(run)
 
 
 def reworded(answer: Row) -> None:
@@ -644,6 +654,9 @@ def test_times_of_a_replay_are_held_to_what_it_replays_or_said_to_be_its_own(
     code, out, _ = harness("run", "check", "of-alone")
     assert code == 1
     assert "another latency of the helpers than of the ego" in " ".join(out.split())
+    latency(Path("of-alone"), helper_s=0.145, source="declared")
+    out = " ".join(harness("run", "check", "of-alone")[1].split())
+    assert "Its latency of 0.145 s, declared in the run that it replays, is stated by" in out
     Path("models/slow.toml").write_text(SLOW.replace("1.9", "0.1"))
     out = " ".join(harness("run", "check", "slow")[1].split())
     assert "card slow in run.json states 1.9 s (card) for an answer; the one that is here" in out
@@ -768,7 +781,11 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
     configure(run, versions={**stated["versions"], "figures": "1"})
     without("optimal_")(run)
     added("comfort", "episodes")(run)
+    edited("answer_times", to={"ego": {"n": 9, "median_s": 1e-4, "p5_s": 1e-4, "p95_s": 1e-4}})(run)
+    edited("digests", to={})(run)
     said = (
+        "Not held, since its figures are by the rules of version 1: run.json has another "
+        "answer_times than its answers took.",
         "comfort: as summary.csv states, and not checked, since",
         "Its figures are made by the rules of version 1, as run.json states. It lacks "
         "optimal_action_rate, optimal_brier and optimal_nll_nats, and whether they were left out "

@@ -434,6 +434,21 @@ def test_a_suites_own_table_is_held_against_its_runs(change: str, evaluated: Har
         )
 
 
+def test_a_suite_with_a_run_by_older_rules_is_held_by_value_alone_and_said_to_be(
+    evaluated: Harness,
+) -> None:
+    stated = json.loads((DONE / "small/run.json").read_text())["versions"]
+    configure(DONE / "small", versions={**stated, "figures": "1"})
+    table = DONE / "summary.csv"
+    table.write_text(table.read_text().replace(",8,", ",400,"))
+    _, out, _ = evaluated("run", "check", DONE)
+    words = " ".join(out.split())
+    assert f"{DONE}: equal where it can be checked: " in words
+    assert (
+        "Its means are held by value alone, not their intervals and n: run.json of small" in words
+    )
+
+
 def test_a_run_counts_for_the_family_whose_scenes_it_has(evaluated: Harness) -> None:
     edited(DONE / "suite.json", '"parking-exit"', '"roundabout"')
     code, out, error = evaluated("report", DONE)

@@ -95,14 +95,15 @@ def _runs_in(folders: list[Path]) -> list[Path]:
 
 def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object]:
     """Check a run, print the result, and return it."""
-    from harness.evaluate.recompute import differences, of_card, texts_otherwise
+    from harness.evaluate.recompute import differences, texts_otherwise
+    from harness.evaluate.stated_times import unchecked_times
     from harness.runs.contradictions import contradictions, unchecked
     from harness.runs.folder import read
     from harness.runs.run_dataset import dataset_of
     from harness.runs.settings import otherwise
 
     run = read(path)
-    open_points = [*unchecked(run), *of_card(run)]
+    open_points = [*unchecked(run), *unchecked_times(run)]
     frozen = run.world == "frozen"
     try:
         if not frozen:
@@ -139,23 +140,24 @@ def _checked(path: Path, dataset: Path | None, silent: bool) -> dict[str, object
 
 def _checked_means(path: Path, silent: bool) -> dict[str, object]:
     """Check the means of a suite over its runs, print the result, and return it."""
-    from harness.runs.contradictions import of_suite
+    from harness.runs.contradictions import of_suite, unchecked_of_suite
     from harness.runs.suite import read
 
     suite = read(path)
-    wrong = list(of_suite(suite))
+    wrong, open_points = list(of_suite(suite)), list(unchecked_of_suite(suite))
     if not silent:
         means = amount(len(suite.stated_scores), "mean")
-        typer.echo(
-            f"{printable(path)}: {'not ' * bool(wrong)}equal: {means}, computed again from its runs"
-        )
-        for difference in wrong:
-            echo_text(f"  {difference}")
+        equal = "equal where it can be checked" if open_points else "equal"
+        result = "not equal" if wrong else equal
+        typer.echo(f"{printable(path)}: {result}: {means}, computed again from its runs")
+        for line in (*wrong, *open_points):
+            echo_text(f"  {line}")
     return {
         "suite": str(path),
         "equal": not wrong,
         "figures": len(suite.stated_scores),
         "differences": wrong,
+        "unchecked": open_points,
     }
 
 

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,13 +10,11 @@ from typing import Any
 from msgspec import UNSET, structs, to_builtins
 from msgspec.structs import astuple
 
-from harness.backends import cards
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
-from harness.backends.registry import open_backend, registration
+from harness.backends.registry import open_backend
 from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
-from harness.core.config import convert
 from harness.core.errors import Unanswered, UserError, in_range, printable
 from harness.core.extensions import part_of
 from harness.core.figures import amount
@@ -38,12 +35,12 @@ from harness.evaluate.of_run import (
 )
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Source, Spec
+from harness.evaluate.stated_times import times_otherwise
 from harness.evaluate.texts import OF_TEXTS, others, same
 from harness.prompts import versions
-from harness.runs.answerers import REPLAY
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
-from harness.runs.records import MEASURED, Episode, FrozenScenes, Latency
+from harness.runs.records import Episode, FrozenScenes, Latency
 from harness.runs.stopping import looked_otherwise
 from harness.runs.unanswered import Tally
 from harness.world import scenarios
@@ -268,8 +265,9 @@ def texts_otherwise(run: Run) -> Iterator[str]:
 
 def _of_manifest(run: Run, card: Card) -> Iterator[str]:
     """Yield what run.json, with this card of the ego's model, states otherwise than is here."""
-    yield from _of_card(run, card)
-    yield from _of_latency(run)
+    if (timer := run.manifest.timer) and (change := timer.changed()):
+        yield change
+    yield from times_otherwise(run, card)
     yield from _of_agents(run)
     yield from _of_calls(run)
     yield from records_otherwise(run)
@@ -338,137 +336,6 @@ def _of_calls(run: Run) -> Iterator[str]:
                 yield f"answers.jsonl has {name}, which {setting} {agent[setting]} gives to none"
             elif agent[setting] == value and without[place, name] and not with_it[place, name]:
                 yield f"answers.jsonl has no {name}, which {setting} {agent[setting]} gives"
-
-
-def _of_card(run: Run, card: Card) -> Iterator[str]:
-    """Yield whether a run's latency is otherwise than this card says, if it names that."""
-    latency, card_s = run.manifest.latency, card.latency.inference_s
-    if card.engine == REPLAY:  # its answers took as long as in the run that it replays
-        card_s = asked_card(run).latency.inference_s
-    if latency.source == "card" and card_s != latency.ego_s:
-        yield "run.json has another latency than its model's card, which it names as the source"
-
-
-def asked_card(run: Run) -> Card:
-    """Return the card (description) of the model that was asked, as the run states it.
-
-    Of answers that are replayed it is that of the first run. Raises UserError if the run states
-    none.
-    """
-    model, where = run.manifest.answerers.model, printable(run.path)
-    if not model:
-        raise UserError(f"{where}: run.json states no model of what it replays; make it again")
-    return convert(model, Card, f"{where}: its model")
-
-
-def of_card(run: Run) -> Iterator[str]:
-    """Yield what is not known of the cards that a run's latency is said to be from.
-
-    A card is the file that describes a model. One that is here may state another time; the time of
-    one that is not here, or of a model whose answers are replayed, the run alone states.
-    """
-    latency, manifest = run.manifest.latency, run.manifest
-    if manifest.settings.latency in (None, "card"):
-        models = [asked_card(run), *(model_of(run, helper) for helper in manifest.helpers)]
-        for card in dict.fromkeys(models):
-            yield from _of_card_here(card)
-    replays = [manifest.model, *(helper["model"] for helper in manifest.helpers)]
-    is_replay = manifest.model["engine"] == REPLAY
-    several = is_replay and bool(manifest.answerers.identity.get("helpers"))
-    by_run = any(model["engine"] == REPLAY for model in replays[1:])
-    if latency.source in ("card", "paper") and (several or by_run):
-        times = dict.fromkeys(f"{seconds:g} s" for seconds in latency.helper_times_s())
-        yield f"Its helpers' latency of {' and '.join(times)} is stated by run.json alone."
-
-
-def _of_card_here(card: Card) -> Iterator[str]:
-    """Yield a sentence if the card of this name that is here states another time, or none is."""
-    if card.engine == REPLAY:
-        return
-    in_run = _time(card)
-    if card.name in cards.names():
-        here = _time(cards.load(card.name))
-        if here != in_run:
-            yield (
-                f"The card {printable(card.name)} in run.json states {in_run} for an answer; the "
-                f"one that is here states {here}."
-            )
-    elif card.latency.inference_s is not None:
-        yield (
-            f"The card {printable(card.name)} in run.json states {in_run} for an answer, and none "
-            "of that name is here."
-        )
-
-
-def _time(card: Card) -> str:
-    """Return in words the time of an answer that a card states."""
-    seconds = card.latency.inference_s
-    return "no time" if seconds is None else f"{seconds:g} s ({card.latency.source})"
-
-
-def _of_latency(run: Run) -> Iterator[str]:
-    """Yield what a run's latencies are otherwise than the source that it names for them."""
-    latency, timer = run.manifest.latency, run.manifest.timer
-    if timer and (change := timer.changed()):
-        yield change
-    if latency.source == "paper" and latency.ego_s != latencies.PAPER.ego_s:
-        yield "run.json has another latency than the paper, which it names as the source"
-    if latency.source == MEASURED and not _is_measured(latency):
-        yield "run.json has another measured latency than the median of its sample"
-    if latency.source in ("declared", MEASURED) and not _is_typed(run):
-        yield f"run.json has times that are {latency.source}, and its settings do not have them"
-    if latency.source in ("card", "paper"):
-        others = {"a fusion call": latency.fusion_s}
-        is_replay = run.manifest.model["engine"] == REPLAY
-        # Those of the run that it replays may have models of their own, whose cards are not here.
-        if is_replay and run.manifest.answerers.identity.get("helpers"):
-            pass
-        elif not run.manifest.helpers:
-            others["the helpers"] = latency.helper_s
-        elif latency.helper_times_s() != _helpers_s(run, latency.helper_times_s()):
-            yield "run.json has another latency of the helpers than their cards, or the paper, have"
-        for whose in (whose for whose, seconds in others.items() if seconds != latency.ego_s):
-            yield f"run.json has another latency of {whose} than of the ego, whose source it names"
-
-
-def _is_measured(latency: Latency) -> bool:
-    """Return whether measured times are the medians of the sample; one of several models' may be.
-
-    A role that was not timed has the time of the ego. A latency without a sample is an older run's.
-    """
-    sample = latency.sample
-    if "ego" not in sample:
-        return True
-    helper_s, fusion_s = (sample.get(role, sample["ego"]).median_s for role in ("helper", "merge"))
-    by_role = (latency.ego_s, latency.fusion_s) == (sample["ego"].median_s, fusion_s)
-    return by_role and (bool(latency.helpers_s) or latency.helper_s == helper_s)
-
-
-def _is_typed(run: Run) -> bool:
-    """Return whether a run's settings have its times, as a finished run's do, or its model has."""
-    typed = run.manifest.settings.latency
-    if typed is None:
-        return registration(run.manifest.model["engine"]).capabilities.own_latency
-    if typed in latencies.NAMES:
-        return False
-    latency = run.manifest.latency
-    of_typed = structs.replace(latencies.declared(typed), source=latency.source)
-    return latencies.same_times(of_typed, latency)
-
-
-def _helpers_s(run: Run, in_manifest: Sequence[float]) -> tuple[float | None, ...]:
-    """Return the times of the models that answer for helpers alone, by what was typed or cards.
-
-    Answers that are replayed have their own, which `in_manifest` states.
-    """
-    typed = run.manifest.settings.latency
-    choice = typed if typed in latencies.NAMES else None
-    times = []
-    for helper, helper_s in zip_longest(run.manifest.helpers, in_manifest):
-        card = model_of(run, helper or run.manifest.helpers[0])
-        has_own = choice is None and registration(card.engine).capabilities.own_latency
-        times.append(helper_s if has_own else latencies.of_card(choice, card).helper_s)
-    return tuple(times)
 
 
 def _of_episodes(run: Run, ours: Run) -> Iterator[str]:

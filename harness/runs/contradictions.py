@@ -19,7 +19,7 @@ from harness.runs import digests, pinned
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run, read
 from harness.runs.headline import BALANCED, PAIRED
-from harness.runs.manifest_contradictions import of_manifest
+from harness.runs.manifest_contradictions import by_later_rules, of_manifest
 from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.metrics import METRICS
 from harness.runs.records import Episode, FrozenScenes, Score
@@ -89,7 +89,9 @@ def contradictions(run: Run) -> Iterator[str]:
     yield from _of_conditions(run)
     yield from _of_episodes(run)
     answers, reached = list(run.answers), run.decisions.scenes
-    yield from of_manifest(run, answers, current=current(run))
+    yield from of_manifest(run, answers)
+    if current(run):
+        yield from by_later_rules(run, answers)
     undecided = (answer.scene for answer in answers if answer.scene not in reached)
     if (scene := next(undecided, None)) is not None:
         yield f"answers.jsonl has scene {printable(scene)!r}, which decisions.parquet has not"
@@ -99,9 +101,6 @@ def contradictions(run: Run) -> Iterator[str]:
     delays = filter(None, map(run.undeclared_delay, answers))
     if (delay := next(delays, None)) is not None:
         yield f"answers.jsonl has {delay}"
-    record = run.manifest.world.interim_looks
-    if record is not None and current(run) and (rule := run.manifest.stopping_rule):
-        yield from rule.contradictions(record, run.grid, run.episodes)
     yield from _of_scores(run, _scores(run))
     yield from digests.otherwise(run)
 
@@ -116,7 +115,7 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
     if any(scenes.count(each) > 1 for each in scenes):
         yield f"{SUITE} has two families of the same scenes"
     yield from _of_families(suite)
-    older = next((run for run in suite.runs.values() if not current(run)), None)
+    older = _older(suite)
     columns = ("value",) if older else _COLUMNS
     stated_scores = {
         _key(older, score) if older else score.key: score for score in suite.stated_scores
@@ -129,6 +128,24 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
             yield f"{SUMMARY} lacks {key[1]} in {printable(key[0])} ({key[2]})"
         else:
             yield from _otherwise(stated_scores[key], computed[key], columns, "its runs make")
+
+
+def unchecked_of_suite(suite: SuiteRun) -> Iterator[str]:
+    """Yield a sentence if intervals and counts of a suite's table are not compared.
+
+    They are not where one of its runs states figures by the rules of an earlier version.
+    """
+    if older := _older(suite):
+        version = printable(older.manifest.versions.get("figures", "1"))
+        yield (
+            f"Its means are held by value alone, not their intervals and n: run.json of "
+            f"{printable(older.path.name)} states figures by the rules of version {version}."
+        )
+
+
+def _older(suite: SuiteRun) -> Run | None:
+    """Return a suite's first run by the rules of an earlier version; None if there is none."""
+    return next((run for run in suite.runs.values() if not current(run)), None)
 
 
 def _scores(run: Run) -> Iterator[Score]:
@@ -206,11 +223,13 @@ def unchecked(run: Run) -> Iterator[str]:
         what = "a package's metrics, or an earlier harness's"
         yield f"{_listed(names)}: as summary.csv states, and not checked, since they are {what}."
     yield from digests.unheld(run)
+    version = printable(run.manifest.versions.get("figures", "1"))
+    for sentence in () if current(run) else by_later_rules(run, list(run.answers)):
+        yield f"Not held, since its figures are by the rules of version {version}: {sentence}."
     rule, record = run.manifest.stopping_rule, run.manifest.world.interim_looks
     if rule and record and (open_point := rule.unchecked(record)):
         yield open_point
     if names := dict.fromkeys(key[1] for key in _lacking(run, here.values())):
-        version = printable(run.manifest.versions.get("figures", "1"))
         yield (
             f"Its figures are made by the rules of version {version}, as run.json states. It lacks "
             f"{_listed(names)}, and whether they were left out cannot be checked."

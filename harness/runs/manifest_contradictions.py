@@ -1,6 +1,6 @@
 """Hold what `run.json` states against a run's answers, and against its own settings."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Any
 
 from harness.core.errors import printable
@@ -10,21 +10,35 @@ from harness.runs.folder import Run
 from harness.runs.records import Answer
 
 
-def of_manifest(run: Run, answers: Iterable[Answer], *, current: bool) -> Iterator[str]:
+def of_manifest(run: Run, answers: Sequence[Answer]) -> Iterator[str]:
     """Yield a sentence for each statement of a run's `run.json` that the run's own data contradict.
 
-    Such is a number of episodes. `answers` are the run's. A run that is not `current`, by earlier
-    rules for figures, may lack records, and its times of answers are not compared.
+    Such is a number of episodes. `answers` are the run's.
     """
-    answers = list(answers)
     for name, count in counts(answers).items():
         in_manifest = getattr(run.manifest, name)
         if in_manifest != count:
             yield f"run.json has {name} {in_manifest}, and answers.jsonl has {count}"
-    if current and run.manifest.answer_times != times(answers):
-        yield "run.json has another answer_times than its answers took"
     yield from _of_cost(run)
-    yield from _of_records(run, current)
+    for what, recorded, named in _records(run):
+        for name in sorted(recorded.keys() - named):
+            yield f"run.json has {what} {printable(name)}, which no condition names"
+
+
+def by_later_rules(run: Run, answers: Sequence[Answer]) -> Iterator[str]:
+    """Yield what a run's `run.json` states otherwise than the rules of today for figures make.
+
+    These are times of answers, records that it lacks, and looks at what it had so far. A run by
+    earlier rules may state them so. `answers` are the run's.
+    """
+    if run.manifest.answer_times != times(answers):
+        yield "run.json has another answer_times than its answers took"
+    for what, recorded, named in _records(run):
+        for name in sorted(named - recorded.keys()):
+            yield f"run.json lacks {what} {printable(name)}, which a condition names"
+    record = run.manifest.world.interim_looks
+    if record is not None and (rule := run.manifest.stopping_rule):
+        yield from rule.contradictions(record, run.grid, run.episodes)
 
 
 def _of_cost(run: Run) -> Iterator[str]:
@@ -42,8 +56,8 @@ def _of_cost(run: Run) -> Iterator[str]:
             )
 
 
-def _of_records(run: Run, current: bool) -> Iterator[str]:
-    """Yield which channel profiles and networks are recorded and not named, or the reverse."""
+def _records(run: Run) -> Iterator[tuple[str, Mapping[str, Any], Set[str]]]:
+    """Yield channel profiles and networks: what they are, those recorded, and those named."""
     manifest = run.manifest
     recorded_by_setting: dict[str, tuple[str, Mapping[str, Any]]] = {
         "profile": ("channel profile", manifest.channels),
@@ -51,7 +65,4 @@ def _of_records(run: Run, current: bool) -> Iterator[str]:
     }
     for setting, (what, recorded) in recorded_by_setting.items():
         named = {str(point[setting]) for point in manifest.conditions if point.get(setting)}
-        for name in sorted(recorded.keys() - named):
-            yield f"run.json has {what} {printable(name)}, which no condition names"
-        for name in sorted(named - recorded.keys() if current else ()):
-            yield f"run.json lacks {what} {printable(name)}, which a condition names"
+        yield what, recorded, named

@@ -32,6 +32,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.files import alone, canonical_json
 from harness.core.progress import Progress
 from harness.dataset.load import Scene
+from harness.evaluate import stated_times
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.latency import PAPER
@@ -40,7 +41,7 @@ from harness.evaluate.requests import EGO, wanted_in
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import Fuses
-from harness.runs.folder import read
+from harness.runs.contradictions import sound
 from harness.runs.records import Answer
 from harness.runs.run_dataset import dataset_of
 from harness.runs.success import Success, alike
@@ -104,7 +105,8 @@ class ReplayedRun:
         """
         if latency not in ("run", "paper"):
             raise unknown("--latency", latency, ("run", "paper"))
-        self.run = read(folder)
+        self.run = sound(folder)
+        stated_times.refuse_otherwise(self.run)
         if self.run.world != "frozen":
             raise UserError(
                 f"{printable(folder)} was driven, and other decisions lead elsewhere; "

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from misbehaving import Server, completion, serving
+from run_on_disk import digested
 from tiers import some
 
 from harness.backends import cards
@@ -197,6 +198,7 @@ def test_a_run_of_a_model_that_no_longer_ships_is_read_and_runs_again_with_its_c
     for name in ("run.json", "run.toml"):
         file = Path("run") / name
         file.write_text(file.read_text().replace('"mine"', '"qwen3-8b"'))
+    digested(Path("run"))
     shutil.rmtree("cache", ignore_errors=True)
     card = Path("models/mine.toml").rename("kept.toml")
     for read in (("report", "run"), ("compare", "run", "run"), ("run", "check", "run")):
@@ -248,4 +250,5 @@ def state(**values: Any) -> None:
     manifest = json.loads(file.read_text())
     manifest["model"]["server"].update(values)
     file.write_text(json.dumps(manifest))
+    digested(file.parent)
     shutil.rmtree("cache", ignore_errors=True)

@@ -20,8 +20,8 @@ from harness.evaluate import resolve
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import card_here
-from harness.evaluate.recompute import asked_card
 from harness.evaluate.spec import Spec
+from harness.evaluate.stated_times import asked_card
 from harness.prompts import versions
 from harness.runs import formats, pinned
 from harness.runs.folder import Run

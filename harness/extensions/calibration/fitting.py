@@ -26,7 +26,8 @@ from harness.extensions.calibration.calibrations import (
     check_seeds,
     question_of,
 )
-from harness.runs.folder import Run, read
+from harness.runs.contradictions import sound
+from harness.runs.folder import Run
 from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats
 from harness.runs.run_dataset import check_scenes, dataset_of
@@ -105,7 +106,7 @@ def calibrate(
     Raises UserError for layouts of another purpose, several models, sampled answers, or if no
     answer of the ego could be parsed.
     """
-    run, name = read(folder), printable(folder)
+    run, name = sound(folder), printable(folder)
     manifest = run.manifest
     if not isinstance(manifest.world, FrozenScenes):
         raise UserError(

@@ -263,7 +263,7 @@ def test_an_answer_in_a_scene_that_the_dataset_has_not_is_one_line(
         "model", "calibrate", run, "--dataset", small_path, "--out", "mine.toml"
     )
     assert (code, error.count("\n")) == (2, 1)
-    assert "has scene '00009-0-000000000000', which its dataset has not" in error
+    assert "has scene '00009-0-000000000000', which decisions.parquet has not" in error
 
 
 @pytest.mark.slow

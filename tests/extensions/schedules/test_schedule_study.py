@@ -536,6 +536,7 @@ def test_a_model_is_opened_once_whatever_it_is_asked(
         return open_backend(card, **options)
 
     monkeypatch.setattr("harness.studies.replayed_run.open_backend", counting)
+    monkeypatch.setattr("harness.studies.replayed_run.sound", read)  # lacks what it was asked
     monkeypatch.setattr(asking, "CHUNK", 2)
     made(ReplayedRun(out), "6g")
     assert opened == ["proxy"]
