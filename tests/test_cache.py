@@ -402,6 +402,24 @@ def test_a_run_from_the_cache_is_the_run_that_was_asked(
     assert same_decisions(tmp_path / "replayed", tmp_path / "again")
 
 
+def test_a_replay_takes_what_its_run_lacks_from_no_cache_but_the_one_that_it_is_given(
+    proxy_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By its model, to which a question goes that the run never asked."""
+    files: list[Path | None] = []
+
+    def noting(model: Any, card: Any, file: Path | None) -> Any:
+        files.append(file)
+        return Scripted({})
+
+    monkeypatch.setattr("harness.backends.replay.cached", noting)
+    card = cards.resolve(f"replay:{proxy_run}")
+    for file in (None, tmp_path / "cache.sqlite"):
+        replay = cached(open_backend(card), card, file)
+        replay.complete([replace(BASE, id="00000-9-0/v1")])
+    assert files == [None, tmp_path / "cache.sqlite"]
+
+
 def asked_at(servers: Sequence[Server], file: Path) -> str:
     """The text that a card with a list of servers gets through the cache."""
     card = cards.load("openai-example")

@@ -6,6 +6,7 @@ the rest of the program does not depend on it.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 
 from msgspec import Meta
@@ -347,6 +348,16 @@ def forget(backend: Backend) -> None:
     forgets: Callable[[], None] | None = getattr(backend, "forget", None)
     if forgets:
         forgets()
+
+
+def keep_in(backend: Backend, file: Path) -> None:
+    """Tell a backend the file of stored completions that models may use which it opens itself.
+
+    A replay opens the model of its run for what that lacks. Does nothing for other backends.
+    """
+    keeps: Callable[[Path], None] | None = getattr(backend, "keep_in", None)
+    if keeps:
+        keeps(file)
 
 
 @dataclass(frozen=True)

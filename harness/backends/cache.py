@@ -31,6 +31,7 @@ from harness.backends.base import (
     Served,
     doubt,
     forget,
+    keep_in,
     served,
     several,
     window,
@@ -223,7 +224,10 @@ def cached(backend: Backend, card: Card, file: Path | None) -> Backend:
     describes a model. `backend` itself is returned if `file` is None, or if its engine cannot show
     its prompts, by which answers are found.
     """
-    if file is None or not capabilities(card.engine).renders:
+    if file is None:
+        return backend
+    keep_in(backend, file)
+    if not capabilities(card.engine).renders:
         return backend
     engine = card.engine
     of_package = "" if ENGINES.is_ours(engine) else ENGINES.of_package(engine)

@@ -10,7 +10,7 @@ from typing import Any
 from msgspec import structs
 
 from harness.backends.base import AGAIN, BARE, Backend, Completion, Request, failed, same_model
-from harness.backends.cache import cached, default_file
+from harness.backends.cache import cached
 from harness.backends.card import Card
 from harness.backends.cards import find_own
 from harness.backends.registry import BUILT_IN, ENGINES, capabilities, open_backend
@@ -60,6 +60,11 @@ class Replay:
         self._answers = {answer.id: answer for answer in run.answers}
         self._episodes = {_episode(answer.scene) for answer in run.answers}
         self._models: dict[str, Backend] = {}
+        self._cache: Path | None = None
+
+    def keep_in(self, file: Path) -> None:
+        """Look in the cache `file` for answers that the run lacks, before its model is asked."""
+        self._cache = file
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         stored = [self._stored(request) for request in requests]
@@ -124,7 +129,7 @@ class Replay:
             if not same_model(stored, model.identity()):
                 changed = f"{printable(card.name)} has changed since that run"
                 raise UserError(f"{lacking}, and {changed}; make the run again")
-            self._models[role] = cached(model, card, default_file())
+            self._models[role] = cached(model, card, self._cache)
         return self._models[role]
 
     def _as_run(self, request: Request) -> Request:
