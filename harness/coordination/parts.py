@@ -256,6 +256,13 @@ class Part(Struct, frozen=True, kw_only=True):
         a group.
         """
 
+    def obstacle_of_models(self, identities: Sequence[Mapping[str, Any]]) -> str | None:
+        """Return why a run cannot use these settings with its opened models; None if it can.
+
+        `identities` are theirs, the ego's first: what tells models apart (`Backend.identity`), such
+        as digests of weights. The text also says what to do instead.
+        """
+
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
         """Return what a run must store of the things that this part's settings name.
 

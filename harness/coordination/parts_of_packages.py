@@ -56,6 +56,18 @@ def obstacle(part: Part, point: "OperatingPoint", run: RunFacts) -> str | None:
         return line_or_none(part.obstacle(point, run), "an obstacle")
 
 
+def obstacle_of_models(part: Part, identities: Sequence[Mapping[str, Any]]) -> str | None:
+    """Return why a part of an operating point cannot be used with models, or None if it can.
+
+    The text is one line. `identities` tell the opened models apart, the ego's first. Raises
+    UserError if a package's part fails or returns no text.
+    """
+    if is_ours(part):
+        return part.obstacle_of_models(identities)
+    with worded_part(part):
+        return line_or_none(part.obstacle_of_models(identities), "an obstacle of its models")
+
+
 def prepared(part: Part, intents: Intents) -> Intents:
     """Return what vehicles intend in n decisions, corrected by one group of settings.
 

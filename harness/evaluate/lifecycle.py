@@ -95,8 +95,10 @@ def begin(
         latency: how long these models take to answer.
         shard: the part of a run, such as `1/3`; empty for all of it.
 
-    Raises UserError if the run was begun with a model of another identity.
+    Raises UserError if the run was begun with a model of another identity, or a condition cannot be
+    used with this one.
     """
+    spec.check_models(identity)
     if run_start is None:
         return RunStart(
             settings=spec.record(),

@@ -1,6 +1,6 @@
 """Hold and check the complete settings of an evaluation: enough to run it again."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -336,6 +336,17 @@ class Spec:
             if obstacle := parts_of_packages.obstacle(part, point, self):
                 return obstacle
         return None
+
+    def check_models(self, identity: Mapping[str, Any]) -> None:
+        """Raise UserError if a condition cannot be used with the models that were opened.
+
+        `identity` tells them apart, as a run's manifest states it: the ego's, and those of helpers.
+        """
+        identities = [identity, *(identity.get("helpers") or ())]
+        for point in self.points:
+            for part in point.more:
+                if obstacle := parts_of_packages.obstacle_of_models(part, identities):
+                    raise UserError(f"condition {printable(point.name)}: {obstacle}")
 
     def _check_shows_objects(self, condition: str) -> None:
         """Raise UserError if the ego's prompt is the same whatever is around;

@@ -203,7 +203,9 @@ class ReplayedRun:
                 messages, and the run's model cannot make it.
         """
         for setting in settings:
-            replace(self._asker.spec, points=(setting.point,))  # which checks that they go together
+            # which checks that they go together
+            spec = replace(self._asker.spec, points=(setting.point,))
+            spec.check_models(self.run.manifest.identity)
         at_once = max(1, WALKS // (len(seeds) * len(self.dataset.episodes)))
         for vehicles, same in groupby(settings, lambda setting: setting.vehicles):
             points = [setting.point for setting in same]

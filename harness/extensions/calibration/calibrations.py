@@ -8,8 +8,8 @@ needs no tree. A temperature sharpens or flattens what is left (Guo and others 2
 of the optimal actions is the best. Both leave an answer that could not be read as it is.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from harness.core import resources
 from harness.core.arrays import Floats
 from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import read_once
+from harness.core.files import digest, read_once
 from harness.core.seeds import purposes, seeds_text
 from harness.world.scenario import Scenario
 
@@ -78,6 +78,8 @@ class Calibration:
     question: dict[str, str]  # what answers: model, prompt and answer mode (`question_of`)
     ego: Correction  # of the ego's answers
     helper: Correction | None = None  # of helpers' answers; None where no helper answered
+    # digests of the model's weights and what else tells them apart; a file before 0.4.0 has none
+    weights: dict[str, str] = field(default_factory=dict)
 
     def obstacle(self, agent: Mapping[str, Any], scenario: Scenario) -> str | None:
         """Return in words why this calibration must not correct an agent's answers; None if it may.
@@ -93,6 +95,20 @@ class Calibration:
             value, other = then.get(name), now.get(name)
             if value != other:
                 return f"was fitted with {name} {printable(value, 40)}, not {printable(other, 40)}"
+        return None
+
+    def obstacle_of_models(self, identities: Iterable[Mapping[str, Any]]) -> str | None:
+        """Return in words that these are other weights than it was fitted on; None if not.
+
+        `identities` tell models apart, by what `Backend.identity` states of each.
+        """
+        for identity in identities if self.weights else ():
+            now = weights_of(identity)
+            for name in {**self.weights, **now}:
+                value, other = self.weights.get(name), now.get(name)
+                if value != other:
+                    value, other = printable(value, 12), printable(other, 12)
+                    return f"was fitted on other weights ({name} {value}, not {other})"
         return None
 
     def of(self, intents: Intents) -> Intents:
@@ -119,6 +135,20 @@ def question_of(agent: Mapping[str, Any]) -> dict[str, str]:
         **{f"prompt.{key}": str(prompt[key]) for key in ("version", "sha256")},
         **{key: str(agent[key]) for key in OF_QUESTION},
     }
+
+
+def weights_of(identity: Mapping[str, Any]) -> dict[str, str]:
+    """Return what tells a model's weights apart, as texts by name, of its identity.
+
+    They are digests of files, a commit on the hub, and what a server states of its model.
+    """
+    texts = {}
+    for name, value in identity.items():
+        if value and (name.endswith("sha256") or name == "revision"):
+            texts[name] = str(value)
+        elif value and name == "states":
+            texts[name] = digest(value)
+    return texts
 
 
 def names() -> list[str]:

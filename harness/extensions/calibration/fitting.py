@@ -25,6 +25,7 @@ from harness.extensions.calibration.calibrations import (
     Level,
     check_seeds,
     question_of,
+    weights_of,
 )
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run
@@ -147,6 +148,7 @@ def calibrate(
         question_of({**manifest.agent(0), "model": answerers.model}),
         corrections["ego"],
         corrections.get("helper"),
+        weights_of(answerers.identity),
     )
     return calibration, fitted
 
@@ -164,10 +166,10 @@ def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None
 def write(calibration: Calibration, out: Path) -> None:
     """Write a calibration, what corrects a model's stated probabilities, to the TOML file `out`."""
     fields = asdict(calibration)
-    tables = {name: fields.pop(name) for name in ("question", "ego", "helper")}
+    tables = {name: fields.pop(name) for name in ("question", "weights", "ego", "helper")}
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
     for name, table in tables.items():
-        if table is not None:
+        if table:
             lines += [
                 "",
                 f"[{name}]",

@@ -2,8 +2,8 @@
 all answers are corrected before anything is made of them.
 """
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from harness.coordination.intents import Intents
 from harness.coordination.parts import Kept, Part, RunFacts, Text, wrong
@@ -52,6 +52,11 @@ class Calibrated(Part, frozen=True, kw_only=True):
         if point.asks and fitted.helper is None and not run.ego_alone:
             return f"{what} was fitted on no helper's answer; fit one on a run with --ask all"
         return None
+
+    def obstacle_of_models(self, identities: Sequence[Mapping[str, Any]]) -> str | None:
+        reason = calibration(self.calibration).obstacle_of_models(identities)
+        what = f"calibration {printable(self.calibration)}"
+        return reason and f"{what} {reason}; fit one with `harness model calibrate`"
 
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:
         file = file_of(self.calibration)

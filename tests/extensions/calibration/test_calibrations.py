@@ -22,7 +22,9 @@ from harness.extensions.calibration.calibrations import (
     OF_QUESTION,
     Calibration,
     Correction,
+    calibration,
     question_of,
+    weights_of,
 )
 from harness.extensions.calibration.fitting import TEMPERATURES, calibrate, fit
 from harness.runs.folder import read
@@ -197,6 +199,34 @@ def test_nothing_is_fitted_on_an_intent_that_no_text_states(
     damage(run, answer=lambda row: row.update(intent=(1.0, 0.0, 0.0)))
     with pytest.raises(UserError, match="states another intent than its text says"):
         calibrate(run, "L1", two_path, "")
+
+
+@pytest.mark.slow
+def test_a_calibration_is_of_the_weights_that_it_was_fitted_on(
+    proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path
+) -> None:
+    (tmp_path / MARKER).touch()
+    tuned = Path(shutil.copytree(proxy_run, tmp_path / "tuned"))
+    identity = {**read(tuned).manifest.identity, "file_sha256": "a" * 64, "states": {"size": 9}}
+    configure(tuned, identity=identity)
+    command = ("--dataset", small_path, "--out", "calibrations/mine.toml")
+    assert harness("model", "calibrate", tuned, *command)[0] == 0
+    fitted = calibration("mine")
+    assert fitted.weights == weights_of(identity)
+    assert [*fitted.weights] == ["file_sha256", "states"]
+    assert fitted.obstacle_of_models([identity, identity]) is None
+    other = {**identity, "file_sha256": "b" * 64}
+    said = str(fitted.obstacle_of_models([identity, other]))
+    assert said.startswith("was fitted on other weights (file_sha256 aaaaaaaa")
+    code, _, error = evaluated(
+        harness, small_path, "--condition", "6g:calibration=mine", "--out", "r"
+    )
+    assert (code, error.count("\n")) == (2, 1)
+    assert "calibration mine was fitted on other weights" in error
+    assert not Path("r/run.json").exists()
+    swept = ("study", "sweep", proxy_run, "--over", "tau", "--grid", "0", "--quiet")
+    code, _, error = harness(*swept, "--condition", "6g:calibration=mine")
+    assert (code, "calibration mine was fitted on other weights" in error) == (2, True)
 
 
 def test_of_a_replay_is_fitted_what_is_fitted_of_the_run_that_was_asked(
