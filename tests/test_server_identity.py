@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from misbehaving import Asked, completion, serving
 
-from harness.backends.base import Request, same_model
+from harness.backends.base import Request, same_model, say_newly_stated
 from harness.backends.cache import cached
 from harness.backends.card import Card, Latency
 from harness.backends.openai import backend as openai_backend
@@ -204,7 +204,9 @@ def test_two_servers_with_other_templates_are_one_line_that_says_in_what_they_di
             openai_backend.open(card)
 
 
-def test_a_run_of_an_earlier_version_is_of_the_same_model_as_far_as_it_says() -> None:
+def test_a_run_of_an_earlier_version_is_of_the_same_model_as_far_as_it_says(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """It did not store what a server states, which is no other model;
     what it stored must be the same.
     """
@@ -217,6 +219,10 @@ def test_a_run_of_an_earlier_version_is_of_the_same_model_as_far_as_it_says() ->
     assert not same_model(now, before)
     assert not same_model(before, {**now, "version": "b1"})
     assert same_model({**before, "helpers": [before]}, {**now, "helpers": [now]})
+    for stored, here in ((now, now), (before, now), ({"helpers": [before]}, {"helpers": [now]})):
+        say_newly_stated(f"run {len(stored)}", stored, here)
+        says_more = "its model states more now than then" in capsys.readouterr().err
+        assert says_more == (stored != here)
     assert not same_model({**now, "helpers": [now]}, {**now, "helpers": [other]})
     assert not same_model({**before, "helpers": [before]}, now)
     assert not same_model({**before, "helpers": 3}, {**now, "helpers": [now]})

@@ -14,6 +14,7 @@ from msgspec import Meta
 from harness.core.config import Count, Seconds, Whole, between
 from harness.core.files import canonical_json
 from harness.core.image import Image
+from harness.core.plugins import say_once
 from harness.prompts.answer_schema import Shape
 from harness.prompts.decision import Question
 
@@ -316,6 +317,28 @@ def _as_stored(now: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, A
         pairs = zip(helpers, stored_helpers, strict=True)
         identity["helpers"] = [_as_stored(h, o) if isinstance(o, Mapping) else h for h, o in pairs]
     return identity
+
+
+def say_newly_stated(what: str, stored: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Say on stderr if the open backend states more than was recorded beside stored answers.
+
+    `same_model` does not compare that: the server, or the harness, told less then. `what` names the
+    answers in the message; `stored` and `now` are as there.
+    """
+    if _tells_more(now, stored):
+        say_once(
+            f"{what}: its model states more now than then, so that it may have other weights; if "
+            "so, make the run again"
+        )
+
+
+def _tells_more(now: Mapping[str, Any], stored: Mapping[str, Any]) -> bool:
+    """Return whether an identity, or one of its helpers', has what the stored one did not yet."""
+    helpers, stored_helpers = now.get("helpers") or (), stored.get("helpers") or ()
+    if any(key in now and key not in stored for key in YOUNGER):
+        return True
+    pairs = zip(helpers, stored_helpers, strict=False)
+    return any(_tells_more(one, other) for one, other in pairs if isinstance(other, Mapping))
 
 
 class Rendering(Backend, Protocol):

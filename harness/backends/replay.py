@@ -9,7 +9,16 @@ from typing import Any
 
 from msgspec import structs
 
-from harness.backends.base import AGAIN, BARE, Backend, Completion, Request, failed, same_model
+from harness.backends.base import (
+    AGAIN,
+    BARE,
+    Backend,
+    Completion,
+    Request,
+    failed,
+    same_model,
+    say_newly_stated,
+)
 from harness.backends.cache import cached
 from harness.backends.card import Card
 from harness.backends.cards import find_own
@@ -129,6 +138,7 @@ class Replay:
             if not same_model(stored, model.identity()):
                 changed = f"{printable(card.name)} has changed since that run"
                 raise UserError(f"{lacking}, and {changed}; make the run again")
+            say_newly_stated(run_path, stored, model.identity())
             self._models[role] = cached(model, card, self._cache)
         return self._models[role]
 

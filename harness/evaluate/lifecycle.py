@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from harness.backends.base import same_model
+from harness.backends.base import same_model, say_newly_stated
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.plugins import package_versions
@@ -115,6 +115,7 @@ def begin(
             f"--out {printable(out)} was begun with {another_model(spec)}; delete it, or choose "
             "another folder"
         )
+    say_newly_stated(f"--out {printable(out)}", run_start.identity, identity)
     return run_start
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from harness.backends.base import Backend, Request, same_model
+from harness.backends.base import Backend, Request, same_model, say_newly_stated
 from harness.backends.cache import default_file
 from harness.backends.card import Card
 from harness.backends.cards import find_own
@@ -416,6 +416,7 @@ class ReplayedRun:
                 f"{folder}: the model is not what it was ({printable(', '.join(changes))}); run "
                 "again"
             )
+        say_newly_stated(folder, stored, now)
         return together(cards, models, default_file())
 
 
