@@ -133,18 +133,26 @@ def read_once(read: Callable[[Path], T]) -> Callable[[Path], T]:
     """
 
     @lru_cache(maxsize=64)
-    def kept(path: Path, written_ns: int) -> T:
+    def kept(path: Path, state: tuple[int, ...]) -> T:
         return read(path)
 
     @wraps(read)
     def of_now(path: Path) -> T:
-        try:
-            written_ns = path.stat().st_mtime_ns
-        except OSError:  # as for a link to nowhere
-            written_ns = 0
-        return kept(path, written_ns)
+        return kept(path, state_of(path))
 
     return of_now
+
+
+def state_of(path: Path) -> tuple[int, ...]:
+    """Return numbers that are others once a file was modified or replaced; none if it is not there.
+
+    They are its inode, its size in bytes, and when its content and its inode changed, in ns.
+    """
+    try:
+        state = path.stat()
+    except (OSError, ValueError):  # as for a link to nowhere, and a name that none can have
+        return ()
+    return state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
 
 
 def neutral(cell: T) -> T | str:

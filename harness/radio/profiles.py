@@ -7,6 +7,7 @@ entry point in the group `swarmdrive.channels`.
 
 import os
 from dataclasses import MISSING, asdict, dataclass, field, fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ from harness.core import strangers
 from harness.core.config import convert, settable, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.extensions import owner_of_plugin, part_of
-from harness.core.files import read_once
+from harness.core.files import read_once, state_of
 from harness.core.plugins import FilesAndPlugins, Shipped
 from harness.core.strangers import worded
 from harness.radio.channel import Channel
@@ -92,9 +93,9 @@ class Profiles(FilesAndPlugins[Channel]):
         file = self.file(name)
         if file is None:
             return {}
-        files, table = {file.name: file}, self.profile(name).parameters.get("file")
-        if isinstance(table, str):  # it lies beside the profile, as reading it has checked
-            files[Path(os.path.normpath(table)).as_posix()] = file.parent / table
+        files, profile = {file.name: file}, self.profile(name)
+        if table := _table(file, profile):  # it lies beside the profile, as reading it has checked
+            files[Path(os.path.normpath(profile.parameters["file"])).as_posix()] = table
         return files
 
     def unchanged(self, name: str, recorded: Any) -> bool:
@@ -122,10 +123,28 @@ class Profiles(FilesAndPlugins[Channel]):
         return record
 
 
-@read_once
 def _read(path: Path) -> tuple[Profile, Channel]:
+    """Return a profile and its channel, read again once a file of theirs is modified."""
+    profile = _profile(path)
+    table = _table(path, profile)
+    return profile, _channel(path, state_of(path), state_of(table) if table else ())
+
+
+def _table(path: Path, profile: Profile) -> Path | None:
+    """Return the path of the table that a profile's file names; None if it names none."""
+    table = profile.parameters.get("file")
+    return path.parent / table if isinstance(table, str) else None
+
+
+@read_once
+def _profile(path: Path) -> Profile:
     where = f"channel file {printable(path)}"
-    profile = convert(toml(path, where), Profile, where)
+    return convert(toml(path, where), Profile, where)
+
+
+@lru_cache(maxsize=64)
+def _channel(path: Path, state: tuple[int, ...], of_table: tuple[int, ...]) -> Channel:
+    where, profile = f"channel file {printable(path)}", _profile(path)
     model = _model(profile.model, where)
     parameters = f"{where} [parameters]"
     if isinstance(model, type):
@@ -140,7 +159,7 @@ def _read(path: Path) -> tuple[Profile, Channel]:
                 f"{where} [limits]: {name} = [{least:g}, {most:g}]; allowed: the least value, then "
                 "the largest"
             )
-    return profile, channel
+    return channel
 
 
 def _model(name: str, where: str) -> Any:

@@ -2,16 +2,19 @@
 
 import hashlib
 import math
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from harness.core.errors import UserError
+from harness.core.files import sha256_file
 from harness.extensions.radio.reception import curves_of
 from harness.extensions.radio.trace import Trace, from_profile, read
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Channel, Draws, Links, Site
 from harness.radio.fading import Trips
+from harness.radio.profiles import CHANNELS
 from harness.radio.wrapped import heard_s
 
 PLAIN = "distance_m,reception\n300,0.2\n100,0.8\n"
@@ -182,6 +185,24 @@ def test_a_mistake_in_a_profile_is_one_line(tmp_path, parameters, says):
         from_profile(parameters, tmp_path, "mine.toml [parameters]")
     assert says in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_table_that_was_changed_is_read_again_in_the_same_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though its profile was not, and the table has its size and its time."""
+    (tmp_path / "channels").mkdir()
+    (tmp_path / "swarmdrive.toml").touch()
+    monkeypatch.chdir(tmp_path)
+    csv = table(tmp_path / "channels")
+    facts = "model = 'trace'\ndescription = 'x'\nsource = 'x'\nstatus = 'measured'\n"
+    parameters = "[parameters]\nfile = 'run.csv'\nlatency_s = 0.01\n"
+    Path("channels/mine.toml").write_text(facts + parameters)
+    before, written = CHANNELS.record("mine")["parameters"]["receptions"], csv.stat()
+    csv.write_text(PLAIN.replace("0.2", "0.1"))
+    os.utime(csv, ns=(written.st_atime_ns, written.st_mtime_ns))
+    after = CHANNELS.record("mine")["parameters"]["receptions"]
+    assert before["sha256"] != after["sha256"] == sha256_file(csv)
 
 
 @pytest.mark.parametrize("file", ["../secret.csv", "/etc/passwd", "link.csv"])
