@@ -28,12 +28,20 @@ class Dataset(Struct):
     name: str | None = None
 
 
+class Scorer(Struct):
+    """Hold what a log says of one of its scorers: its name, and the options that it was given."""
+
+    name: str
+    options: Any = None
+
+
 class Spec(Struct):
-    """Hold what a log says of its evaluation: task, model and dataset."""
+    """Hold what a log says of its evaluation: task, model, dataset and scorers."""
 
     task: str
     model: str
     dataset: Dataset
+    scorers: list[Scorer] | None = None
 
 
 class Header(Struct):
@@ -61,6 +69,7 @@ class Sample(Struct):
     id: int | str
     epoch: int
     input: Any = None
+    choices: Any = None
     target: Any = None
     scores: dict[str, Score] | None = None
     error: Error | None = None
@@ -94,7 +103,7 @@ def _log(file: Path, archive: ZipFile) -> SampleLog:
         key = sample.id, sample.epoch
         if key in inputs:
             raise ValueError(f"sample {sample.id} is there twice in epoch {sample.epoch}")
-        inputs[key] = digest([_without_ids(sample.input), sample.target])
+        inputs[key] = digest([_without_ids(sample.input), sample.choices, sample.target])
         if sample.error:
             errors[key] = sample.error.message
         for scorer, value in _numbers(sample.scores or {}):
@@ -104,8 +113,18 @@ def _log(file: Path, archive: ZipFile) -> SampleLog:
     if not inputs:
         raise ValueError("it has no samples")
     spec = header.eval
+    dataset = spec.dataset.name or ""
+    options = {scorer.name: digest(scorer.options or {}) for scorer in spec.scorers or ()}
     return SampleLog(
-        file, spec.task, spec.model, spec.dataset.name or "", header.status, inputs, errors, scores
+        file,
+        spec.task,
+        spec.model,
+        dataset,
+        header.status,
+        inputs,
+        errors,
+        scores,
+        options=options,
     )
 
 

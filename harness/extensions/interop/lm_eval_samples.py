@@ -20,12 +20,16 @@ NO_FILTER = "none"  # the name of the filter that changes nothing
 
 
 class Line(msgspec.Struct):
-    """Hold what a line says of a document: its number, itself, the right answer and the filter."""
+    """Hold what a line says of a document: its number, itself, the right answer and the filter.
+
+    `arguments` have the prompt that the model was given.
+    """
 
     doc_id: int | str
     metrics: tuple[str, ...]
     doc: Any = None
     target: Any = None
+    arguments: Any = None
     filter: str = NO_FILTER
 
 
@@ -43,6 +47,7 @@ def read(file: Path) -> SampleLog:
 
 def _log(file: Path) -> SampleLog:
     inputs, scores = dict[Key, str](), dict[str, dict[Key, float]]()
+    prompts = dict[Key, str]()
     for data in _lines(file):
         values = decoded(data, dict[str, Any])
         line = msgspec.convert(values, Line)
@@ -50,6 +55,8 @@ def _log(file: Path) -> SampleLog:
         question = digest([line.doc, line.target])
         if inputs.setdefault(key, question) != question:
             raise ValueError(f"document {line.doc_id} is there with two inputs")
+        if line.arguments is not None:
+            prompts[key] = digest(line.arguments)
         for scorer, value in _numbers(line, values):
             numbers = scores.setdefault(scorer, {})
             if key in numbers:
@@ -62,7 +69,7 @@ def _log(file: Path) -> SampleLog:
     match = NAME.fullmatch(file.name)
     task = match["task"] if match else file.stem
     model = file.absolute().parent.name  # lm-eval's folder for a model; the file does not say
-    return SampleLog(file, task, model, "", "success", inputs, {}, scores)
+    return SampleLog(file, task, model, "", "success", inputs, {}, scores, prompts)
 
 
 def _lines(file: Path) -> Iterator[bytes]:

@@ -1,7 +1,7 @@
 """Two logs of the same samples, paired: what a scorer gives B more than A, and how sure that is."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,8 @@ class SampleLog:
     """Hold what a log of another program says of its samples, each asked in one or more epochs.
 
     `inputs` has the digest of what each was asked and of its right answer, `errors` why some have
-    no answer, and `scores` the number that each scorer gave; NaN for what is no number.
+    no answer, and `scores` the number that each scorer gave; NaN for what is no number. `prompts`
+    and `options` tell apart what may differ between logs that are compared.
     """
 
     path: Path  # the log's file
@@ -34,6 +35,10 @@ class SampleLog:
     inputs: Mapping[Key, str]  # hex SHA-256 of question and right answer, by sample and epoch
     errors: Mapping[Key, str]  # messages, by sample and epoch
     scores: Mapping[str, Mapping[Key, float]]  # by scorer, then by sample and epoch
+    # hex SHA-256 of the prompt with its examples, by sample and epoch; empty if the log has none
+    prompts: Mapping[Key, str] = field(default_factory=dict)
+    # hex SHA-256 of what each scorer was set to, by its name; empty if the log does not say
+    options: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,18 @@ class SampleComparison:
         return {each.scorer: each.change for each in self.differences}
 
     @cached_property
+    def other_prompts(self) -> int:
+        """Return how many of the common answers had another prompt in each log, if both say it."""
+        a, b = self.a.prompts, self.b.prompts
+        return sum(a[key] != b[key] for key in self.answers if key in a and key in b)
+
+    @cached_property
+    def other_options(self) -> list[str]:
+        """Return the names of the scorers that both logs have, with other options in each."""
+        a, b = self.a.options, self.b.options
+        return [name for name in a if name in b and a[name] != b[name]]
+
+    @cached_property
     def unsure(self) -> str:
         """Return why gates have nothing sure to judge: unfinished logs, errors, or answers that
         have no number in one of them, as those that it lacks; else empty.
@@ -146,8 +163,8 @@ def pair(a: SampleLog, b: SampleLog) -> SampleComparison:
     if otherwise:
         raise UserError(
             f"{both} ask different things: {len(otherwise)} of {amount(len(answers), 'answer')}, "
-            f"such as that to sample {printable(repr(otherwise[0][0]), 30)}, have another input or "
-            "target; give two logs of one dataset"
+            f"such as that to sample {printable(repr(otherwise[0][0]), 30)}, have another "
+            "input, choices or target; give two logs of one dataset"
         )
     scorers = [name for name in a.scores if name in b.scores]
     if not scorers:

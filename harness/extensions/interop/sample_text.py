@@ -83,6 +83,8 @@ def mapping(comparison: SampleComparison, verdicts: Sequence[Verdict], most: int
         "only_in_b": _answers(comparison.only_b, most),
         "scorers_only_in_a": [name for name in a.scores if name not in b.scores],
         "scorers_only_in_b": [name for name in b.scores if name not in a.scores],
+        "scorers_with_other_options": comparison.other_options,
+        "answers_with_other_prompts": comparison.other_prompts,
         "scorers": [_scorer(difference, most) for difference in comparison.differences],
         "gates": gates,
         "passed": all(gate["passed"] for gate in gates),
@@ -109,6 +111,10 @@ def _facts(comparison: SampleComparison, most: int) -> Iterator[str]:
         scorers = [scorer for scorer in log.scores if scorer not in other.scores]
         if scorers:
             yield f"scorers only in {name}, left out: {_some(scorers, most)}"
+    if comparison.other_options:
+        yield f"other options in A and B, of scorers: {_some(comparison.other_options, most)}"
+    if comparison.other_prompts:
+        yield f"asked with another prompt in B than in A: {comparison.other_prompts} of these"
     for what in ("task", "dataset"):
         names = getattr(a, what), getattr(b, what)
         if names[0] != names[1]:

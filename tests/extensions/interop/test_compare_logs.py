@@ -173,12 +173,14 @@ def test_what_cannot_be_compared_is_one_line(tmp_path: Path, harness: Harness) -
     a = log("a.eval", [sample("x"), sample("y")])
     other_input = log("input.eval", [sample("x"), sample("y", input="??")])
     other_target = log("target.eval", [sample("x", target="?"), sample("y")])
+    chosen_of = log("choices.eval", [sample("x", choices=["!", "?"]), sample("y")])
     other_scorer = log("scorer.eval", [sample("x", scores={"f1": {"value": 1}})])
     run = made_up(tmp_path / "run")
     for b, more, reason in (
         (log("none.eval", [sample("z")]), (), "have no sample in common (ids such as 'x' and 'z')"),
         (other_input, (), "1 of 2 answers, such as that to sample 'y', have another input"),
         (other_target, (), "1 of 2 answers, such as that to sample 'x', have another input"),
+        (chosen_of, (), "such as that to sample 'x', have another input, choices or target"),
         (other_scorer, (), "have no scorer in common (match in A, f1 in B)"),
         (run, (), "one is a log of another program (.eval) and one is not"),
         (Path("gone.eval"), (), "gone.eval is no log of Inspect AI"),
@@ -256,6 +258,27 @@ def test_answers_of_lm_eval_are_paired_by_document(harness: Harness) -> None:
     assert [each["sample"] for each in digits["changed"]["listed"]] == [1, 4]
     assert (whole["a"]["task"], whole["a"]["model"]) == ("sums", "right")
     assert whole["gates"][0]["failed_in"] == [{"scorer": "exact_match", "value": -0.5}]
+    assert whole["answers_with_other_prompts"] == 0
+
+
+def test_what_differs_beside_the_samples_is_a_line(harness: Harness) -> None:
+    """The options of a scorer of one name, and the examples in a prompt."""
+    spec = {"task": "t", "model": "m", "dataset": {"name": "d"}}
+    logs = []
+    for name in ("any", "end"):
+        scorer = {"name": "match", "options": {"location": name}}
+        logs.append(log(f"{name}.eval", [sample(1)], eval={**spec, "scorers": [scorer]}))
+    said = "other options in A and B, of scorers: match"
+    assert said in harness("compare", *logs)[1]
+    assert said not in harness("compare", logs[0], logs[0])[1]
+    files = []
+    for shots in ("", "2 + 2 = 4\n"):
+        line = {"doc_id": 0, "metrics": ["m"], "m": 1, "arguments": {"arg_0": f"{shots}1 + 1 ="}}
+        files.append(Path(f"samples{len(shots)}.jsonl"))
+        files[-1].write_text(json.dumps(line))
+    said = "asked with another prompt in B than in A: 1 of these"
+    assert said in harness("compare", *files)[1]
+    assert said not in harness("compare", files[0], files[0])[1]
 
 
 @pytest.mark.parametrize(
