@@ -103,7 +103,8 @@ SOME = (
     "a figure", "success of episodes", "latency of decisions", "older rules", "a radio's name",
     "rules in another spelling", "a figure that is left out", "which layouts", "a dataset's name",
     "a latency's source", "settings beside it", "an answer that is missing", "errors of an engine",
-    "a radio's limits", "a limit of its model", "what nothing computes of an answer",
+    "a radio's limits", "a limit of its model", "a limit that nobody typed", "what a model sees",
+    "what nothing computes of an answer",
     "lists that were read reversed",
 )  # fmt: skip
 IN_TABLES = {
@@ -391,6 +392,14 @@ OF_THE_RUN = {
     "a limit of its model": (
         edited("model", "max_new_tokens", to=7),
         "run.json has another digest of ego than what it states makes",
+    ),
+    "a limit that nobody typed": (
+        edited("world", "limit", to=13),
+        "run.json has another limit of its scenes than its settings",
+    ),
+    "what a model sees": (
+        edited("model", "privileged", to=True),
+        "run.json says of proxy that it sees other than it does",
     ),
     "whether its prompt is released": (
         edited("prompt", "released", to=False),
@@ -688,7 +697,7 @@ def test_a_driven_run_is_held_against_what_drives_here(drive: Path, harness: Har
     configure(drive, model={**model, "name": "full-view", "engine": "driver", "privileged": False})
     code, out, _ = harness("run", "check", drive)
     assert code == 1
-    assert "run.json says of a driver that it sees other than it does" in " ".join(out.split())
+    assert "run.json says of full-view that it sees other than it does" in " ".join(out.split())
 
 
 @pytest.mark.slow

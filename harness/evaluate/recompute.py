@@ -12,7 +12,7 @@ from msgspec.structs import astuple
 
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
-from harness.backends.registry import open_backend
+from harness.backends.registry import open_backend, registration
 from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
 from harness.core.errors import Unanswered, UserError, in_range, printable
@@ -41,6 +41,7 @@ from harness.prompts import versions
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
+from harness.runs.settings import FrozenSettings
 from harness.runs.stopping import looked_otherwise
 from harness.runs.unanswered import Tally
 from harness.world import scenarios
@@ -268,6 +269,7 @@ def _of_manifest(run: Run, card: Card) -> Iterator[str]:
     if (timer := run.manifest.timer) and (change := timer.changed()):
         yield change
     yield from times_otherwise(run, card)
+    yield from _of_limit(run)
     yield from _of_agents(run)
     yield from _of_calls(run)
     yield from records_otherwise(run)
@@ -296,13 +298,27 @@ def _of_scenes(run: Run, ours: Run, besides: Collection[str]) -> Iterator[str]:
             yield f"run.json has another {name} of its scenes than {what}"
 
 
+def _of_limit(run: Run) -> Iterator[str]:
+    """Yield whether run.json has more or fewer scenes asked for than its settings.
+
+    A run that stopped early states those that it came to.
+    """
+    world, settings = run.manifest.world, run.manifest.settings.world
+    if isinstance(world, FrozenScenes) and isinstance(settings, FrozenSettings):
+        is_stopped = world.interim_looks is not None and world.limit == world.episodes
+        if world.limit != settings.limit and not is_stopped:
+            yield "run.json has another limit of its scenes than its settings"
+
+
 def _of_agents(run: Run) -> Iterator[str]:
     """Yield what run.json says otherwise of what its models see, and of what they cost."""
     manifest = run.manifest
     models = [model_of(run, record) for record in (manifest.agent(0), *manifest.helpers)]
     for card in models:
-        if card.engine == DRIVER and card.privileged != card_here(card).privileged:
-            yield "run.json says of a driver that it sees other than it does"
+        may_see_all = "privileged" in registration(card.engine).card_keys
+        sees_all = card_here(card).privileged if card.engine == DRIVER else card.privileged
+        if card.privileged != (sees_all and may_see_all):
+            yield f"run.json says of {printable(card.name)} that it sees other than it does"
         cost = (manifest.cost or {}).get(card.name)
         if cost and card.price:
             amount_here = card.price.of(cost.read_tokens, cost.written_tokens)
