@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from harness.coordination.named_points import POINTS, named_point
 from harness.dataset.load import Dataset
 from harness.evaluate.lifecycle import Evaluated
-from harness.report.caveats import no_prompt, unheard
+from harness.report.caveats import no_prompt, of_one_name, unheard
 from harness.report.findings import FIRST, LAST, Kind, findings
 from harness.runs import folder
 from harness.runs.folder import Run
@@ -53,6 +53,17 @@ def without_prompt(done: Evaluated, *manifests: Manifest) -> list[str]:
 
 def with_engine(done: Evaluated, engine: str) -> Manifest:
     return replace(done.manifest, model={**done.manifest.model, "engine": engine})
+
+
+def test_a_radio_of_one_name_that_is_another_in_some_runs_is_said(done: Evaluated) -> None:
+    radios = done.manifest.channels
+    other = replace(radios["6g"], parameters={**radios["6g"].parameters, "loss": 0.5})
+    moved = replace(done.manifest, channels={**radios, "6g": other})
+    runs = {name: Run(done.out, stated) for name, stated in (("a", done.manifest), ("b", moved))}
+    assert of_one_name(runs) == [
+        "radio 6g is another in a and b: conditions that name it are not the same."
+    ]
+    assert of_one_name({"a": runs["a"], "c": runs["a"]}) == []
 
 
 def share(metric: str, value: float) -> Score:

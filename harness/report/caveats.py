@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
+import msgspec
 import numpy as np
 
 from harness.backends.registry import is_from_file, reads_prompts
@@ -19,6 +20,7 @@ from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
 from harness.report.apart import said_of
 from harness.runs import doubts, pinned
+from harness.runs.alike import opened
 from harness.runs.folder import Run
 from harness.runs.headline import BALANCED
 from harness.runs.listing import UNREAD
@@ -383,6 +385,28 @@ def beyond_sources(run: Run) -> Iterator[str]:
     """
     for name, sentence in doubts.beyond(run.manifest.conditions, _channels(run.manifest)):
         yield f"{printable(name)}: {sentence}"
+
+
+def of_one_name(runs: Mapping[str, Run]) -> list[str]:
+    """Return a warning for each radio, network and the like that is another in some of the runs.
+
+    `runs` are by the name that each is shown by. Conditions of one name are then not the same.
+    """
+    names_by_record: dict[tuple[str, str], dict[bytes, list[str]]] = {}
+    for run_name, run in runs.items():
+        for what, by_name in opened(run).items():
+            for name, record in by_name.items():
+                key = msgspec.json.encode(record, order="sorted")
+                names_by_record.setdefault((what, name), {}).setdefault(key, []).append(run_name)
+    sentences = []
+    for (what, name), by_record in names_by_record.items():
+        if len(by_record) > 1:
+            places = " and ".join(names[0] for names in by_record.values())
+            sentences.append(
+                f"{what} {printable(name)} is another in {places}: conditions that name it are not "
+                "the same."
+            )
+    return sentences
 
 
 def no_prompt(runs: Mapping[str, Run]) -> list[str]:

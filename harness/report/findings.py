@@ -73,6 +73,7 @@ OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
     Kind.CAVEAT: [
         each(caveats.from_file),
         each(caveats.of_extensions),
+        caveats.of_one_name,
         each(caveats.moved_system),
         each(caveats.by_letter),
         each(caveats.beyond_sources),

@@ -35,12 +35,15 @@ def setup(run: Run, scenario: Scenario | None = None) -> dict[str, Any]:
         "ties": manifest.ties,
         "latency": MEASURED if times.source == MEASURED else times,
         "weights": formats.identity(manifest.identity),
-        **_opened(run),
+        **opened(run),
     }
 
 
-def _opened(run: Run) -> dict[str, Mapping[str, Any]]:
-    """Return what a run's conditions open, by a word for errors and by name."""
+def opened(run: Run) -> dict[str, Mapping[str, Any]]:
+    """Return what a run's conditions open, by a word of `OPENED` and by name.
+
+    Such is what a radio does, as the run recorded it.
+    """
     manifest = run.manifest
     radios = {name: (each.model, each.parameters) for name, each in manifest.channels.items()}
     kept = {}
