@@ -180,6 +180,15 @@ def test_a_replay_takes_no_delay_that_no_card_declares(
     assert f"{run} states a delay of -0.1 s in 00000-0-" in error
 
 
+def test_a_run_that_was_changed_in_part_is_not_replayed(
+    run: Path, two_path: Path, harness: Harness
+) -> None:
+    edited("latency", "ego_s", to=0.001)(run)
+    code, _, error = harness("eval", "--model", f"replay:{run}", "--dataset", two_path)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "contradicts itself: run.json has another digest of run than what it states" in error
+
+
 @pytest.mark.slow
 def test_tables_that_contradict_each_other_are_neither_shown_nor_compared(
     run: Path, proxy_run: Path, harness: Harness

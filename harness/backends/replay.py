@@ -27,6 +27,7 @@ from harness.backends.token_counts import too_few
 from harness.core.config import convert
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, sha256_file
+from harness.runs import digests
 from harness.runs.folder import Run, read
 from harness.runs.records import ASKED, Answer, FirstTurn, Latency
 from harness.runs.unanswered import why
@@ -39,10 +40,13 @@ def open(card: Card, **_: Any) -> "Replay":
     """Return the backend that answers from the folder of an earlier run, which a card names.
 
     A model card, here made of `replay:` and the folder, names what answers. Options of other
-    engines are ignored. Raises UserError if it is not a finished run, is a rule-based driver's,
-    which has answers of the ego only, or lacks answers that no run can do without.
+    engines are ignored. Raises UserError if it is not a finished run, or not what its digests say,
+    is a rule-based driver's, which has answers of the ego only, or lacks answers that no run can do
+    without.
     """
     run = read(Path(card.weights or ""))
+    for sentence in digests.otherwise(run):
+        raise UserError(f"{printable(run.path)} contradicts itself: {sentence}; make the run again")
     engine = ENGINES.get(str(run.manifest.model.get("engine")))
     if engine and not engine.capabilities.asks_helpers:
         raise UserError(
