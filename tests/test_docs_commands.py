@@ -69,6 +69,11 @@ READER_HAS = {
     "my-checkpoint": ROOT / "models/swarm-tiny",
     "tokenizer.json": ROOT / "models/swarm-tiny/tokenizer.json",
     "street": ROOT / "tests/extensions/roads/street",
+    "my-crossing.xml": ROOT / "tests/extensions/roads/crossing.xml",
+    **{
+        f"crossing.{part}.xml": ROOT / f"benchmarks/traffic/crossing.{part}.xml"
+        for part in ("net", "rou", "poly")
+    },
 }
 
 CHECKED = (
