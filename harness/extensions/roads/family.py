@@ -118,7 +118,13 @@ def _recording(name: str, folders: Sequence[str]) -> "Recording":
         except (OSError, ValueError):
             continue
         if whole.startswith(digest):
-            return _kept(folder, whole)
+            recording = _kept(folder, whole)
+            if name_of(recording) != PREFIX + name:
+                raise UserError(
+                    f"the recording of {printable(name, 80)} has another name; type "
+                    f"{name_of(recording)}"
+                )
+            return recording
     raise UserError(
         f"recording {printable(name, 80)} is in no folder that is known; type its folder: "
         f"--{OPTION} FOLDER, or set {FOLDERS}=FOLDER"
@@ -128,11 +134,13 @@ def _recording(name: str, folders: Sequence[str]) -> "Recording":
 @lru_cache(maxsize=16)
 def _kept(folder: str, digest: str) -> "Recording":
     """Return the recording in a folder, the same object as long as its digest is the same."""
+    from harness.extensions.roads import held
     from harness.extensions.roads.tables import read
 
     recording = read(Path(folder))
     if recording.digest != digest:
         raise UserError(f"recording {printable(folder)} changes; read it when it is written")
+    held.hold(recording)
     return recording
 
 

@@ -17,11 +17,11 @@ from harness.core.progress import Progress
 
 if TYPE_CHECKING:
     from harness.extensions.roads.csv_tracks import Columns
+    from harness.extensions.roads.held import Speeds
     from harness.extensions.roads.tables import Moment, Recording, Scene
 
 MOST_FILES = 10_000
 MOST_OVERLAPS = 0.1  # share of road users that may appear where another is, and are left out
-LONGEST_TEXT = 1000  # characters of a licence and a source
 SHOWN = 3  # reasons that the screen has
 KNOWN = (
     "CommonRoad's XML, SUMO's net, positions (FCD), routes and polygons, and tables of tracks, "
@@ -180,6 +180,12 @@ def kind_of(path: Path) -> str:
     return "tracks"
 
 
+def _speeds() -> "Speeds":
+    from harness.extensions.roads.held import Speeds
+
+    return Speeds()
+
+
 @dataclass
 class _Taken:
     """Hold what was read, for the screen."""
@@ -190,26 +196,21 @@ class _Taken:
     lanes: int = 0
     lights: int = 0  # scenes with traffic lights
     left_out: Counter[str] = field(default_factory=Counter)
-    speeds_mps: list[float] = field(default_factory=list)
+    _speeds: "Speeds" = field(default_factory=_speeds)
 
     def add(self, scene: "Scene") -> None:
         for track in scene.tracks.values():
             self.kinds[track.kind] += 1
             self.still += track.still
-            if not track.still and track.kind not in ("bicycle", "pedestrian"):
-                self.speeds_mps += track.poses[::10, 3].tolist()
+        self._speeds.add(scene)
         self.minutes += (scene.end_s - scene.begin_s) / 60
         self.lanes += len(scene.lanes)
         self.lights += scene.lights
         self.left_out.update(scene.left_out)
 
     def targets_mps(self) -> tuple[float, float, float]:
-        """Return the ego's target speeds: none, half and all of what 95 % of poses stay below."""
-        import numpy as np
-
-        fast = [speed for speed in self.speeds_mps if speed > 1]
-        top = max(2.0, float(np.round(np.percentile(fast, 95)))) if fast else 10.0
-        return 0.0, top / 2, top
+        """Return the ego's target speeds."""
+        return self._speeds.targets_mps()
 
 
 def _imported(
@@ -343,13 +344,12 @@ def _chosen(
     recording: "Recording", progress: Progress
 ) -> "tuple[Sequence[Moment], Mapping[str, Any]]":
     """Return the moments of a recording, and how they were chosen."""
-    from harness.extensions.environments.place import AFTER
     from harness.extensions.roads.fitness import choose_fit
+    from harness.extensions.roads.held import horizon_s
 
-    facts = recording.facts
-    horizon_s = (facts.decisions + AFTER) * facts.period_s
-    choice = choose_fit(recording, _counted(recording.scenes(), progress), horizon_s)
-    return choice.moments, {**choice.record, "horizon_s": horizon_s}
+    until_s = horizon_s(recording.facts)
+    choice = choose_fit(recording, _counted(recording.scenes(), progress), until_s)
+    return choice.moments, {**choice.record, "horizon_s": until_s}
 
 
 def _counted(scenes: Iterator["Scene"], progress: Progress) -> Iterator["Scene"]:
@@ -380,6 +380,8 @@ def _licence(text: str | None) -> str:
 
 
 def _text(option: str, text: str) -> str:
+    from harness.extensions.roads.tables import LONGEST_TEXT
+
     if len(text) > LONGEST_TEXT:
         raise UserError(f"{option} has {len(text)} characters; give {LONGEST_TEXT} at most")
     return sayable(f"{option}", text, "give another text")
@@ -449,6 +451,7 @@ def _echo(recording: "Recording", taken: _Taken, show: Path | None) -> None:
 
 def _echo_moments(recording: "Recording") -> None:
     from harness.cli.terminal import echo_text
+    from harness.core.seeds import FIRST
 
     facts = recording.facts
     purposes = Counter(moment.purpose for moment in facts.moments)
@@ -460,6 +463,16 @@ def _echo_moments(recording: "Recording") -> None:
     )
     if reasons := facts.choice.get("left_out"):
         echo_text(f"not taken: {_reasons(reasons)}")
+    if shared := facts.choice.get("shared"):
+        echo_text(
+            f"{shared} scenes share traffic with another (cuts of one session that overlap?): "
+            "such are one scene for purposes and intervals"
+        )
+    if without := [purpose for purpose in FIRST if not purposes[purpose]]:
+        echo_text(
+            f"no moments to {' or '.join(without)}: import more files or longer ones, or with "
+            "another --window; what moves in a file decides what it is for"
+        )
 
 
 def _reasons(counts: Mapping[str, int]) -> str:

@@ -21,7 +21,8 @@ import shapely
 from msgspec import structs
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.seeds import FIRST, Purpose
+from harness.core.seeds import FIRST
+from harness.extensions.roads.sessions import FEW, SHARED, Sessions, Traffic
 from harness.extensions.roads.tables import STILL_M, Moment, Scene, Track
 from harness.world.conflict_measures import MOMENTS_HZ, SHORT_PET_S
 from harness.world.state import separation_m
@@ -37,7 +38,6 @@ NEVER = np.iinfo(np.int64).max  # a frame that does not come
 BLOCK = 600  # frames whose encroachments are looked for at once
 TRIPLES = 4000  # pairs of road users whose paths are compared at once
 
-DEALT: Sequence[Purpose] = ("report", "tune", "train")  # purposes as scenes are dealt to them
 LIGHTS = "its scene has a traffic light"
 STILL = "it stands still"
 LEAVES = "it leaves the recording within the horizon"
@@ -64,11 +64,13 @@ class Choice:
     moments: tuple[Moment, ...]
     candidates: int  # how many there were: seconds of motor vehicles
     left_out: Mapping[str, int]  # how many of these were not taken, by the reason
+    shared: int = 0  # how many scenes share traffic with another
 
     @property
     def record(self) -> dict[str, Any]:
         """Return what a recording states of the choice."""
-        return {"rule": self.rule, "candidates": self.candidates, "left_out": dict(self.left_out)}
+        counts = {"candidates": self.candidates, "left_out": dict(self.left_out)}
+        return {"rule": self.rule, **counts, "shared": self.shared}
 
 
 def choose(
@@ -90,11 +92,9 @@ def choose(
 class _Fit:
     """A candidate that is left after all that its own scene says."""
 
-    content: str  # digest of its scene's file
     draw: str  # digest of the candidate, which orders the draw
     scene: str
     moment: Moment  # without its purpose
-    span_s: tuple[float, float]  # begin and end of its scene
 
 
 @dataclass
@@ -118,9 +118,11 @@ class Chooser:
     candidates: int = 0
     left_out: Counter[str] = field(default_factory=Counter)
     _fit: list[_Fit] = field(default_factory=list)
+    _traffic: dict[str, Traffic] = field(default_factory=dict)  # by the name of the scene
 
     def look(self, scene: Scene) -> None:
         """Count a scene's candidates, and note those at which an episode may begin."""
+        self._traffic[scene.name] = Traffic.of(scene)
         frames = _Frames.of(scene)
         egos = np.array([track.kind in EGOS for track in frames.tracks], dtype=bool)
         rows = np.flatnonzero((frames.frame % EVERY == 0) & egos[frames.track])
@@ -134,7 +136,7 @@ class Chooser:
         rows = self._without(rows, ~_on_lane(scene, frames.poses[rows]), OFF_LANE)
         gap = round(self.gap_s * MOMENTS_HZ)
         conflicts = _hidden_conflicts(scene, frames, rows, self.window_m, horizon, gap)
-        fit, span_s = [], (scene.begin_s, scene.end_s)
+        fit = []
         for row in rows.tolist():
             who = frames.tracks[int(frames.track[row])].id
             hidden, conflict_s = conflicts.get(row, (None, None))
@@ -142,7 +144,7 @@ class Chooser:
                 scene.name, who, float(frames.frame[row] / MOMENTS_HZ), hidden, conflict_s, ""
             )
             draw = _digest(scene.sha256, who, f"{moment.time_s:.3f}")
-            fit.append(_Fit(scene.sha256, draw, scene.name, moment, span_s))
+            fit.append(_Fit(draw, scene.name, moment))
         for candidate in self._apart(fit):
             reason = self.unfit and self.unfit(scene, candidate.moment)
             if reason:
@@ -161,20 +163,15 @@ class Chooser:
         What is not taken is counted by its reason.
         """
         left_out = Counter(self.left_out)
-        names: dict[str, str] = {}  # of the scene of each content
-        for each in self._fit:
-            names[each.content] = min(names.get(each.content, each.scene), each.scene)
-        decisive = {each.content for each in self._fit if each.moment.hidden is not None}
-        contents = sorted(decisive, key=_digest)
-        place_of = {content: place for place, content in enumerate(contents)}
+        sessions = Sessions.of(self._traffic)
+        decisive = {each.scene for each in self._fit if each.moment.hidden is not None}
         by_purpose: dict[str, list[_Fit]] = {purpose: [] for purpose in FIRST}
         for candidate in self._fit:
-            purpose: str | None = DEALT[place_of.get(candidate.content, 0) % len(DEALT)]
-            if len(contents) < len(DEALT):
-                purpose = part_of(candidate.moment.time_s, candidate.span_s, self.horizon_s)
-            if names[candidate.content] != candidate.scene:
+            scene, time_s = candidate.scene, candidate.moment.time_s
+            purpose = sessions.purpose(scene, time_s, self.horizon_s)
+            if sessions.first[scene] != scene:
                 left_out[TWICE] += 1
-            elif candidate.content not in decisive:
+            elif scene not in decisive:
                 left_out[NO_CONFLICT] += 1
             elif purpose is None:
                 left_out[GAP] += 1
@@ -186,20 +183,21 @@ class Chooser:
             left_out[NOT_DRAWN] += len(dealt) - len(drawn)
             moments += [structs.replace(each.moment, purpose=purpose) for each in drawn]
         counts = {reason: count for reason, count in sorted(left_out.items()) if count}
-        return Choice(self.rule(len(contents)), tuple(moments), self.candidates, counts)
+        return Choice(self.rule(sessions), tuple(moments), self.candidates, counts, sessions.shared)
 
-    def rule(self, scenes: int) -> str:
-        """Return the rule in words, as it is for so many scenes that have decisive moments."""
+    def rule(self, sessions: Sessions) -> str:
+        """Return the rule in words, as it is for a recording of these sessions."""
         dealt = (
-            "Scenes with a decisive moment are dealt in turn to report, tune and train, in the "
-            "order of their digests; none is in two."
+            "By the digest of what moves in it each scene is for report (half of all digests), "
+            "tune or train (a quarter each)"
         )
-        if scenes < len(DEALT):
+        if len(sessions.contents) <= FEW:
             dealt = (
-                "Each scene with a decisive moment is cut in three by time, for tune, train and "
-                f"report, with gaps of {self.horizon_s:g} s, so that no second is in two; one that "
-                "is too short is for report."
+                "Each scene is cut in three by time, for tune, train and report, with gaps of "
+                f"{self.horizon_s:g} s, so that no second is in two; one that is too short is for "
+                "report"
             )
+        dealt += f"; scenes with more than 1 in {SHARED} places in common are dealt as one."
         most = "" if self.most is None else f", at most {self.most} of a purpose"
         return (
             f"Candidates: each whole second of a motor vehicle that is recorded for "
@@ -246,22 +244,6 @@ class Chooser:
         for pair in zip(decisive, others, strict=False):
             drawn += pair
         return drawn[: self.most]
-
-
-def part_of(time_s: float, span_s: tuple[float, float], horizon_s: float) -> str | None:
-    """Return the purpose of a moment of a scene that is cut by time; None between two parts.
-
-    `span_s` is the scene's begin and end. Parts are of one length, and a horizon lies between the
-    last moment of one and the first of the next. A scene too short for that is for reports alone.
-    """
-    begin_s, end_s = span_s
-    # no moment is later than a horizon before the end
-    length_s = (end_s - begin_s - len(FIRST) * horizon_s) / len(FIRST)
-    if length_s <= 0:
-        return list(FIRST)[-1]
-    place = int((time_s - begin_s) // (length_s + horizon_s))
-    within_s = time_s - begin_s - place * (length_s + horizon_s)
-    return list(FIRST)[place] if within_s < length_s and place < len(FIRST) else None
 
 
 def _digest(*texts: str) -> str:

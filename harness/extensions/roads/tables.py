@@ -48,6 +48,7 @@ LENGTHS_M, WIDTHS_M = (0.1, 60.0), (0.1, 10.0)  # of road users
 FASTEST_MPS = 120.0
 LANE_WIDTHS_M = (0.5, 50.0)
 LONGEST_ID = 200  # characters
+LONGEST_TEXT = 1000  # characters of a licence and a source
 SLACK_M = 0.3  # by which road users may overlap: sensors err by so much
 EARLY_S = 1e-6  # sums of steps miss a time by rounding
 WORDS = re.compile(r"[a-z0-9][a-z0-9._-]{0,79}")  # of a recording's name, which scenarios have
@@ -462,10 +463,29 @@ def _check_facts(facts: Facts, where: str) -> None:
         raise UserError(f"{where}: speeds_mps do not rise; give the slowest first")
     if not 0 <= facts.speeds_mps[0] <= facts.speeds_mps[-1] <= FASTEST_MPS:
         raise UserError(f"{where}: speeds_mps; allowed: 0 to {FASTEST_MPS:g}")
+    for name, text in (("source", facts.source), ("licence", facts.licence)):
+        if len(text) > LONGEST_TEXT or not text.isprintable():
+            raise UserError(
+                f"{where}: {name} has {len(text)} characters; allowed: {LONGEST_TEXT} at most, all "
+                "of which can be shown"
+            )
     scenes = {scene.name: scene for scene in facts.scenes}
     if len(scenes) < len(facts.scenes):
         raise UserError(f"{where}: two scenes have one name; make the recording again")
+    seen: set[tuple[str, str, float]] = set()
     for moment in facts.moments:
+        key = moment.scene, moment.vehicle, moment.time_s
+        if key in seen or moment.time_s % 1:
+            why = "is there twice" if key in seen else "begins at no whole second"
+            raise UserError(
+                f"{where}: moment {printable(moment.scene, 60)} {printable(moment.vehicle, 60)} "
+                f"{moment.time_s:g} s {why}; make the recording again"
+            )
+        seen.add(key)
+        if (moment.hidden is None) != (moment.conflict_s is None):
+            raise UserError(
+                f"{where}: a moment has one of hidden and conflict_s; allowed: both or none"
+            )
         if moment.purpose not in FIRST:
             raise unknown(f"purpose of a moment in {where}", moment.purpose, FIRST)
         scene = scenes.get(moment.scene)

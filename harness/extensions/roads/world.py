@@ -14,6 +14,7 @@ from harness.extensions.environments.world import EnvironmentScenario, Environme
 from harness.extensions.environments.world import scenario as scenario_of_environment
 from harness.extensions.roads import driver
 from harness.extensions.roads.family import recording_of
+from harness.extensions.roads.held import sessions_of
 from harness.extensions.roads.tables import FACTS, SCHEMAS
 from harness.extensions.roads.traffic import LIMITS_MPS2, Recorded, nth, setting
 from harness.world.outcome import SAME_WAY
@@ -184,12 +185,17 @@ class Moments:
 
 @dataclass(frozen=True)
 class Scenes:
-    """Return, when called with a layout seed, the scene from which its layout is cut."""
+    """Return, when called with a layout seed, the scene from which its layout is cut.
+
+    Of scenes that share traffic it is the first by name.
+    """
 
     name: str  # the scenario's name
 
     def __call__(self, seed: int) -> str:
-        return nth(recording_of(self.name), seed).scene
+        recording = recording_of(self.name)
+        sessions = sessions_of(recording)
+        return sessions.title[sessions.session[nth(recording, seed).scene]]
 
 
 @lru_cache(maxsize=16)

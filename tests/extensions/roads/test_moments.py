@@ -25,8 +25,8 @@ from harness.extensions.roads.moments import (
     TWICE,
     Choice,
     choose,
-    part_of,
 )
+from harness.extensions.roads.sessions import Sessions, Traffic, dealt, part_of
 from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track, checked
 
 HORIZON_S = 6.0
@@ -159,26 +159,46 @@ def test_each_candidate_that_falls_has_its_reason() -> None:
 
 
 def long(name: str, sha256: str, times: int = 10) -> Scene:
-    """Return a crossing of a hundred seconds, with a pair of cars every ten."""
-    tracks = []
+    """Return a crossing of a hundred seconds, with a pair of cars every ten.
+
+    Where they begin is by its digit.
+    """
+    tracks, farther_m = [], 0.17 * int(sha256, 16)
+    ego = steady("e", (-40.0 + farther_m, 0.0), EAST)
+    other = steady("o", (0.0, -52.0 + farther_m), NORTH)
     for n in range(times):
-        for car in (replace(EGO, id=f"e{n}"), replace(OTHER, id=f"o{n}")):
+        for car in (replace(ego, id=f"e{n}"), replace(other, id=f"o{n}")):
             tracks.append(replace(car, time_s=car.time_s + 10.0 * n))
     return crossing(*tracks, houses=(HOUSE,), name=name, sha256=sha256 * 64)
+
+
+def cut(scene: Scene, begin_s: float, end_s: float, name: str) -> Scene:
+    """Return a part of a scene as a file of its own would have it, whose clock begins at 0 s."""
+    tracks = {}
+    for track in scene.tracks.values():
+        there = (begin_s - 1e-6 <= track.time_s) & (track.time_s <= end_s + 1e-6)
+        if there.any():
+            times_s = track.time_s[there] - begin_s
+            tracks[track.id] = replace(track, time_s=times_s, poses=track.poses[there])
+    return replace(scene, name=name, sha256=f"{name:0>64}", tracks=tracks)
 
 
 def test_scenes_are_dealt_whole_and_few_are_cut_by_time() -> None:
     scenes = [long(name, digit) for name, digit in zip("abcdef", "123456", strict=True)]
     choice = of(*scenes)
-    purposes = {(m.scene, m.purpose) for m in choice.moments}
-    assert len(purposes) == 6
-    assert sorted(purpose for _, purpose in purposes) == sorted(["tune", "train", "report"] * 2)
-    assert "none is in two" in choice.rule
+    purposes = {m.scene: m.purpose for m in choice.moments}
+    assert {(m.scene, m.purpose) for m in choice.moments} == set(purposes.items())
+    assert purposes == {scene.name: dealt(Traffic.of(scene).content) for scene in scenes}
+    assert set(purposes.values()) > {"report"}
+    assert "half of all digests" in choice.rule
+    fewer = {(m.scene, m.vehicle, m.time_s, m.purpose) for m in of(*scenes[1:]).moments}
+    assert fewer < {(m.scene, m.vehicle, m.time_s, m.purpose) for m in choice.moments}
     alone = of(scenes[0])
-    twice = of(replace(scenes[0], name="copy"), scenes[0], replace(scenes[0], name="z"))
+    renamed = {f"{key}x": replace(track, id=f"{key}x") for key, track in scenes[0].tracks.items()}
+    twice = of(replace(scenes[0], name="copy", sha256="9" * 64, tracks=renamed), scenes[0])
     assert twice.moments == alone.moments, "one content under several names is one scene"
-    assert twice.left_out[TWICE] == 2 * (alone.candidates - alone.left_out[LEAVES]
-                                         - alone.left_out[NEAR])  # fmt: skip
+    assert twice.left_out[TWICE] == (alone.candidates - alone.left_out[LEAVES]
+                                     - alone.left_out[NEAR])  # fmt: skip
     quiet = replace(scenes[1], houses=())
     assert of(scenes[0], quiet, replace(quiet, name="q", sha256="9" * 64)).moments == alone.moments
     assert alone.left_out[GAP] > 0
@@ -191,6 +211,51 @@ def test_scenes_are_dealt_whole_and_few_are_cut_by_time() -> None:
     few = of(scenes[0], most=2)
     assert {p: sum(m.purpose == p for m in few.moments) for p in times} == dict.fromkeys(times, 2)
     assert [m for m in alone.moments if m.purpose == "tune"][:2] == list(few.moments[:2])
+
+
+def drawn(number: int) -> Scene:
+    """Return an hour of cars that come by chance, at speeds by chance, as simulated ones do."""
+    draws = np.random.default_rng(number)
+    tracks = []
+    for n in range(60):
+        speed_mps, begin_s = draws.uniform(8, 13), draws.uniform(0, 180)
+        car = driven(f"e{n}", (-300.0, 0.0), EAST, np.full(400, speed_mps))
+        tracks.append(replace(car, time_s=np.round(car.time_s + begin_s, 1)))
+    return replace(crossing(tracks[0]), name=f"d{number}", tracks={t.id: t for t in tracks})
+
+
+SESSIONS: dict[str, tuple[list[Scene], list[list[str]]]] = {
+    "by themselves": ([drawn(1), drawn(2), drawn(3)], [["d1"], ["d2"], ["d3"]]),
+    "overlapping cuts": (
+        [drawn(2), *(cut(drawn(1), 40.3 * n, 40.3 * n + 60, f"c{n}") for n in range(4))],
+        [["c0", "c1", "c2", "c3"], ["d2"]],
+    ),
+    "cuts that touch": (
+        [cut(drawn(1), 60 * n, 60 * n + 59.9, f"c{n}") for n in range(3)],
+        [["c0"], ["c1"], ["c2"]],
+    ),
+    "later and by other names": (
+        [drawn(1), cut(drawn(1), -1e6, 1e6, "late"), drawn(2)], [["d1", "late"], ["d2"]],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("which", SESSIONS)
+def test_scenes_that_share_traffic_are_one_session(which: str) -> None:
+    scenes, expected = SESSIONS[which]
+    found = Sessions.of({scene.name: Traffic.of(scene) for scene in scenes})
+    groups: dict[str, list[str]] = {}
+    for name in sorted(found.session):
+        groups.setdefault(found.session[name], []).append(name)
+    assert sorted(groups.values()) == expected
+    assert {found.title[session]: names for session, names in groups.items()} == {
+        names[0]: names for names in groups.values()
+    }
+    for session, names in groups.items():
+        if which == "overlapping cuts" and len(names) > 1:
+            purposes = [found.purpose(name, 5.0, HORIZON_S) for name in names]
+            assert purposes == [dealt(session)] * len(names)
+            assert found.shared == len(names)
 
 
 @given(st.floats(0, 100), st.floats(0, 100), st.floats(1, 10))

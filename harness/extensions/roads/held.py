@@ -1,0 +1,108 @@
+"""Hold what a recording states against its tables: nothing that can be computed is taken."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.core.errors import UserError, printable
+from harness.extensions.environments.place import AFTER
+from harness.extensions.roads.sessions import Sessions, Traffic
+from harness.extensions.roads.tables import EARLY_S, FACTS, Facts, Moment, Recording, Scene
+
+EVERY = 10  # rows of a track from one speed to the next that counts
+
+
+@dataclass
+class Speeds:
+    """Collect how fast motor vehicles of scenes drive."""
+
+    speeds_mps: list[float] = field(default_factory=list)
+
+    def add(self, scene: Scene) -> None:
+        for track in scene.tracks.values():
+            if not track.still and track.kind not in ("bicycle", "pedestrian"):
+                self.speeds_mps += track.poses[::EVERY, 3].tolist()
+
+    def targets_mps(self) -> tuple[float, float, float]:
+        """Return the ego's target speeds: none, half and all of what 95 % of poses stay below."""
+        fast = [speed for speed in self.speeds_mps if speed > 1]
+        top = max(2.0, float(np.round(np.percentile(fast, 95)))) if fast else 10.0
+        return 0.0, top / 2, top
+
+
+def horizon_s(facts: Facts) -> float:
+    """Return the time that an episode of a recording needs, s."""
+    return (facts.decisions + AFTER) * facts.period_s
+
+
+class _Computed(NamedTuple):
+    """Hold what a recording's tables give."""
+
+    sessions: Sessions
+    speeds_mps: tuple[float, ...]
+    problem: str | None  # what the first moment that cannot be lacks
+
+
+@lru_cache(maxsize=16)
+def _computed(recording: Recording) -> _Computed:
+    """Read all tables of a recording, scene by scene."""
+    speeds, traffic = Speeds(), dict[str, Traffic]()
+    by_scene: dict[str, list[Moment]] = {}
+    for moment in recording.moments:
+        by_scene.setdefault(moment.scene, []).append(moment)
+    problems: list[str] = []
+    for scene in recording.scenes():
+        traffic[scene.name] = Traffic.of(scene)
+        speeds.add(scene)
+        for moment in by_scene.get(scene.name, ()):
+            problems += _problems(scene, moment, horizon_s(recording.facts))
+    return _Computed(Sessions.of(traffic), speeds.targets_mps(), next(iter(problems), None))
+
+
+def sessions_of(recording: Recording) -> Sessions:
+    """Return the sessions of a recording, all of whose tables are read once."""
+    return _computed(recording).sessions
+
+
+def hold(recording: Recording) -> None:
+    """Raise UserError where a recording states what its tables do not give.
+
+    Such are target speeds, purposes of moments, and moments of somebody who is not there so long.
+    """
+    computed, until_s = _computed(recording), horizon_s(recording.facts)
+    problem = computed.problem
+    if recording.speeds_mps != computed.speeds_mps:
+        texts = ", ".join(f"{speed:g}" for speed in computed.speeds_mps)
+        problem = problem or f"other speeds_mps than its tables give: {texts}"
+    for moment in recording.moments:
+        purpose = computed.sessions.purpose(moment.scene, moment.time_s, until_s)
+        if moment.purpose != purpose and problem is None:
+            given = "none" if purpose is None else purpose
+            problem = f"{_which(moment)} for {moment.purpose}; its tables give {given}"
+    if problem is not None:
+        raise UserError(
+            f"recording {printable(recording.folder / FACTS)} states {problem}; make the recording "
+            "again: `harness dataset import`"
+        )
+
+
+def _problems(scene: Scene, moment: Moment, horizon_s: float) -> Iterator[str]:
+    track, until_s = scene.tracks.get(moment.vehicle), moment.time_s + horizon_s
+    if track is None:
+        yield f"{_which(moment)}, and nobody there is called so"
+        return
+    if not track.begin_s - EARLY_S <= moment.time_s <= until_s <= track.end_s + EARLY_S:
+        there = f"{track.begin_s:g} to {track.end_s:g} s"
+        yield f"{_which(moment)} and until {until_s:g} s; that vehicle is there {there}"
+    if moment.hidden is not None:
+        other = scene.tracks.get(moment.hidden)
+        if other is None or other is track or other.at(moment.time_s) is None:
+            yield f"{_which(moment)}; its hidden road user is not there then"
+
+
+def _which(moment: Moment) -> str:
+    vehicle = printable(moment.vehicle, 60)
+    return f"a moment of {printable(moment.scene, 60)}, {vehicle} at {moment.time_s:g} s"
