@@ -301,8 +301,10 @@ def _of_scenes(run: Run, ours: Run, besides: Collection[str]) -> Iterator[str]:
 def _of_limit(run: Run) -> Iterator[str]:
     """Yield whether run.json has more or fewer scenes asked for than its settings.
 
-    A run that stopped early states those that it came to.
+    A run that stopped early states those that it came to, and an older one states no settings.
     """
+    if "settings" not in run.record:
+        return
     world, settings = run.manifest.world, run.manifest.settings.world
     if isinstance(world, FrozenScenes) and isinstance(settings, FrozenSettings):
         is_stopped = world.interim_looks is not None and world.limit == world.episodes
