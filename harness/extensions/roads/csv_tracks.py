@@ -10,6 +10,7 @@ import io
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from threading import Event, Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,6 +76,7 @@ SIZES_M = {
     "pedestrian": (0.4, 0.5),
 }
 SCALED = re.compile(r"(.+?)\s*([*/])\s*(-?[0-9.]+(?:[eE][+-]?[0-9]+)?)")
+LAST_READ_S = 0.3  # in which a thread that reads ahead asks for more, or does not any more
 EXAMPLE = "--columns time_s=frame/25,id=track,x_m=x,y_m=y"
 
 
@@ -281,10 +283,10 @@ def _table(path: Path, header: list[str], kinds: Mapping[str, pa.DataType]) -> p
     with unpacked(path) as file:
         first = file.read(1 << 16)
         delimiter = _delimiter(first.decode("utf-8-sig", "replace").split("\n")[0])
-    with unpacked(path) as file:
+    with unpacked(path) as file, _Raw(file) as raw:
         try:
             reader = pyarrow.csv.open_csv(
-                io.BufferedReader(_Raw(file), 1 << 20),
+                io.BufferedReader(raw, 1 << 20),
                 read_options=pyarrow.csv.ReadOptions(
                     use_threads=False, column_names=header, skip_rows=1
                 ),
@@ -306,18 +308,30 @@ def _table(path: Path, header: list[str], kinds: Mapping[str, pa.DataType]) -> p
 
 
 class _Raw(io.RawIOBase):
-    """Give pyarrow a file that it can read from."""
+    """Give pyarrow a file that it can read from, in a thread of its own.
+
+    That thread reads ahead, and may do so when the rows are refused; it must have come to an end
+    of the file before the program has.
+    """
 
     def __init__(self, file: Any) -> None:
-        self.file = file
+        self.file, self._stopped, self._over, self._lock = file, False, Event(), Lock()
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any) -> int:
-        data = self.file.read(len(buffer))
+        with self._lock:
+            data = b"" if self._stopped else self.file.read(len(buffer))
         buffer[: len(data)] = data
+        if not data:
+            self._over.set()
         return len(data)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._stopped = True
+        self._over.wait(LAST_READ_S)
 
 
 def _numbers(path: Path, table: pa.Table, place: Column) -> Floats:

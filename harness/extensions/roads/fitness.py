@@ -7,6 +7,7 @@ from msgspec import structs
 
 from harness.core.errors import UserError
 from harness.core.files import canonical_json, sha256_bytes
+from harness.core.progress import Progress
 from harness.core.seeds import FIRST
 from harness.extensions.roads.driver import NAME
 from harness.extensions.roads.family import in_memory
@@ -18,12 +19,15 @@ from harness.world.reference import drive
 Key = tuple[str, str, float]  # scene, vehicle and time of a moment
 
 
-def choose_fit(recording: Recording, scenes: Iterable[Scene], horizon_s: float) -> Choice:
+def choose_fit(
+    recording: Recording, scenes: Iterable[Scene], horizon_s: float, progress: Progress
+) -> Choice:
     """Return the moments of a recording that `choose` takes and its recorded driver masters.
 
     Of those chosen, each is driven; without those at which the driver fails, it is chosen again,
     until it fails at none. `scenes` are the recording's, read once, and `horizon_s` is the time
     that an episode needs. The recording has the window, the target speeds and the period.
+    `progress` is told of each moment that is driven.
     """
     failed: set[Key] = set()
     passed: set[Key] = set()
@@ -33,8 +37,10 @@ def choose_fit(recording: Recording, scenes: Iterable[Scene], horizon_s: float) 
 
     choice = choose(scenes, recording.window_m, horizon_s, unfit=unfit)
     while rest := [moment for moment in choice.moments if _key(moment) not in passed]:
+        progress.more(len(rest))
         for moment in sorted(rest, key=_key):  # those of one scene together
             (passed if is_mastered(recording, moment) else failed).add(_key(moment))
+            progress(1)
         if any(_key(moment) in failed for moment in rest):
             choice = choose(recording.scenes(), recording.window_m, horizon_s, unfit=unfit)
     return choice

@@ -64,7 +64,7 @@ def command(
     in_range("--window", window, 10, 2000)
     in_range("--decisions", decisions, 1, 9)
     about = _About(_name(name, out), _text("--source", source), _licence(licence))
-    _refuse_format(show)
+    _refuse_picture(show, out)
     declared = columns_of(columns)
     with bar("sorting files", quiet=as_json) as progress:
         sources = Sources.of(files, progress)
@@ -234,7 +234,8 @@ def _imported(
             with bar("reading files", sources.count, quiet) as progress:
                 scenes = _watched(_unique(scenes_of(sources, columns)), taken, progress)
                 recording = tables.write(part, *texts, scenes, (), {}, decisions=decisions)
-            with bar("choosing moments", len(recording.scenes_stated), quiet) as progress:
+            count = len(recording.scenes_stated)
+            with bar("choosing moments", count, quiet, grows=True) as progress:
                 # the recorded driver must reach the goal with the speeds that the ego will have
                 speeds_mps = taken.targets_mps()
                 recording = tables.chosen(recording, speeds_mps, (), {})
@@ -348,7 +349,7 @@ def _chosen(
     from harness.extensions.roads.held import horizon_s
 
     until_s = horizon_s(recording.facts)
-    choice = choose_fit(recording, _counted(recording.scenes(), progress), until_s)
+    choice = choose_fit(recording, _counted(recording.scenes(), progress), until_s, progress)
     return choice.moments, {**choice.record, "horizon_s": until_s}
 
 
@@ -387,8 +388,13 @@ def _text(option: str, text: str) -> str:
     return sayable(f"{option}", text, "give another text")
 
 
-def _refuse_format(show: Path | None) -> None:
+def _refuse_picture(show: Path | None, out: Path) -> None:
     if show:
+        if out.resolve() in show.resolve().parents:
+            raise UserError(
+                f"--show {printable(show)} is in --out {printable(out)}, which has nothing but the "
+                "recording; give another path"
+            )
         from harness.report.drawing.pictures import FORMATS
 
         if show.suffix[1:] not in FORMATS:

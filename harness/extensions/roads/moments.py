@@ -367,6 +367,8 @@ def _encroachments(frames: _Frames, gap: int) -> Pairs:
     for begin in range(int(by_frame[0]), int(by_frame[-1]) + 1, BLOCK):
         ends = np.searchsorted(by_frame, (begin, begin + BLOCK, begin + BLOCK + gap))
         block, later = order[ends[0] : ends[1]], order[ends[0] : ends[2]]
+        if not len(block):
+            continue
         tree = KDTree(_layers(frames, block, 0, layer_m))
         for lag in range(gap + 1):
             seconds = KDTree(_layers(frames, later, lag, layer_m))

@@ -42,6 +42,8 @@ STILL_M = 0.5  # what moves less than this in all its time stands
 # Of one scene; what is beyond these is no traffic of one place.
 MOST_ROWS, MOST_TRACKS, MOST_LANES, MOST_HOUSES = 10_000_000, 50_000, 100_000, 100_000
 MOST_POINTS = 5_000_000  # of all its lanes
+CELL_M, MOST_OF_CELL = 100.0, 1000  # lanes that begin in one square: what roads are made of
+LONGEST_S, LONGEST_ALL_S = 1e6, 3e6  # from its begin to its end, and of all its road users together
 MOST_SCENES, MOST_MOMENTS = 10_000, 1_000_000
 FARTHEST_M = 1e8  # of a coordinate: maps have them in metres from an equator and a meridian
 LENGTHS_M, WIDTHS_M = (0.1, 60.0), (0.1, 10.0)  # of road users
@@ -679,8 +681,33 @@ def _problems_of_numbers(scene: Scene) -> Iterator[str]:
     ):
         if amount > most:
             yield f"{amount} {what}; allowed: at most {most}: cut it"
+    yield from _problems_of_density(scene)
     if not 0.001 <= scene.step_s <= 10:
         yield f"a step of {scene.step_s:g} s; allowed: 0.001 to 10"
+
+
+def _problems_of_density(scene: Scene) -> Iterator[str]:
+    """Yield what makes a scene that no machine simulates: times far apart, or a heap of lanes."""
+    spans = [track.time_s[[0, -1]] for track in scene.tracks.values() if len(track.time_s)]
+    ends = np.array(spans).reshape(-1, 2)
+    if np.isfinite(ends).all() and len(ends):
+        begin_s, end_s = float(ends.min()), float(ends.max())
+        all_s = float(np.ptp(ends, axis=1).sum())
+        if end_s - begin_s > LONGEST_S:
+            yield (
+                f"its times are from {begin_s:.10g} to {end_s:.10g} s; allowed: {LONGEST_S:g} s "
+                "in all: mend a time that is unknown, or cut it into scenes"
+            )
+        elif all_s > LONGEST_ALL_S:
+            yield f"{all_s:g} s of road users; allowed: {LONGEST_ALL_S:g}: cut it"
+    begins = np.array([lane.points[0] for lane in scene.lanes.values() if len(lane.points)])
+    if len(begins) > MOST_OF_CELL and _is_place(begins):
+        _, counts = np.unique(np.floor(begins / CELL_M), axis=0, return_counts=True)
+        if counts.max() > MOST_OF_CELL:
+            yield (
+                f"{counts.max()} lanes begin in a square of {CELL_M:g} m; allowed: "
+                f"{MOST_OF_CELL}: leave out what are no lanes"
+            )
 
 
 def _is_place(points: Floats) -> bool:

@@ -172,6 +172,10 @@ WRONG: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("hand-1.xml",),
         ("--licence", "x", "--show", "/proc/a.svg"),
     ),
+    "--show mine/a.svg is in --out mine": (
+        ("hand-1.xml",),
+        ("--licence", "x", "--show", "mine/a.svg"),
+    ),
     "--window 5 is out of range": (("hand-1.xml",), ("--licence", "x", "--window", "5")),
     "--name '../x'; allowed: small letters": (
         ("hand-1.xml",),

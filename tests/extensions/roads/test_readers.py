@@ -1,6 +1,7 @@
 """Readers of CommonRoad, SUMO and tables: numbers worked out by hand, and files that are refused."""
 
 import gzip
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -283,3 +284,10 @@ def test_a_wrong_table_of_lanes_is_refused(tmp_path: Path) -> None:
         path = written(tmp_path, "l.csv", files.LANES.replace("3,50,0,,,,,", new))
         with pytest.raises(UserError, match=words):
             csv_tracks.lanes_of(path)
+
+
+def test_nobody_reads_on_when_rows_are_refused() -> None:
+    """A thread that reads ahead would call Python while it ends, which aborts it."""
+    with csv_tracks._Raw(io.BytesIO(b"0123456789")) as raw:
+        assert raw.read(4) == b"0123"
+    assert raw.read(4) == b""

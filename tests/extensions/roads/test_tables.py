@@ -145,6 +145,18 @@ WRONG: dict[str, dict[str, Any]] = {
         "tracks": {"\x1b": straight("\x1b", 0, 1)}
     },
     "a step of 0 s": {"step_s": 0.0},
+    "its times are from 0 to 1000000000 s; allowed: 1e+06 s": {
+        "tracks": {"a": straight("a", 0, 1, time_s=np.array([0.0, 1, 2, 1e9]))}
+    },
+    "4e+06 s of road users; allowed: 3e+06": {
+        "tracks": {
+            key: straight(key, 9.0 * n, 1, time_s=np.array([0.0, 1, 2, 1e6]))
+            for n, key in enumerate("abcd")
+        }
+    },
+    "1001 lanes begin in a square of 100 m; allowed: 1000": {
+        "lanes": {f"{n}": Lane(f"{n}", LINE, 4, None, (), None, None) for n in range(1001)}
+    },
 }
 
 
