@@ -402,6 +402,10 @@ def scenario_name(name: str | None, of_family: Mapping[str, str]) -> str:
             f"give either a scenario{''.join(flags)}; `harness dataset scenario list` lists "
             "scenarios"
         )
+    if len(typed) > 1:
+        given = [option for option in of_family if option in first]
+        flags = [f"--{option.replace('_', '-')}" for option in given or of_family]
+        raise UserError(f"{' and '.join(flags)} are of several scenarios; give those of one")
     return typed[0].named(of_family)
 
 

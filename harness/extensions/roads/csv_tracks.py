@@ -160,6 +160,16 @@ def is_buildings(header: list[str]) -> bool:
     return set(HOUSE_COLUMNS) == set(header)
 
 
+def has_places(header: list[str], columns: Columns) -> bool:
+    """Return whether a table with this header has any of the columns of time and place."""
+    names = ("time_s", *POINTS, *FRONT)
+    for text in [columns.texts[name] for name in names if name in columns.texts]:
+        scaled = SCALED.fullmatch(text)
+        if text in header or (scaled and scaled[1] in header):
+            return True
+    return False
+
+
 def scenes(
     *paths: Path,
     columns: Columns,

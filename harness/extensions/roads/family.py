@@ -60,14 +60,15 @@ class Recordings:
         from harness.extensions.roads.tables import FACTS
 
         if (folder / FACTS).is_file():
-            _remember(folder.absolute())
+            _remember(folder.absolute(), is_first=True)  # what is beside a dataset is its own
 
 
-def _remember(folder: Path) -> None:
-    """Look for recordings in a folder, too, here and in worker processes."""
+def _remember(folder: Path, is_first: bool = False) -> None:
+    """Look for recordings in a folder, too, here and in worker processes; in it first or last."""
     folders = _folders()
     if str(folder) not in folders:
-        os.environ[FOLDERS] = os.pathsep.join([*folders, str(folder)])
+        folders.insert(0 if is_first else len(folders), str(folder))
+        os.environ[FOLDERS] = os.pathsep.join(folders)
 
 
 def _folders() -> list[str]:

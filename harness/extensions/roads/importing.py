@@ -67,7 +67,7 @@ def command(
     _refuse_picture(show, out)
     declared = columns_of(columns)
     with bar("sorting files", quiet=as_json) as progress:
-        sources = Sources.of(files, progress)
+        sources = Sources.of(files, progress, declared)
     what = about, window, decisions
     recording, taken = _imported(sources, declared, out, what, show, as_json)
     if as_json:
@@ -95,7 +95,7 @@ class Sources:
     tracks: list[Path] = field(default_factory=list)
     lanes: list[Path] = field(default_factory=list)
     buildings: list[Path] = field(default_factory=list)
-    others: int = 0  # files of folders that are none of these
+    others: list[str] = field(default_factory=list)  # why files of folders are none of these
 
     @property
     def count(self) -> int:
@@ -103,10 +103,11 @@ class Sources:
         return len(self.commonroad) + len(self.positions) + len(self.tracks)
 
     @classmethod
-    def of(cls, paths: Sequence[Path], progress: Progress) -> "Sources":
+    def of(cls, paths: Sequence[Path], progress: Progress, columns: "Columns") -> "Sources":
         """Sort files, and all files of folders, by what stands in them.
 
-        Raises UserError for a file that is none of them; of folders such files are counted.
+        Raises UserError for a file that is none of them; of folders such files are counted, and
+        so are tables with none of the declared `columns` of time and place.
         """
         sources = cls()
         for path in paths:
@@ -116,19 +117,31 @@ class Sources:
             for inner in files_of(path):
                 try:
                     kind = kind_of(inner)
-                except UserError:
-                    sources.others += 1
+                    if kind == "tracks":
+                        _refuse_without_places(inner, columns)
+                except UserError as error:
+                    sources.others.append(str(error))
                     continue
                 sources._add(inner, kind)
                 progress(1)
         if not sources.count and not sources.sumo:
-            raise UserError(f"no file has road users; give {KNOWN}")
+            left_out = f" (left out: {sources.others[0]})" if sources.others else ""
+            raise UserError(f"no file has road users{left_out}; give {KNOWN}")
         return sources
 
     def _add(self, path: Path, kind: str) -> None:
         list_of: list[Path] = getattr(self, kind)
         if path not in list_of:
             list_of.append(path)
+
+
+def _refuse_without_places(path: Path, columns: "Columns") -> None:
+    """Raise UserError for a table of something else, such as one of what recordings are there."""
+    from harness.extensions.roads import csv_tracks
+    from harness.extensions.roads.sources import no_use
+
+    if not csv_tracks.has_places(csv_tracks.header_of(path), columns):
+        raise no_use(path, "it has none of the columns of time and place")
 
 
 def files_of(folder: Path) -> list[Path]:
@@ -226,7 +239,7 @@ def _imported(
 
     taken = _Taken()
     if sources.others:
-        taken.left_out["file of another kind"] = sources.others
+        taken.left_out["file of another kind"] = len(sources.others)
     about, window_m, decisions = what
     texts = (about.name, about.source, about.licence, window_m)
     try:

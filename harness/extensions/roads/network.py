@@ -4,6 +4,7 @@ Lanes that lie side by side are one street; streets that lead on to each other s
 is mirrored: recordings have it to the north, and the harness to the south.
 """
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,6 +19,9 @@ from harness.core.arrays import Floats
 from harness.extensions.roads.tables import Lane as Recorded
 from harness.extensions.roads.tables import Scene
 from harness.world.road import Lane
+
+# It warns in each frame of who is off the route, as vehicles on recorded maps often are.
+logging.getLogger("highway_env.road.road").setLevel(logging.ERROR)
 
 MIRROR = np.array([1.0, -1.0])  # from the frame of recordings to the harness's
 LIMIT_MPS = 20.0  # of a lane whose limit is not stated: highway-env's own

@@ -667,7 +667,9 @@ def _problems(scene: Scene) -> Iterator[str]:
 
 def _problems_of_numbers(scene: Scene) -> Iterator[str]:
     if not scene.tracks:
-        yield "nobody moves or stands there; it needs a track"
+        left_out = ", ".join(printable(reason, 80) for reason in list(scene.left_out)[:3])
+        others = f" but those left out: {left_out}; kinds: {', '.join(KINDS)}" if left_out else ""
+        yield f"nobody moves or stands there{others or '; it needs a track'}"
     if not scene.lanes:
         yield "it has no lanes; give a map"
     rows = sum(len(track.time_s) for track in scene.tracks.values())
@@ -759,7 +761,9 @@ def _problems_of_lane(lane: Lane, lanes: Mapping[str, Lane]) -> Iterator[str]:
         yield f"{which}: limit_mps {lane.limit_mps:g}; allowed: above 0 to {FASTEST_MPS:g}"
     beside = [other for other in (lane.left, lane.right) if other is not None]
     for other in (*lane.successors, *beside):
-        if other not in lanes or other == lane.id:
+        if other == lane.id:
+            yield f"{which} names itself as what is after or beside it"
+        elif other not in lanes:
             yield f"{which} names lane {printable(other)}, which is not there"
 
 

@@ -167,7 +167,8 @@ def nth(recording: Recording, seed: int) -> Moment:
         there = f"seeds {begin} to {begin + len(moments) - 1}" if moments else "none"
         raise UserError(
             f"recording {printable(recording.name)} has {len(moments)} moments to {purpose} "
-            f"({there}), and no seed {seed}; give a first seed and a number of layouts within them"
+            f"({there}), and no more are to be had; give a first seed and a number of layouts "
+            "within them"
         )
     return moments[n]
 

@@ -11,7 +11,9 @@ import pytest
 import road_files as files
 
 from harness.core.errors import UserError
+from harness.core.progress import Progress
 from harness.extensions.roads import fitness, importing, moments, tables
+from harness.extensions.roads.csv_tracks import columns_of
 from harness.extensions.roads.importing import Sources, kind_of
 from harness.extensions.roads.tables import Lane, Moment, Scene, Track
 
@@ -204,13 +206,38 @@ def test_a_wrong_command_writes_nothing(
     assert sorted(path.name for path in source.parent.iterdir()) == ["files"]
 
 
+@pytest.mark.parametrize(
+    ("names", "others"),
+    [
+        (("tracks.csv", "tracksMeta.csv", "recordingMeta.csv", "lanes.csv"), 2),
+        (("tracksMeta.csv", "lanes.csv"), "no file has road users (left out: file"),
+    ],
+)
+def test_a_folder_may_have_tables_of_other_things(
+    names: tuple[str, ...], others: int | str, tmp_path: Path
+) -> None:
+    metas = {
+        "tracksMeta.csv": "recordingId,track,initialFrame,width,length,class\n0,0,0,2,4,car\n",
+        "recordingMeta.csv": "recordingId,locationId,frameRate,weekday\n0,4,25,monday\n",
+    }
+    for name in names:
+        (tmp_path / name).write_text({**FILES, **metas}[name])
+    if isinstance(others, str):
+        with pytest.raises(UserError) as refusal:
+            Sources.of([tmp_path], Progress(), columns_of(COLUMNS))
+        assert others in str(refusal.value)
+        assert "none of the columns of time and place" in str(refusal.value)
+        return
+    sources = Sources.of([tmp_path], Progress(), columns_of(COLUMNS))
+    assert [path.name for path in sources.tracks] == ["tracks.csv"]
+    assert len(sources.others) == others
+
+
 def test_scenes_of_one_name_get_a_number(source: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     again.mkdir()
     (again / "hand-3.xml").write_text(files.COMMONROAD_2018B)
-    sources = Sources.of([source / "hand-1.xml", again], lambda done: None)  # type: ignore[arg-type]
-    from harness.extensions.roads.csv_tracks import columns_of
-
+    sources = Sources.of([source / "hand-1.xml", again], Progress(), columns_of(None))
     names = [
         scene.name for scene in importing._unique(importing.scenes_of(sources, columns_of(None)))
     ]

@@ -221,7 +221,7 @@ def test_dangers_goals_and_seeds(scenario: Scenario) -> None:
     assert scenario.cluster is not None
     assert scenario.cluster(0) == "s"
     with pytest.raises(
-        UserError, match=r"hand has 2 moments to tune \(seeds 0 to 1\), and no seed 2"
+        UserError, match=r"hand has 2 moments to tune \(seeds 0 to 1\), and no more are to be had"
     ):
         World.start(scenario, 2)
     with pytest.raises(UserError, match=r"0 moments to train \(none\)"):
@@ -296,6 +296,25 @@ def test_nobody_was_recorded_elsewhere() -> None:
     request = Request("1", "ego", (), ("IDLE",), 100, scenario=scenario)
     with pytest.raises(UserError, match=r"nobody was recorded in blind-merge"):
         backend.complete([request])
+
+
+def test_a_recording_and_an_environment_are_two_scenarios(
+    harness: Callable[..., tuple[int, str, str]],
+) -> None:
+    given = ("--recording", "mine", "--env", "merge-v0")
+    code, _, err = harness("dataset", "build", *given, "--out", "made")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "are of several scenarios; give those of one" in err
+
+
+def test_what_is_beside_a_dataset_goes_before_what_a_variable_names(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "recording.json").write_bytes((folder / "recording.json").read_bytes())
+    monkeypatch.setenv(family.FOLDERS, str(tmp_path))  # which has no tables
+    name = family.name_of(tables.read(folder))
+    RECORDINGS.kept_in(name, folder)
+    assert recording_of(name).folder == folder
 
 
 @pytest.mark.slow

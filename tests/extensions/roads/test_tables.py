@@ -135,6 +135,11 @@ WRONG: dict[str, dict[str, Any]] = {
         "tracks": {"a": straight("a", 0, 1), "b": straight("b", 3, 1)}
     },
     "nobody moves or stands there": {"tracks": {}},
+    "there but those left out: dragon (a kind that none is made of); kinds: car, van": {
+        "tracks": {},
+        "left_out": {"dragon (a kind that none is made of)": 2},
+    },
+    "lane 1 names itself": {"lanes": {"1": Lane("1", LINE, 4, None, ("1",), None, None)}},
     "it has no lanes": {"lanes": {}},
     "lane 1 has no length": {"lanes": {"1": Lane("1", 0 * LINE, 4, None, (), None, None)}},
     "lane 1: width_m 0": {"lanes": {"1": Lane("1", LINE, 0, None, (), None, None)}},
