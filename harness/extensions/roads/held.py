@@ -70,7 +70,8 @@ def sessions_of(recording: Recording) -> Sessions:
 def hold(recording: Recording) -> None:
     """Raise UserError where a recording states what its tables do not give.
 
-    Such are target speeds, purposes of moments, and moments of somebody who is not there so long.
+    Such are target speeds, purposes of moments, moments of somebody who is not there so long, and
+    those of a scene that is another one again.
     """
     computed, until_s = _computed(recording), horizon_s(recording.facts)
     problem = computed.problem
@@ -79,6 +80,9 @@ def hold(recording: Recording) -> None:
         problem = problem or f"other speeds_mps than its tables give: {texts}"
     for moment in recording.moments:
         purpose = computed.sessions.purpose(moment.scene, moment.time_s, until_s)
+        first = computed.sessions.first[moment.scene]
+        if first != moment.scene:
+            problem = problem or f"{_which(moment)}; that scene is {printable(first, 60)} again"
         if moment.purpose != purpose and problem is None:
             given = "none" if purpose is None else purpose
             problem = f"{_which(moment)} for {moment.purpose}; its tables give {given}"

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,7 @@ EDITS: dict[str, Edit | None] = {
     ),
     "source has 3000 characters; allowed: 1000": lambda facts: facts.update(source="s" * 3000),
     "licence has 8 characters": lambda facts: facts.update(licence="MIT\n\n# x"),
+    "that scene is s again": of_moment(scene="t"),
     "recording:column@": lambda facts: None,
 }
 
@@ -59,7 +61,8 @@ def test_what_a_recording_states_is_held(
 ) -> None:
     monkeypatch.setenv(family.FOLDERS, str(tmp_path))
     moments = [Moment("s", "e1", time_s, None, None, "tune") for time_s in (1.0, 2.0)]
-    tables.write(tmp_path, "column", "", "", 80.0, [column()], moments, {})
+    scenes = [column(), replace(column(), name="t", sha256="1" * 64)]
+    tables.write(tmp_path, "column", "", "", 80.0, scenes, moments, {})
     facts = json.loads((tmp_path / "recording.json").read_text())
     if edit := EDITS[words]:
         edit(facts)
