@@ -10,7 +10,7 @@ import numpy as np
 from harness.core.errors import UserError, printable
 from harness.extensions.environments.place import AFTER
 from harness.extensions.roads.sessions import Sessions, Traffic
-from harness.extensions.roads.tables import EARLY_S, FACTS, Facts, Moment, Recording, Scene
+from harness.extensions.roads.tables import EARLY_S, FACTS, SLACK_M, Facts, Moment, Recording, Scene
 
 EVERY = 10  # rows of a track from one speed to the next that counts
 
@@ -58,7 +58,7 @@ def _computed(recording: Recording) -> _Computed:
         traffic[scene.name] = Traffic.of(scene)
         speeds.add(scene)
         for moment in by_scene.get(scene.name, ()):
-            problems += _problems(scene, moment, horizon_s(recording.facts))
+            problems += _problems(scene, moment, recording.facts)
     return _Computed(Sessions.of(traffic), speeds.targets_mps(), next(iter(problems), None))
 
 
@@ -78,6 +78,10 @@ def hold(recording: Recording) -> None:
     if recording.speeds_mps != computed.speeds_mps:
         texts = ", ".join(f"{speed:g}" for speed in computed.speeds_mps)
         problem = problem or f"other speeds_mps than its tables give: {texts}"
+    chosen_s = recording.choice.get("horizon_s", until_s)
+    if chosen_s != until_s:
+        decisions = recording.facts.decisions
+        problem = problem or f"decisions {decisions}, and moments of another number of them"
     for moment in recording.moments:
         purpose = computed.sessions.purpose(moment.scene, moment.time_s, until_s)
         first = computed.sessions.first[moment.scene]
@@ -93,8 +97,8 @@ def hold(recording: Recording) -> None:
         )
 
 
-def _problems(scene: Scene, moment: Moment, horizon_s: float) -> Iterator[str]:
-    track, until_s = scene.tracks.get(moment.vehicle), moment.time_s + horizon_s
+def _problems(scene: Scene, moment: Moment, facts: Facts) -> Iterator[str]:
+    track, until_s = scene.tracks.get(moment.vehicle), moment.time_s + horizon_s(facts)
     if track is None:
         yield f"{_which(moment)}, and nobody there is called so"
         return
@@ -103,8 +107,12 @@ def _problems(scene: Scene, moment: Moment, horizon_s: float) -> Iterator[str]:
         yield f"{_which(moment)} and until {until_s:g} s; that vehicle is there {there}"
     if moment.hidden is not None:
         other = scene.tracks.get(moment.hidden)
-        if other is None or other is track or other.at(moment.time_s) is None:
+        here = track.at(moment.time_s)
+        there_then = None if other is None else other.at(moment.time_s)
+        if other is track or here is None or there_then is None:
             yield f"{_which(moment)}; its hidden road user is not there then"
+        elif np.hypot(*(here - there_then)[:2]) > facts.window_m + SLACK_M:
+            yield f"{_which(moment)}; its hidden road user is beyond {facts.window_m:g} m"
 
 
 def _which(moment: Moment) -> str:

@@ -44,7 +44,11 @@ EDITS: dict[str, Edit | None] = {
     "e1 at 14 s and until 19 s; that vehicle is there 0 to 16 s": of_moment(time_s=14.0),
     "no\\x1bbody at 1 s, and nobody there is called so": of_moment(vehicle="no\x1bbody"),
     "e1 at 1 s; its hidden road user is not there": of_moment(hidden="e1", conflict_s=1.0),
+    "e1 at 1 s; its hidden road user is beyond 80 m": of_moment(hidden="q", conflict_s=1.0),
     "one of hidden and conflict_s": of_moment(hidden="e0"),
+    "decisions 4, and moments of another number": lambda facts: facts.update(
+        decisions=4, choice={"horizon_s": 5.0}
+    ),
     "other speeds_mps than its tables give: 0, 5, 10": lambda facts: facts.update(
         speeds_mps=[9.9, 10, 10.1]
     ),
