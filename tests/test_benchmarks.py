@@ -7,10 +7,14 @@ import sys
 from collections.abc import Callable
 from itertools import product
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from harness.core.arrays import Floats
 from harness.dataset.load import Dataset
+from harness.runs.success import Success
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
@@ -69,3 +73,24 @@ def test_no_sequence_clears_more_than_the_one_that_is_found(small: Dataset) -> N
     found = forest.sequence_success(open_loop.best(forest, weights)) @ weights
     every = product(forest.actions, repeat=int(forest.step.max()) + 1)
     assert found == pytest.approx(max(forest.sequence_success(each) @ weights for each in every))
+
+
+@pytest.mark.slow
+def test_pairs_of_policies_that_turn_round_are_told_from_those_that_are_equal() -> None:
+    """Worked by hand: of six pairs three stay, one turns, and two are equal on a side."""
+    import traffic_ranks  # which needs an extension
+
+    every, half, none = np.ones(40), np.tile([0.0, 1.0], 20), np.zeros(40)
+    ours = {"a": every, "b": half, "c": none, "d": none, "full-view": every}
+    theirs = {"a": every, "b": none, "c": half, "d": none, "full-view": none}
+
+    def side(name: str, success: dict[str, Floats]) -> Any:
+        scenes = traffic_ranks.Scenes(name, Success(none > 0), success)
+        return traffic_ranks.Side(name, (scenes,))
+
+    found = traffic_ranks.compared(side("ours", ours), side("traffic", theirs), lambda name: True)
+    assert found.policies == 4  # who sees everything has no rank
+    assert (found.told, found.same, found.turned) == (4, 3, [("b", "c")])
+    assert (found.first_only, found.second_only, found.neither, found.tied) == (1, 1, 0, 2)
+    assert found.share == pytest.approx((0.75, 0.75, 0.75))
+    assert found.tau == pytest.approx((0.4, 0.4, 0.4))
