@@ -22,7 +22,7 @@ from msgspec import structs
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.seeds import FIRST
-from harness.extensions.roads.sessions import FEW, SHARED, Sessions, Traffic
+from harness.extensions.roads.sessions import APART, FEW, SHARED, Sessions, Traffic
 from harness.extensions.roads.tables import STILL_M, Moment, Scene, Track
 from harness.world.conflict_measures import MOMENTS_HZ, SHORT_PET_S
 from harness.world.state import separation_m
@@ -194,8 +194,8 @@ class Chooser:
         if len(sessions.contents) <= FEW:
             dealt = (
                 "Each scene is cut in three by time, for tune, train and report, with gaps of "
-                f"{self.horizon_s:g} s, so that no second is in two; one that is too short is for "
-                "report"
+                f"{APART * self.horizon_s:g} s, so that no second is in two; one that is too short "
+                "is for report"
             )
         dealt += f"; scenes with more than 1 in {SHARED} places in common are dealt as one."
         most = "" if self.most is None else f", at most {self.most} of a purpose"

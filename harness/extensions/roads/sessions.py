@@ -19,6 +19,7 @@ from harness.extensions.roads.tables import Scene, Track
 
 DEALT: Sequence[Purpose] = ("report", "report", "tune", "train")  # by the rest of a digest by 4
 FEW = 2  # sessions of a recording that are cut by time, so that each purpose has a part
+APART = 2  # horizons between two parts of a scene that is cut by time
 SHARED = 50  # scenes with more than one in so many places in common share traffic
 MOVES_MPS = 0.5  # who is slower stands
 STEPS = np.array([0.1, 0.1, 0.1, 0.5])  # m, m, rad and m/s, to which shared poses are rounded
@@ -156,15 +157,17 @@ def dealt(session: str) -> Purpose:
 def part_of(time_s: float, span_s: tuple[float, float], horizon_s: float) -> str | None:
     """Return the purpose of a moment of a scene that is cut by time; None between two parts.
 
-    `span_s` is the scene's begin and end. Parts are of one length, and a horizon lies between the
-    last moment of one and the first of the next. A scene too short for that is for reports alone.
+    `span_s` is the scene's begin and end. Parts are of one length, and `APART` horizons lie between
+    the last moment of one and the first of the next, since an episode may take longer than the
+    horizon. A scene too short for that is for reports alone.
     """
     begin_s, end_s = span_s
+    gap_s = APART * horizon_s
     # no moment is later than a horizon before the end
-    length_s = (end_s - begin_s - len(FIRST) * horizon_s) / len(FIRST)
+    length_s = (end_s - begin_s - horizon_s - (len(FIRST) - 1) * gap_s) / len(FIRST)
     if length_s <= 0:
         return list(FIRST)[-1]
-    place = int((time_s - begin_s) // (length_s + horizon_s))
-    within_s = time_s - begin_s - place * (length_s + horizon_s)
+    place = int((time_s - begin_s) // (length_s + gap_s))
+    within_s = time_s - begin_s - place * (length_s + gap_s)
     is_in = 0 <= place < len(FIRST) and within_s < length_s
     return list(FIRST)[place] if is_in else None
