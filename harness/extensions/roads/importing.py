@@ -489,8 +489,9 @@ def _echo_moments(recording: "Recording") -> None:
         )
     if without := [purpose for purpose in FIRST if not purposes[purpose]]:
         echo_text(
-            f"no moments to {' or '.join(without)}: import more files or longer ones, or with "
-            "another --window; what moves in a file decides what it is for"
+            f"no moments to {' or '.join(without)}: import more files or longer ones, with fewer "
+            "--decisions (an episode takes two seconds more than these), or with another --window; "
+            "what moves in a file decides what it is for"
         )
 
 

@@ -33,6 +33,7 @@ EVERY_S = 1.0  # from one candidate of a vehicle to the next
 APART_S = 5.0  # least time from one moment of a vehicle to the next
 HARD_MPS2 = 4.0  # mean deceleration over a second that is hard braking, as metrics have it
 ALIKE_RAD = math.pi / 4  # headings that differ by less are of one direction
+CALM = 20  # most moments of a purpose in which nobody hidden comes into conflict
 EVERY = round(EVERY_S * MOMENTS_HZ)  # frames from one candidate to the next
 NEVER = np.iinfo(np.int64).max  # a frame that does not come
 BLOCK = 600  # frames whose encroachments are looked for at once
@@ -166,21 +167,24 @@ class Chooser:
         sessions = Sessions.of(self._traffic)
         decisive = {each.scene for each in self._fit if each.moment.hidden is not None}
         by_purpose: dict[str, list[_Fit]] = {purpose: [] for purpose in FIRST}
+        calm: dict[str, list[_Fit]] = {purpose: [] for purpose in FIRST}
         for candidate in self._fit:
             scene, time_s = candidate.scene, candidate.moment.time_s
             purpose = sessions.purpose(scene, time_s, self.horizon_s)
             if sessions.first[scene] != scene:
                 left_out[TWICE] += 1
-            elif scene not in decisive:
-                left_out[NO_CONFLICT] += 1
             elif purpose is None:
                 left_out[GAP] += 1
             else:
-                by_purpose[purpose].append(candidate)
+                (by_purpose if scene in decisive else calm)[purpose].append(candidate)
         moments: list[Moment] = []
         for purpose, dealt in by_purpose.items():
             drawn = self._drawn(dealt)
             left_out[NOT_DRAWN] += len(dealt) - len(drawn)
+            spare = sorted(calm[purpose], key=lambda each: each.draw)
+            taken = [] if drawn else spare[: min(CALM, self.most or CALM)]
+            left_out[NO_CONFLICT] += len(spare) - len(taken)
+            drawn += taken
             moments += [structs.replace(each.moment, purpose=purpose) for each in drawn]
         counts = {reason: count for reason, count in sorted(left_out.items()) if count}
         return Choice(self.rule(sessions), tuple(moments), self.candidates, counts, sessions.shared)
@@ -210,7 +214,8 @@ class Chooser:
             "Who follows the other, driving in its direction over the place where it is now, is in "
             "no conflict, unless the ego follows so near and the other slows down by "
             f"{HARD_MPS2:g} m/s within a second. As many with such a conflict are drawn as "
-            f"without, by digest{most}. {dealt}"
+            f"without, by digest{most}; a purpose that has none with one takes up to {CALM} of "
+            f"scenes without any. {dealt}"
         )
 
     def _without(self, rows: Ints, falls: Bools, reason: str) -> Ints:
