@@ -18,7 +18,7 @@ from pathlib import Path
 from misbehaving import Asked, completion, serving
 
 
-def answer(asked: Asked) -> None:
+def answer(asked: Asked, prompt_tokens: int = 12) -> None:
     digest = hashlib.sha256(json.dumps(asked.body).encode()).digest()
     shares = [1 + byte for byte in digest[:3]]
     p = dict(
@@ -26,7 +26,9 @@ def answer(asked: Asked) -> None:
     )
     helper = {"evidence": "", "risk": "low"} if "evidence" in json.dumps(asked.body) else {}
     time.sleep(0.002)
-    asked.reply(completion(json.dumps({**helper, "action_distribution": p})))
+    reply = completion(json.dumps({**helper, "action_distribution": p}))
+    reply["usage"]["prompt_tokens"] = prompt_tokens
+    asked.reply(reply)
 
 
 @contextmanager

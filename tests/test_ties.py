@@ -203,6 +203,7 @@ def test_a_run_without_the_setting_took_the_first(
     old = run(spec, tmp_path / "old").out
     record = msgspec.json.decode((old / "run.json").read_bytes())
     assert record.pop("ties") == "first"
+    del record["digests"]  # which such runs have not
     (old / "run.json").write_bytes(msgspec.json.encode(record))
     assert read(old).manifest.settings.ties == "first"
     assert ReplayedRun(old).spec.ties == "first"

@@ -63,7 +63,8 @@ class Play:
         if self.refuses(asked):
             asked.reply({"error": {"message": WORDS}}, 404)
         else:
-            served.answer(asked)
+            # as many as such texts have: what times answers takes no fewer
+            served.answer(asked, prompt_tokens=len(json.dumps(asked.body)) // 4)
 
     def again(self, refuses: Callable[[Asked], bool] = lambda asked: False) -> None:
         """Forget what was asked, and refuse other questions from now on."""

@@ -8,7 +8,6 @@ import pytest
 from harness.core.resources import DATASET
 from harness.dataset.load import find, load
 from harness.world.parameters import DIALS, SCENES
-from harness.world.scenarios import get
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/scenarios.md").read_text()
@@ -16,12 +15,11 @@ SHIPPED = sorted(path.stem for path in (ROOT / "harness/world/scenarios").glob("
 
 
 @pytest.mark.parametrize("module", SHIPPED)
-def test_every_scenario_has_a_row_a_section_and_its_actions_on_the_page(module: str):
+def test_every_scenario_has_a_row_and_a_page_of_what_was_measured(module: str):
     name = module.replace("_", "-")
-    assert f"| [{name}](#{name}) |" in PAGE
-    heading = name.replace("-", " ").capitalize().replace("All way", "All-way")
-    assert f"\n## {heading}\n" in PAGE
-    assert all(f"`{action}`" in PAGE for action in get(name).actions)
+    assert f"| [{name}](#{name}) |" in PAGE or f"| `{name}` |" in PAGE
+    measured = (ROOT / f"benchmarks/measured/scenarios/{name}.md").read_text()
+    assert measured.startswith(f"# Scenario `{name}`: measured\n")
 
 
 def test_the_dials_that_the_page_names_are_those_of_every_scenario():
