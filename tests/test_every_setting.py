@@ -120,7 +120,10 @@ def answer(asked: Asked) -> None:
     helper = '"evidence":"","risk":"low",' if "evidence" in json.dumps(asked.body) else ""
     thinks = asked.body["chat_template_kwargs"]["enable_thinking"]
     said = f'{{{helper}"action_distribution":{p}}}'
-    asked.reply(completion(said, **({"reasoning_content": "Who comes?"} if thinks else {})))
+    reply = completion(said, **({"reasoning_content": "Who comes?"} if thinks else {}))
+    # as many as such texts have: what times answers takes no fewer
+    reply["usage"]["prompt_tokens"] = len(json.dumps(asked.body)) // 4
+    asked.reply(reply)
 
 
 def unusual(settings: Settings) -> Iterator[Option]:
