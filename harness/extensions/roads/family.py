@@ -1,6 +1,5 @@
 """The family `recording`: scenarios that are recordings, found in folders by their digest."""
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -8,17 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from harness.core.errors import UserError, printable
+from harness.extensions.roads.by_digest import DIGITS, ByDigest, Folders, digest_in
 
 if TYPE_CHECKING:
     from harness.extensions.roads.tables import Recording
     from harness.world.scenario import Scenario
 
 PREFIX, OPTION = "recording:", "recording"
-DIGITS = 12  # of a recording's digest, in its scenario's name
 FOLDERS = "SWARMDRIVE_RECORDINGS"  # environment variable: folders that may hold recordings
+_FOLDERS = Folders(FOLDERS)
 
 
-class Recordings:
+class Recordings(ByDigest):
     """Make scenarios of recordings, by names such as `recording:crossing@0123456789ab`.
 
     A name has the digest of the recording, so its content is the same wherever it lies. `options`
@@ -38,7 +38,7 @@ class Recordings:
         text, settings = self.split(typed[OPTION])
         folder = Path(text).absolute()
         recording = read(folder)
-        _remember(folder)
+        _FOLDERS.remember(folder)
         return self.joined(name_of(recording), [settings] if settings else [])
 
     def scenario(self, name: str) -> "Scenario":
@@ -46,33 +46,11 @@ class Recordings:
 
         return scenario(name)
 
-    def split(self, text: str) -> tuple[str, str | None]:
-        name, _, settings = text.rpartition(":")
-        return (name, settings) if "=" in settings else (text, None)
-
-    def joined(self, name: str, settings: Sequence[str]) -> str:
-        return ":".join([name, *([",".join(settings)] if settings else [])])
-
-    def allow(self, name: str) -> str | None:
-        return None  # a dataset has the recording of its scenario
-
     def kept_in(self, name: str, folder: Path) -> None:
         from harness.extensions.roads.tables import FACTS
 
         if (folder / FACTS).is_file():
-            _remember(folder.absolute(), is_first=True)  # what is beside a dataset is its own
-
-
-def _remember(folder: Path, is_first: bool = False) -> None:
-    """Look for recordings in a folder, too, here and in worker processes; in it first or last."""
-    folders = _folders()
-    if str(folder) not in folders:
-        folders.insert(0 if is_first else len(folders), str(folder))
-        os.environ[FOLDERS] = os.pathsep.join(folders)
-
-
-def _folders() -> list[str]:
-    return [folder for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
+            _FOLDERS.remember(folder.absolute(), is_first=True)  # what is beside a dataset
 
 
 _IN_MEMORY: dict[str, "Recording"] = {}
@@ -104,7 +82,7 @@ def recording_of(name: str) -> "Recording":
     """
     if name in _IN_MEMORY:
         return _IN_MEMORY[name]
-    return _recording(name.removeprefix(PREFIX), tuple(_folders()))
+    return _recording(name.removeprefix(PREFIX), _FOLDERS.listed)
 
 
 @lru_cache(maxsize=16)
@@ -112,8 +90,8 @@ def _recording(name: str, folders: Sequence[str]) -> "Recording":
     from harness.core.files import bytes_of, sha256_bytes
     from harness.extensions.roads.tables import FACTS
 
-    _, at, digest = name.partition("@")
-    for folder in folders if at and len(digest) == DIGITS else ():
+    digest = digest_in(name)
+    for folder in folders if digest else ():
         try:
             whole = sha256_bytes(bytes_of(Path(folder) / FACTS, "record"))
         except (OSError, ValueError):

@@ -5,7 +5,7 @@ makes another run from the layout's seed, which is the same up to that time, so 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, cast
 
@@ -14,7 +14,6 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Ints
 from harness.extensions.environments import place as environments
 from harness.extensions.environments.place import AFTER, LIMIT
-from harness.extensions.environments.world import EnvironmentScenario
 from harness.extensions.environments.world import scenario as scenario_of_environment
 from harness.extensions.roads import driver, simulation
 from harness.extensions.roads.draws import Drawn, drawn
@@ -31,8 +30,7 @@ from harness.extensions.roads.traffic import (
     Wall,
     sampled,
 )
-from harness.extensions.roads.world import RecordedWorld
-from harness.world.parameters import DIALS
+from harness.extensions.roads.world import RecordedScenario, RecordedWorld, described
 from harness.world.scenario import LAYOUTS_KEPT, Names, Scenario
 from harness.world.scene_graph import SceneGraph
 
@@ -344,14 +342,10 @@ class Layouts:
         return replace(scenario(self.name), names=Names(layout.moment.time_s, by_id))
 
 
-class FreshScenario(EnvironmentScenario):
+class FreshScenario(RecordedScenario):
     """Describe fresh traffic as a scenario; each layout is a run of SUMO, with its road."""
 
-    def __post_init__(self, start: Any) -> None:
-        super().__post_init__(start)
-        if self.layouts is not None:
-            layouts = Layouts(self.name, cast("Parameters", self.parameters))
-            object.__setattr__(self, "layouts", layouts)
+    by_seed = Layouts
 
 
 @lru_cache(maxsize=16)
@@ -361,21 +355,13 @@ def scenario(name: str) -> Scenario:
     Raises UserError if no folder that is known has the files, or SUMO is not installed.
     """
     simulation.version()
-    base = scenario_of_environment(name, FreshWorld)
-    values = {each.name: getattr(base.parameters, each.name) for each in fields(base.parameters)}
-    limit_s = (DECISIONS + LIMIT) * PERIOD_S
-    values |= {
-        "decisions": DECISIONS,
-        "time_limit_s": limit_s,
-        "delay_allowance_s": limit_s,
-        "braking_mps2": -LIMITS_MPS2[0],
-        "acceleration_mps2": LIMITS_MPS2[1],
-    }
-    parts = {each.name: getattr(base, each.name) for each in fields(Scenario)}
-    parts |= {
-        "description": f"Scenario {name}: fresh traffic of SUMO.\n",
-        "parameters": Parameters(**values),
-        "dials": (*DIALS, "warm_up_s", "decisions", "helpers", "time_limit_s", "delay_allowance_s"),
-        "source": f"simulated with SUMO {simulation.version()}",
-    }
-    return FreshScenario(**parts)
+    return described(
+        FreshScenario,
+        scenario_of_environment(name, FreshWorld),
+        Parameters,
+        DECISIONS,
+        PERIOD_S,
+        dial="warm_up_s",
+        description=f"Scenario {name}: fresh traffic of SUMO.\n",
+        source=f"simulated with SUMO {simulation.version()}",
+    )

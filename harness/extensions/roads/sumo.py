@@ -4,7 +4,6 @@ Their files are found by their digest: those that were typed, and those of a dat
 """
 
 import atexit
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -13,17 +12,18 @@ from tempfile import mkdtemp
 from typing import TYPE_CHECKING, ClassVar
 
 from harness.core.errors import UserError, printable
+from harness.extensions.roads.by_digest import DIGITS, ByDigest, Folders, digest_in
 
 if TYPE_CHECKING:
     from harness.extensions.roads.simulation import Inputs
     from harness.world.scenario import Scenario
 
 PREFIX, NET, ROUTES, BUILDINGS = "sumo:", "sumo", "routes", "buildings"
-DIGITS = 12  # of the files' digest, in their scenario's name
 FOLDERS = "SWARMDRIVE_SUMO"  # environment variable: folders that may hold such files
+_FOLDERS = Folders(FOLDERS)
 
 
-class FreshTraffic:
+class FreshTraffic(ByDigest):
     """Make scenarios of fresh traffic, by names such as `sumo:crossing@0123456789ab`.
 
     A name has the digest of the files, as SUMO is given them, so they are the same wherever they
@@ -53,7 +53,7 @@ class FreshTraffic:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         for name, content in inputs.files.items():
             (folder / name).write_bytes(content)
-        _remember(folder)
+        _FOLDERS.remember(folder)
         name = f"{PREFIX}{name_of(stem_of(net))}@{inputs.digest[:DIGITS]}"
         return self.joined(name, [settings] if settings else [])
 
@@ -62,32 +62,11 @@ class FreshTraffic:
 
         return scenario(name)
 
-    def split(self, text: str) -> tuple[str, str | None]:
-        name, _, settings = text.rpartition(":")
-        return (name, settings) if "=" in settings else (text, None)
-
-    def joined(self, name: str, settings: Sequence[str]) -> str:
-        return ":".join([name, *([",".join(settings)] if settings else [])])
-
-    def allow(self, name: str) -> str | None:
-        return None  # a dataset has the files of its scenario
-
     def kept_in(self, name: str, folder: Path) -> None:
         from harness.extensions.roads.simulation import NET_FILE
 
         if (folder / NET_FILE).is_file():
-            _remember(folder.absolute())
-
-
-def _remember(folder: Path) -> None:
-    """Look for files of SUMO in a folder, too, here and in worker processes."""
-    folders = _folders()
-    if str(folder) not in folders:
-        os.environ[FOLDERS] = os.pathsep.join([*folders, str(folder)])
-
-
-def _folders() -> list[str]:
-    return [folder for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
+            _FOLDERS.remember(folder.absolute())
 
 
 def inputs_named(name: str) -> "Inputs":
@@ -95,15 +74,15 @@ def inputs_named(name: str) -> "Inputs":
 
     Raises UserError where no such folder has those with the digest that the name has.
     """
-    return _inputs(name.removeprefix(PREFIX), tuple(_folders()))
+    return _inputs(name.removeprefix(PREFIX), _FOLDERS.listed)
 
 
 @lru_cache(maxsize=16)
 def _inputs(name: str, folders: Sequence[str]) -> "Inputs":
     from harness.extensions.roads.simulation import kept_inputs
 
-    _, at, digest = name.partition("@")
-    for folder in folders if at and len(digest) == DIGITS else ():
+    digest = digest_in(name)
+    for folder in folders if digest else ():
         try:
             inputs = kept_inputs(Path(folder))
         except UserError:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -153,15 +153,6 @@ class RecordedWorld(EnvironmentWorld):
         ego.to_go_m -= float(np.hypot(*(ego.position - before)))
 
 
-class RecordedScenario(EnvironmentScenario):
-    """Describe a recording as a scenario; each layout is a moment of it, with its road."""
-
-    def __post_init__(self, start: Any) -> None:
-        super().__post_init__(start)
-        if self.layouts is not None:
-            object.__setattr__(self, "layouts", Moments(self.name, self.parameters))
-
-
 @dataclass(frozen=True)
 class Moments:
     """Return, when called with a layout seed, the scenario whose place becomes that moment's.
@@ -181,6 +172,18 @@ class Moments:
             for number, track in enumerate(cast.tracks, 1)
         }
         return replace(scenario(self.name), names=Names(moment.time_s, by_id))
+
+
+class RecordedScenario(EnvironmentScenario):
+    """Describe a recording as a scenario; each layout is a moment of it, with its road."""
+
+    by_seed: ClassVar[type[Any]] = Moments  # returns the scenario of a layout, by its seed
+
+    def __post_init__(self, start: Any) -> None:
+        super().__post_init__(start)
+        if self.layouts is not None:
+            layouts = self.by_seed(self.name, self.parameters)
+            object.__setattr__(self, "layouts", layouts)
 
 
 @dataclass(frozen=True)
@@ -206,22 +209,52 @@ def scenario(name: str) -> Scenario:
     """
     recording = recording_of(name)
     facts = recording.facts
-    base = scenario_of_environment(name, RecordedWorld)
+    return described(
+        RecordedScenario,
+        scenario_of_environment(name, RecordedWorld),
+        Parameters,
+        facts.decisions,
+        facts.period_s,
+        dial="react",
+        description=f"Scenario {name}: moments of recorded traffic.\n",
+        source=recording.source,
+        licence=recording.licence,
+        cluster=Scenes(name),
+    )
+
+
+def described(
+    kind: type[RecordedScenario],
+    base: Scenario,
+    parameters: type[environments.Parameters],
+    decisions: int,
+    period_s: float,
+    dial: str,
+    **parts: Any,
+) -> Scenario:
+    """Return a scenario of an environment as one of traffic, whose goal may take to the end.
+
+    Args:
+        kind: the class of the scenario.
+        base: the scenario of the environment.
+        parameters: the class of its parameters, which has the ego's limits.
+        decisions: number of decisions of an episode, `period_s` apart.
+        period_s: seconds between two decisions.
+        dial: name of the parameter that users may set besides those of every environment.
+        parts: further fields of the scenario that are other than the environment's.
+    """
     values = {field.name: getattr(base.parameters, field.name) for field in fields(base.parameters)}
+    limit_s = (decisions + LIMIT) * period_s
     values |= {
-        "decisions": facts.decisions,
-        "time_limit_s": (facts.decisions + LIMIT) * facts.period_s,
-        "delay_allowance_s": (facts.decisions + LIMIT) * facts.period_s,
-        "braking_mps2": -LIMITS_MPS2[0],
-        "acceleration_mps2": LIMITS_MPS2[1],
+        "decisions": decisions,
+        "time_limit_s": limit_s,
+        "delay_allowance_s": limit_s,
+        "braking_mps2": parameters.braking_mps2,
+        "acceleration_mps2": parameters.acceleration_mps2,
     }
-    parts = {field.name: getattr(base, field.name) for field in fields(Scenario)}
-    parts |= {
-        "description": f"Scenario {name}: moments of recorded traffic.\n",
-        "parameters": Parameters(**values),
-        "dials": (*DIALS, "react", "decisions", "helpers", "time_limit_s", "delay_allowance_s"),
-        "source": recording.source,
-        "licence": recording.licence,
-        "cluster": Scenes(name),
+    of_base = {field.name: getattr(base, field.name) for field in fields(Scenario)}
+    of_base |= {
+        "parameters": parameters(**values),
+        "dials": (*DIALS, dial, "decisions", "helpers", "time_limit_s", "delay_allowance_s"),
     }
-    return RecordedScenario(**parts)
+    return kind(**(of_base | parts))

@@ -12,6 +12,7 @@ import pytest
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.extensions.roads import family, tables
+from harness.extensions.roads.by_digest import DIGITS
 from harness.extensions.roads.tables import Lane, Moment, Scene, Track
 
 Edit = Callable[[dict[str, Any]], object]
@@ -71,7 +72,7 @@ def test_what_a_recording_states_is_held(
     if edit := EDITS[words]:
         edit(facts)
     (tmp_path / "recording.json").write_text(json.dumps(facts))
-    digest = sha256_file(tmp_path / "recording.json")[: family.DIGITS]
+    digest = sha256_file(tmp_path / "recording.json")[:DIGITS]
     called = "other\x1b" if words.startswith("recording:") else "column"
     if not words:
         assert family.recording_of(f"recording:column@{digest}").name == "column"
