@@ -24,6 +24,7 @@ import msgspec
 from harness import __version__
 from harness.core import shards, work
 from harness.core.errors import UserError, in_range, printable
+from harness.core.figures import amount
 from harness.core.files import canonical_json, opened, replacing, sha256_bytes, write_whole
 from harness.core.formats import WORK
 from harness.core.parallel import Workers, each
@@ -363,7 +364,7 @@ def _keep_unreachable(scenario: Scenario, layouts: int, unreachable: bool) -> No
     of_name = printable(scenario.name, 80)
     other = f"declare another, as in {of_name}:goal=6s," if "goal" in scenario.dials else "mend it,"
     raise UserError(
-        f"no course of {layouts} layout{'s' if layouts > 1 else ''} of {of_name} reaches the goal "
+        f"no course of {amount(layouts, 'layout')} of {of_name} reaches the goal "
         f"({printable(scenario.prompt_words['task'])}); {other} or type --unreachable to keep it"
     )
 

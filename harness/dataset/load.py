@@ -308,12 +308,13 @@ class Dataset:
             lines = read_level(file, tree, step)
         except Damaged as damage:
             raise unusable(self.path, str(damage)) from None
+        scenario = self.scenario.at(tree.episode_seed)
         for place in places:
             name = tree.levels[step][place].scene
             if self.trusted or name in self._checked:  # the level's digest vouches for it
-                yield msgspec.json.decode(lines[place], type=plain_type(self.scenario))
+                yield msgspec.json.decode(lines[place], type=plain_type(scenario))
                 continue
-            record, problems = decoded(lines[place], self.manifest, name)
+            record, problems = decoded(scenario, lines[place], self.manifest, name)
             for problem in problems:
                 raise unusable(self.path, problem)
             if record:

@@ -126,9 +126,10 @@ def check(path: Path) -> list[str]:
     manifest, _ = read_manifest(path)
     problems, nodes = list(file_problems(path, manifest)), 0
     try:
+        scenario = scenario_of(manifest)
         with opened(path) as file:
             for episode in range(manifest.episodes):
-                tree_problems, points = _check_tree(file, manifest, episode)
+                tree_problems, points = _check_tree(scenario, file, manifest, episode)
                 problems += tree_problems
                 nodes += points
     except UserError as error:
@@ -138,14 +139,16 @@ def check(path: Path) -> list[str]:
     return problems
 
 
-def _check_tree(file: ZipFile, manifest: Manifest, episode: int) -> tuple[list[str], int]:
+def _check_tree(
+    scenario: Scenario, file: ZipFile, manifest: Manifest, episode: int
+) -> tuple[list[str], int]:
     """Return what is wrong with a tree and its scenes, and how many decision points it has."""
     try:
         tree = read_tree(file, manifest, episode)
-        problems = []
+        of_layout, problems = scenario.at(tree.episode_seed), list[str]()
         for step, level in enumerate(tree.levels):
             for line, point in zip(read_level(file, tree, step), level, strict=True):
-                problems += decoded(line, manifest, point.scene)[1]
+                problems += decoded(of_layout, line, manifest, point.scene)[1]
         return problems, sum(len(level) for level in tree.levels)
     except Damaged as error:
         return [str(error)], 0
@@ -315,17 +318,15 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
     return [problem for problem, holds in conditions.items() if not holds]
 
 
-def decoded(line: bytes, manifest: Manifest, name: str) -> tuple[Record | None, list[str]]:
+def decoded(
+    scenario: Scenario, line: bytes, manifest: Manifest, name: str
+) -> tuple[Record | None, list[str]]:
     """Decode a scene's JSON line; return the scene's record, and a line for each problem.
 
     The record is None if it cannot be decoded, and may be used only if there is no problem.
-    `manifest` is the dataset's, which the record must fit, and `name` is the scene id that it
-    should have.
+    `scenario` is the dataset's as the scene's layout has it (`Scenario.at`), `manifest` is the
+    dataset's, which the record must fit, and `name` is the scene id that it should have.
     """
-    whole, episode = scenarios.get(manifest.scenario), name.partition("-")[0]
-    if whole.has_own_world:  # its road may follow from its parameters
-        whole = scenario_of(manifest)
-    scenario = whole if whole.layouts is None else whole.at(manifest.seed + int(episode))
     kind, where = record_type(scenario), f"{LAYOUTS} scene {name}"
     try:
         record = msgspec.json.decode(line, type=kind)
