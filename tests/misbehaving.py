@@ -114,6 +114,11 @@ def pieces(
     return [*made, b"data: [DONE]\n\n"]
 
 
+def tokens_of(asked: Asked) -> int:
+    """As many tokens as a question of this length may have; what times answers takes no fewer."""
+    return len(json.dumps(asked.body)) // 4
+
+
 def completion(
     content: Any = "hello", finish_reason: str = "stop", **message: Any
 ) -> dict[str, Any]:

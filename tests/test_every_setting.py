@@ -14,7 +14,7 @@ import msgspec
 import pytest
 from another_program import Line, answered, write
 from evaluating import A_TENTH, same_decisions, spec_of
-from misbehaving import Asked, completion, serving
+from misbehaving import Asked, completion, serving, tokens_of
 from msgspec import structs
 
 from harness.core.errors import UserError
@@ -121,8 +121,7 @@ def answer(asked: Asked) -> None:
     thinks = asked.body["chat_template_kwargs"]["enable_thinking"]
     said = f'{{{helper}"action_distribution":{p}}}'
     reply = completion(said, **({"reasoning_content": "Who comes?"} if thinks else {}))
-    # as many as such texts have: what times answers takes no fewer
-    reply["usage"]["prompt_tokens"] = len(json.dumps(asked.body)) // 4
+    reply["usage"]["prompt_tokens"] = tokens_of(asked)
     asked.reply(reply)
 
 

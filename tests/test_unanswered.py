@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import pytest
 import served
-from misbehaving import Asked, Server, completion, serving
+from misbehaving import Asked, Server, completion, serving, tokens_of
 from run_on_disk import Row, answers_of, made_up
 from tiers import some
 
@@ -63,8 +63,7 @@ class Play:
         if self.refuses(asked):
             asked.reply({"error": {"message": WORDS}}, 404)
         else:
-            # as many as such texts have: what times answers takes no fewer
-            served.answer(asked, prompt_tokens=len(json.dumps(asked.body)) // 4)
+            served.answer(asked, prompt_tokens=tokens_of(asked))
 
     def again(self, refuses: Callable[[Asked], bool] = lambda asked: False) -> None:
         """Forget what was asked, and refuse other questions from now on."""
