@@ -18,6 +18,7 @@ import math
 import numpy as np
 
 from harness.core.arrays import Floats
+from harness.core.quantiles import student_quantile
 from harness.core.statistics import LEVEL, ROUNDING, Estimate
 
 LEAST = 30  # layouts with a value: of fewer, intervals hold the truth too seldom
@@ -49,8 +50,6 @@ def corrected(
         least: the least that a value can be, such as 0 for a share, -1 for a difference of shares.
         level: the level of confidence of the interval of `plain`, from 0 to 1.
     """
-    from harness.core.special import stdtrit
-
     n, deviations = len(values), values - values.mean()
     squares, centred = float(deviations @ deviations), variables - variables.mean(axis=0)
     left_axes, lengths, axes = np.linalg.svd(centred, full_matrices=False)
@@ -63,7 +62,7 @@ def corrected(
     left = max(squares - float(along @ along), 0.0) / freedom
     error = left * (1 / n + float(np.sum(ahead.mean(axis=1) ** 2)))
     error += float((along @ ahead).var(ddof=1)) / len(pool)
-    t, plain_t = stdtrit(np.array([freedom, n - 1]), 0.5 + level / 2).tolist()
+    t, plain_t = (student_quantile(each, 0.5 + level / 2) for each in (freedom, n - 1))
     nearer = t / plain_t * math.sqrt(error / (squares / (n - 1) / n))
     nearer = max(nearer, 2 * t * math.sqrt(error) / (plain.high - plain.low))
     value = min(max(plain.value + float(along @ ahead.mean(axis=1)), least), 1.0)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from harness.core.quantiles import normal_quantile, normal_share, root
 from harness.core.statistics import Estimate
 
 LEVEL = 0.05  # the chance of a false alarm among all comparisons that are shown together
@@ -35,9 +36,7 @@ def p_value(interval: Callable[[float], Estimate]) -> float | None:
         return 1.0
     if reach(surest) >= 0:
         return LEAST
-    from scipy.optimize import brentq
-
-    return math.exp(brentq(reach, surest, least_sure, xtol=1e-9))
+    return math.exp(root(reach, surest, least_sure, 1e-9))
 
 
 def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
@@ -47,14 +46,12 @@ def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
     0 is treated as that of a normal distribution (Altman and Bland 2011, doi:10.1136/bmj.d2304),
     since resamples are too few to invert the interval. None without an interval.
     """
-    from harness.core.special import ndtr, ndtri
-
     if math.isnan(low) or math.isnan(high):
         return None
     half = value - low if value > 0 else high - value
     if half <= 0:  # without spread on that side, only whether 0 is excluded is known
         return LEVEL if value else 1.0
-    return float(2 * ndtr(-abs(value) / half * ndtri(0.975)))
+    return float(2 * normal_share(-abs(value) / half * normal_quantile(0.975)))
 
 
 def holm(p_values: Sequence[float], comparisons: int | None = None) -> list[float]:

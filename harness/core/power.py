@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
+from harness.core.quantiles import normal_quantile
 from harness.core.statistics import ALIKE, FEW, LEVEL
 
 UNKNOWN = 1e12  # stands for a variance that is not known
@@ -71,8 +72,6 @@ class Spread:
         gained: pilots that agree do not say that fewer layouts are enough. Over several seeds this
         is more than it must be.
         """
-        from harness.core.special import ndtri
-
         least = (difference * (1 - difference))[..., None]
         varies = np.minimum(np.maximum(self.variances, least), UNKNOWN)
         of_part = n[..., None] * self.shares
@@ -87,7 +86,8 @@ class Spread:
         usual = np.sum(differing * weights**2, axis=-1) / many
         added = 2 * (usual + (weights.max(axis=-1) ** 2 - usual) * np.exp(-many / FEW))
         assumed = np.sum(weights**2 * of_part * mixed, axis=-1) + added
-        return np.asarray(ndtri(0.5 + LEVEL / 2) * np.sqrt(assumed) + ndtri(power) * np.sqrt(error))
+        beyond = normal_quantile(0.5 + LEVEL / 2) * np.sqrt(assumed)
+        return np.asarray(beyond + normal_quantile(power) * np.sqrt(error))
 
 
 def variance(values: Floats, counts: Ints) -> Floats:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.quantiles import normal_quantile, student_quantile
 
 LEVEL = 0.95  # of confidence
 LEAST_MASS = 1e-4  # least probability that is counted of safe actions
@@ -191,8 +192,6 @@ def seed_rate_interval(values: Floats) -> Estimate:
     Bonett and Price 2012 do with pairs), since seeds that were not drawn may differ. n is the
     number of seeds; with one seed the ends are NaN.
     """
-    from harness.core.special import stdtrit
-
     means = known_mean(values, axis=1)
     value, counted = float(known_mean(means, axis=0)), int((~np.isnan(means)).sum())
     is_known = ~np.isnan(values)
@@ -201,7 +200,7 @@ def seed_rate_interval(values: Floats) -> Estimate:
         return Estimate(value, math.nan, math.nan, counted, len(means) - counted)
     within = float(np.nansum((values - known_mean(values, axis=0)) ** 2)) / freedom
     n = int(is_known.sum())
-    half = float(stdtrit(freedom, 0.5 + LEVEL / 2)) * math.sqrt(n * within + 2) / n
+    half = student_quantile(freedom, 0.5 + LEVEL / 2) * math.sqrt(n * within + 2) / n
     return Estimate(
         value, max(value - half, -1.0), min(value + half, 1.0), counted, len(means) - counted
     )
@@ -413,8 +412,6 @@ def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float = LEVE
     from 0 to 1 vary more than yes or no. `totals` are each episode's sum of deviations from the
     rate, and `sizes` the number of its values, (C,).
     """
-    from harness.core.special import stdtrit
-
     clusters, n = len(totals), float(sizes.sum())
     least = n**2 / float(np.sum(sizes**2))
     squares, fourths = float(np.sum(totals**2)), float(np.sum(totals**4))
@@ -423,7 +420,7 @@ def _effective_n(rate: float, totals: Floats, sizes: Floats, level: float = LEVE
     variance = clusters / (clusters - 1) * squares / n**2
     uneven = fourths - squares**2 / clusters
     freedom = 2 * squares**2 / uneven if uneven > 0 else math.inf
-    t = float(stdtrit(min(max(freedom, 1.0), clusters - 1.0), 0.5 + level / 2))
+    t = student_quantile(min(max(freedom, 1.0), clusters - 1.0), 0.5 + level / 2)
     return max(rate * (1 - rate) / variance * (_normal(level) / t) ** 2, least)
 
 
@@ -435,8 +432,6 @@ def _clusters(values: Floats, episodes: Ints | None) -> tuple[Floats, Floats]:
 
 
 def _student(values: Floats, episodes: Ints, level: float = LEVEL) -> Estimate:
-    from harness.core.special import stdtrit
-
     is_known = ~np.isnan(values)
     n, n_excluded = int(is_known.sum()), int((~is_known).sum())
     if n == 0:
@@ -447,11 +442,9 @@ def _student(values: Floats, episodes: Ints, level: float = LEVEL) -> Estimate:
     if clusters < 2 or squares < ROUNDING * max(mean**2, 1.0):
         return Estimate(mean, math.nan, math.nan, n, n_excluded)
     error = math.sqrt(clusters / (clusters - 1) * squares) / n
-    half = float(stdtrit(clusters - 1, 0.5 + level / 2)) * error
+    half = student_quantile(clusters - 1, 0.5 + level / 2) * error
     return Estimate(mean, mean - half, mean + half, n, n_excluded)
 
 
 def _normal(level: float) -> float:
-    from harness.core.special import ndtri
-
-    return float(ndtri(0.5 + level / 2))
+    return float(normal_quantile(0.5 + level / 2))

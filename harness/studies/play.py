@@ -10,6 +10,7 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Floats, Ints
 from harness.core.plugins import Shipped
+from harness.core.quantiles import student_quantile
 from harness.core.statistics import Estimate, known_mean, seed_interval
 from harness.evaluate.table import columns
 from harness.evaluate.walk import Ask, Decided, World, walk
@@ -308,9 +309,8 @@ def over_own_episodes(name: str, values: Floats) -> Estimate:
     estimate = seed_interval(known_mean(values, axis=1))
     if name not in ENDS or estimate.n < 2:
         return in_range(name, estimate)
-    from harness.core.special import stdtrit
-
-    least = float(stdtrit(estimate.n - 1, 0.975)) * 0.5 / values.shape[1] / math.sqrt(estimate.n)
+    quantile = student_quantile(estimate.n - 1, 0.975)
+    least = quantile * 0.5 / values.shape[1] / math.sqrt(estimate.n)
     half = float(np.fmax(estimate.high - estimate.value, least))  # no interval where all agree
     return in_range(name, replace(estimate, low=estimate.value - half, high=estimate.value + half))
 

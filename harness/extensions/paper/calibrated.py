@@ -28,6 +28,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints, any_of
+from harness.core.quantiles import normal_quantile, normal_share
 from harness.evaluate.walk import Decided, Due
 from harness.radio.channel import Draws
 from harness.studies.axes import Setting
@@ -377,10 +378,8 @@ def spread(mean: float, sd: float, uniforms: Floats) -> Floats:
     `uniforms` are draws in [0, 1), `(...)`, as is the result. The distribution is cut at `CUT`
     standard deviations on either side.
     """
-    from harness.core.special import ndtr, ndtri
-
-    below = ndtr(-CUT)
-    return np.asarray(mean + sd * ndtri(below + (1 - 2 * below) * uniforms))
+    below = normal_share(-CUT)
+    return np.asarray(mean + sd * normal_quantile(below + (1 - 2 * below) * uniforms))
 
 
 # beside runs in a sweep; a seed has as many episodes as in the paper's sweeps

@@ -9,6 +9,7 @@ where `share` is the part of the dangers that helpers watch.
 
 import numpy as np
 
+from harness.core.quantiles import normal_quantile
 from harness.extensions.paper.calibrated import CUT, FITTED_ON, Parameters
 from harness.radio.constant import density_coupled_loss
 from harness.studies.paper_numbers import paper_numbers
@@ -20,8 +21,6 @@ def fit() -> Parameters:
     They follow in closed form from results of the SwarmDrive paper, the rows of `paper_numbers.csv`
     that `FITTED_ON` names; KeyError if one of these is missing.
     """
-    from harness.core.special import ndtri
-
     paper = {row["id"]: row for row in paper_numbers()}
     value = {
         key: float(row["paper_value"]) / 100 for key, row in paper.items() if row["paper_value"]
@@ -31,7 +30,7 @@ def fit() -> Parameters:
     left = (value["B2"] - guess) / ((know - guess) * heard_of_two)
     both = (value["B3"] - guess) / ((know - guess) * heard_of_three)
     # Of the ego's decisions 67.6 % are above 0.8 nats, and all are above 0.7.
-    above = float(ndtri(value["B18"]))
+    above = float(normal_quantile(value["B18"]))
     sd = (0.8 - 0.7) / (CUT - above)
     # Below 0.65 the paper's success is that of two to three more rounds on the channel: the two
     # helpers that see no danger ask at every threshold below, the witness at low ones only. Where

@@ -19,7 +19,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.files import text_of
-from harness.core.special import expit
+from harness.core.quantiles import logistic
 
 # Maps SINR in dB to the probability that a block is lost, of the same shape.
 BlockError = Callable[[Floats], Floats]
@@ -44,7 +44,7 @@ def block_error(curve: str) -> BlockError:
         names = sorted({row["curve"] for row in _rows("block_error_points.csv")} | set(fits))
         raise UserError(f"block error curve {curve!r} is unknown: use one of {', '.join(names)}")
     middle, slope = (float(fits[curve][key]) for key in ("midpoint_db", "slope_per_db"))
-    return lambda sinr_db: expit(slope * (middle - sinr_db))
+    return lambda sinr_db: logistic(slope * (middle - sinr_db))
 
 
 def threshold(bits_per_s_per_hz: float, efficiency: float) -> BlockError:

@@ -36,7 +36,7 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import between
 from harness.core.errors import UserError
-from harness.core.special import ndtr, ndtri
+from harness.core.quantiles import normal_quantile, normal_share
 from harness.extensions.radio import back_off
 from harness.extensions.radio.back_off import SLOT_S, free_share
 from harness.extensions.radio.block_error import block_error
@@ -178,7 +178,7 @@ class ItsG5(Transceiver):
         `sight` (what stands between, such as `CLEAR`) also over clear and blocked links by the
         environment's shares.
         """
-        shadow = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
+        shadow = normal_quantile((np.arange(QUANTILES) + 0.5) / QUANTILES)
         distance_m = np.asarray(distance_m, dtype=float)[:, None]
 
         def received(sight: Ints | int) -> Floats:
@@ -232,7 +232,7 @@ def _shannon_db(rate_mbps: float) -> float:
 def _sensed(radio: ItsG5, distance_m: Floats) -> Floats:
     """Return the probability (13) that vehicles at these distances sense each other's packets."""
     mean_dbm = radio.received_dbm(radio.path_loss_db(distance_m))
-    return np.asarray(ndtr((mean_dbm - radio.sensing_dbm) / radio.shadowing_db()))
+    return np.asarray(normal_share((mean_dbm - radio.sensing_dbm) / radio.shadowing_db()))
 
 
 @lru_cache(maxsize=64)

@@ -13,7 +13,7 @@ import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.config import between
-from harness.core.special import ndtr
+from harness.core.quantiles import normal_share
 from harness.radio.channel import CLEAR, VEHICLE
 
 Environment = Literal["winner-b1", "tr37885-highway", "tr37885-urban"]
@@ -209,7 +209,7 @@ class Propagation:
 def _clipped(mean: float, deviation: float) -> tuple[float, float]:
     """Return mean and standard deviation of max(0, X) for a normal X."""
     z = mean / deviation
-    above, at = float(ndtr(z)), math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
+    above, at = float(normal_share(z)), math.exp(-z * z / 2) / math.sqrt(2 * math.pi)
     first = mean * above + deviation * at
     return first, math.sqrt((mean**2 + deviation**2) * above + mean * deviation * at - first**2)
 

@@ -21,7 +21,7 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import between
 from harness.core.errors import UserError
-from harness.core.special import ndtr
+from harness.core.quantiles import normal_share
 from harness.extensions.radio.block_error import BlockError
 from harness.extensions.radio.sps import Scheduling
 from harness.extensions.radio.transceiver import STEP_DB, STEP_M, Transceiver
@@ -202,7 +202,7 @@ class Sidelink(Transceiver):
         """Return the share of packets from these distances that are above a threshold (11)."""
         states = self._states(distance_m, None)
         return np.asarray(
-            sum(share * ndtr((mean - threshold_dbm) / sd) for share, mean, sd in states)
+            sum(share * normal_share((mean - threshold_dbm) / sd) for share, mean, sd in states)
         )
 
     def _shares(self, distance_m: Floats, sight: Ints | int | None) -> Floats:
@@ -212,8 +212,10 @@ class Sidelink(Transceiver):
         edges = self.sensing_dbm + STEP_DB * np.arange(CELLS + 1)
         edges[-1] = np.inf
         states = self._states(distance_m, sight)
-        below = [share[:, None] * ndtr((edges - mean[:, None]) / sd) for share, mean, sd in states]
-        return np.diff(np.sum(below, axis=0), axis=-1)
+        below = np.zeros((len(distance_m), CELLS + 1))
+        for share, mean, sd in states:
+            below += share[:, None] * normal_share((edges - mean[:, None]) / sd)
+        return np.diff(below, axis=-1)
 
 
 _DISTANCE_M: Floats = np.arange(0.0, FURTHEST_M + STEP_M, STEP_M)

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 
 from harness.core.arrays import Floats
 
@@ -86,8 +85,9 @@ class Scheduling:
         """
         sensed = self.sensed(METRES, self.threshold_dbm)
         size = 2 * sensed.size - 1
-        length = next_fast_len(size, real=True)
-        both_ways = irfft(rfft(sensed, length) * rfft(sensed[::-1], length), length)
+        length = 1 << size.bit_length()  # of which a transform is fast
+        forth, back = np.fft.rfft(sensed, length), np.fft.rfft(sensed[::-1], length)
+        both_ways = np.fft.irfft(forth * back, length)
         overlap = both_ways[2 * REACH_M : size]  # (30.2), by metre from 0 on
         by_chance = taken**2 / self.resources
         # In (30) the density cancels: beta / Spsr is 1 / the sum of `sensed`.

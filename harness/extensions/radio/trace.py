@@ -21,6 +21,7 @@ from harness.core.arrays import Floats, Ints
 from harness.core.config import Seconds, convert
 from harness.core.errors import UserError, printable
 from harness.core.files import sha256_file
+from harness.core.quantiles import normal_quantile
 from harness.extensions.radio.tables import DISTANCE_M, RECEPTION, number_of, refuse_ragged, rows_of
 from harness.radio.channel import (
     BUILDING,
@@ -122,10 +123,9 @@ class Trace:
     def latencies_s(self, site: Site, draws: Draws, way: Way) -> Floats:
         if not self.spread:
             return self._at(site.distance_m, site.sight, "p50_s")
-        from harness.core.special import ndtri
-
         p50_s, p95_s = self.percentiles_s(site.distance_m, site.sight)
-        return np.asarray(p50_s * (p95_s / p50_s) ** (ndtri(draws.latency[..., way]) / ndtri(P95)))
+        slower = normal_quantile(draws.latency[..., way]) / normal_quantile(P95)
+        return np.asarray(p50_s * (p95_s / p50_s) ** slower)
 
     @property
     def spread(self) -> bool:

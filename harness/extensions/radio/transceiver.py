@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, Ints
 from harness.core.config import between, check
 from harness.core.errors import UserError
 from harness.extensions.radio.propagation import Propagation
@@ -128,10 +128,20 @@ class Transceiver(Propagation, Physical):
         """Interpolate a table `(D, P)` whose first column is `first_db` above the sensing
         threshold.
         """
-        from scipy.ndimage import map_coordinates
+        row, down = _place(distance_m / STEP_M, table.shape[0])
+        step = (power_dbm - self.sensing_dbm - first_db) / STEP_DB
+        column, along = _place(step, table.shape[1])
+        here, below = table[row, column], table[row + 1, column]
+        beside, across = table[row, column + 1], table[row + 1, column + 1]
+        left, right = here + down * (below - here), beside + down * (across - beside)
+        return np.asarray(left + along * (right - left))
 
-        at = np.broadcast_arrays(
-            distance_m / STEP_M, (power_dbm - self.sensing_dbm - first_db) / STEP_DB
-        )
-        # An absent helper has NaN coordinates, but the table must be read somewhere.
-        return map_coordinates(table, np.nan_to_num(at), order=1, mode="nearest")
+
+def _place(at: Floats, n: int) -> tuple[Ints, Floats]:
+    """Return between which of n places some numbers lie, as the first of the two and the share.
+
+    Beyond the ends they are at these. An absent helper's are NaN, and read somewhere.
+    """
+    within = np.clip(np.nan_to_num(at), 0, n - 1)
+    first = np.minimum(within.astype(int), n - 2)
+    return first, within - first

@@ -21,6 +21,7 @@ import shapely
 from msgspec import structs
 
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.extras import need
 from harness.core.seeds import FIRST
 from harness.extensions.roads.sessions import APART, FEW, SHARED, Sessions, Traffic
 from harness.extensions.roads.tables import STILL_M, Moment, Scene, Track
@@ -361,6 +362,7 @@ def _encroachments(frames: _Frames, gap: int) -> Pairs:
     The key is the first and the second track. The value is each frame at which the first was there,
     rising, and the earliest frame at which the second is where the first was then or later.
     """
+    need("recorded traffic", "scipy")
     from scipy.spatial import KDTree
 
     order = np.argsort(frames.frame, kind="stable")

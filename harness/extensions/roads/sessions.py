@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
+from harness.core.extras import need
 from harness.core.seeds import FIRST, Purpose
 from harness.extensions.roads.tables import Scene, Track
 
@@ -133,6 +134,7 @@ class Sessions:
 
 def _firsts(places: Sequence[Ints]) -> Iterable[int]:
     """Return for each of n scenes the first that it shares traffic with, itself or by others."""
+    need("recorded traffic", "scipy")
     from scipy.sparse import csgraph, csr_array
 
     counts = np.array([len(each) for each in places])

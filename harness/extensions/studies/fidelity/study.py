@@ -113,8 +113,6 @@ def fidelity(runs: Sequence[Path]) -> Fidelity:
 
 
 def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
-    from scipy.stats import spearmanr
-
     distinct = rows.drop_duplicates([*WHO, "frozen", "closed"])
     if (
         len(distinct) < LEAST_RANKED
@@ -122,7 +120,8 @@ def _rank(rows: "pd.DataFrame") -> tuple[float, int]:
         or distinct.closed.nunique() == 1
     ):
         return np.nan, len(distinct)
-    return float(spearmanr(distinct.frozen, distinct.closed).statistic), len(distinct)
+    ranks = distinct[["frozen", "closed"]].rank()
+    return float(ranks.frozen.corr(ranks.closed)), len(distinct)
 
 
 def _refuse_unlike(frozen: Run, driven: Run) -> None:
