@@ -6,7 +6,6 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
-import former
 import pytest
 
 from harness.core import resources
@@ -59,7 +58,7 @@ def test_a_shipped_prompt_is_released(version: str) -> None:
     assert prompts.load(version).released
 
 
-def test_a_wheel_holds_the_newest_of_each_family_and_the_former_default() -> None:
+def test_a_wheel_holds_the_newest_of_each_family() -> None:
     wheel = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["build"][
         "targets"
     ]["wheel"]
@@ -68,7 +67,7 @@ def test_a_wheel_holds_the_newest_of_each_family_and_the_former_default() -> Non
     }
     suite = suites.named("suite:v2v-safety-2")
     assert suite
-    assert held & {*DATASETS} == {*suite.datasets, former.DATASET}
+    assert held & {*DATASETS} == {*suite.datasets}
 
 
 def test_a_released_dataset_that_an_installation_lacks_is_one_line(
