@@ -203,7 +203,8 @@ class Cast:
         first = touch[np.flatnonzero(np.diff(pair, prepend=-1))]
         before = np.maximum(first - 1, 0)
         free = (at[before] == at[first] - 1) & (whom[before] == whom[first]) & (first > 0)
-        past = np.where(free, apart_m[first] / (apart_m[first] - apart_m[before]), 0.0)
+        past = np.zeros(len(first))
+        np.divide(apart_m[first], apart_m[first] - apart_m[before], out=past, where=free)
         steps = paths.arc_m[at[first]] - paths.arc_m[at[before]]
         gaps = paths.arc_m[at[first]] - past * steps - arc_m[owners[first]]
         turned = there[kept][first, 2] - places[kept][first, 2]

@@ -178,6 +178,14 @@ def test_who_crosses_stops_for_an_ego_that_stands_on_its_path(folder: Path) -> N
     assert ends[True][1] < 3.0
 
 
+def test_who_stands_on_the_first_place_of_a_path_is_met_at_once() -> None:
+    poses = np.array([[[10.0 * n, 0, 0, 10] for n in range(3)], [[2.0, 0, 0, 0]] * 3])
+    cars = (track("e", lambda _: (0, 0, 0, 0)), track("o", lambda _: (2, 0, 0, 0)))
+    cast = Cast(1, cars, poses, np.zeros(2, dtype=int), np.full(2, 2))
+    n, k, gaps, along = cast.contacts(np.array([0]), np.array([1]), np.zeros(2), poses[:, 0])
+    assert [n.tolist(), k.tolist(), gaps.tolist(), along.tolist()] == [[0], [1], [0.0], [1.0]]
+
+
 def test_who_was_late_catches_up_and_is_the_recording_again(folder: Path) -> None:
     play = Play.start(cast_of(folder), True)
     cast = play.cast
