@@ -11,43 +11,36 @@ from harness.core.progress import Progress
 from harness.core.seeds import FIRST
 from harness.extensions.roads.driver import NAME
 from harness.extensions.roads.family import in_memory
-from harness.extensions.roads.moments import NOT_REACHED, Choice, choose
+from harness.extensions.roads.moments import NOT_REACHED, Choice, Chooser, Key, key_of
 from harness.extensions.roads.tables import Moment, Recording, Scene
 from harness.extensions.roads.world import scenario
 from harness.world.reference import drive
-
-Key = tuple[str, str, float]  # scene, vehicle and time of a moment
 
 
 def choose_fit(
     recording: Recording, scenes: Iterable[Scene], horizon_s: float, progress: Progress
 ) -> Choice:
-    """Return the moments of a recording that `choose` takes and its recorded driver masters.
+    """Return the moments of a recording that are chosen and its recorded driver masters.
 
     Of those chosen, each is driven; without those at which the driver fails, it is chosen again,
     until it fails at none. `scenes` are the recording's, read once, and `horizon_s` is the time
     that an episode needs. The recording has the window, the target speeds and the period.
     `progress` is told of each moment that is driven.
     """
-    failed: set[Key] = set()
+    chooser = Chooser(recording.window_m, horizon_s)
+    for scene in scenes:
+        chooser.look(scene)
     passed: set[Key] = set()
-
-    def unfit(scene: Scene, moment: Moment) -> str | None:
-        return NOT_REACHED if _key(moment) in failed else None
-
-    choice = choose(scenes, recording.window_m, horizon_s, unfit=unfit)
-    while rest := [moment for moment in choice.moments if _key(moment) not in passed]:
+    choice = chooser.choice()
+    while rest := [moment for moment in choice.moments if key_of(moment) not in passed]:
         progress.more(len(rest))
-        for moment in sorted(rest, key=_key):  # those of one scene together
-            (passed if is_mastered(recording, moment) else failed).add(_key(moment))
+        failed: set[Key] = set()
+        for moment in sorted(rest, key=key_of):  # those of one scene together
+            (passed if is_mastered(recording, moment) else failed).add(key_of(moment))
             progress(1)
-        if any(_key(moment) in failed for moment in rest):
-            choice = choose(recording.scenes(), recording.window_m, horizon_s, unfit=unfit)
+        chooser.drop(failed, NOT_REACHED)
+        choice = chooser.choice()
     return choice
-
-
-def _key(moment: Moment) -> Key:
-    return moment.scene, moment.vehicle, moment.time_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +58,7 @@ def is_mastered(recording: Recording, moment: Moment) -> bool:
     """Return whether the recorded driver reaches the goal at a moment, unhurt and in time."""
     first = structs.replace(moment, purpose="tune")
     facts = structs.replace(recording.facts, moments=(first,))
-    digest = sha256_bytes(canonical_json([recording.digest, *_key(moment)]).encode())
+    digest = sha256_bytes(canonical_json([recording.digest, *key_of(moment)]).encode())
     alone = OneMoment(recording.folder, digest, facts, whole=recording)
     with in_memory(alone) as name:
         try:

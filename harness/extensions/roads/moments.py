@@ -11,7 +11,7 @@ A conflict is an encroachment with a post-encroachment time of at most `SHORT_PE
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -21,7 +21,6 @@ import shapely
 from msgspec import structs
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.core.extras import need
 from harness.core.seeds import FIRST
 from harness.extensions.roads.sessions import APART, FEW, SHARED, Sessions, Traffic
 from harness.extensions.roads.tables import STILL_M, Moment, Scene, Track
@@ -32,12 +31,15 @@ EGOS = ("car", "van", "truck", "motorcycle")  # kinds that may be the ego
 OPAQUE = ("car", "van", "truck")  # kinds that nobody sees through
 EVERY_S = 1.0  # from one candidate of a vehicle to the next
 APART_S = 5.0  # least time from one moment of a vehicle to the next
+AROUND_S = np.arange(1 - APART_S, APART_S, EVERY_S).tolist()  # of times that are nearer
 HARD_MPS2 = 4.0  # mean deceleration over a second that is hard braking, as metrics have it
 ALIKE_RAD = math.pi / 4  # headings that differ by less are of one direction
 CALM = 20  # most moments of a purpose in which nobody hidden comes into conflict
 EVERY = round(EVERY_S * MOMENTS_HZ)  # frames from one candidate to the next
 NEVER = np.iinfo(np.int64).max  # a frame that does not come
-BLOCK = 600  # frames whose encroachments are looked for at once
+LAYERS = 64  # stretches of time in which those who come near each other are looked for at once
+STRETCHES = 2000  # pairs of road users whose places are compared at once, all of a stretch
+LOOSE_M = 0.001  # more than the places of stretches are rounded off by
 TRIPLES = 4000  # pairs of road users whose paths are compared at once
 
 LIGHTS = "its scene has a traffic light"
@@ -46,12 +48,18 @@ LEAVES = "it leaves the recording within the horizon"
 OFF_LANE = "it is on no lane"
 NEAR = "another moment of it is too near in time"
 GAP = "it is in a gap between two purposes"
-NOT_REACHED = "its recorded driver does not reach the goal"  # of a function that looks for it
+NOT_REACHED = "its recorded driver does not reach the goal"  # of who looks for it, and drops it
 TWICE = "its scene is there twice"
 NO_CONFLICT = "no moment of its scene is decisive"
 NOT_DRAWN = "it was not drawn"
 
-Unfit = Callable[[Scene, Moment], str | None]
+
+Key = tuple[str, str, float]  # scene, vehicle and time of a moment
+
+
+def key_of(moment: Moment) -> Key:
+    """Return what tells a moment from all others of a recording."""
+    return moment.scene, moment.vehicle, moment.time_s
 
 
 @dataclass(frozen=True)
@@ -75,21 +83,6 @@ class Choice:
         return {"rule": self.rule, **counts, "shared": self.shared}
 
 
-def choose(
-    scenes: Iterable[Scene],
-    window_m: float,
-    horizon_s: float,
-    gap_s: float = SHORT_PET_S,
-    unfit: Unfit | None = None,
-    most: int | None = None,
-) -> Choice:
-    """Return the moments of some scenes at which episodes begin; see `Chooser`."""
-    chooser = Chooser(window_m, horizon_s, gap_s, unfit, most)
-    for scene in scenes:
-        chooser.look(scene)
-    return chooser.choice()
-
-
 @dataclass(frozen=True)
 class _Fit:
     """A candidate that is left after all that its own scene says."""
@@ -107,15 +100,12 @@ class Chooser:
         window_m: radius around the ego in which others count, m.
         horizon_s: length of an episode, s.
         gap_s: greatest post-encroachment time of a conflict, s.
-        unfit: returns a reason, such as `NOT_REACHED`, why a moment of a scene is none, else None.
-            It is asked about candidates that nothing else speaks against.
         most: how many moments of a purpose are chosen; None for all that can be.
     """
 
     window_m: float
     horizon_s: float
     gap_s: float = SHORT_PET_S
-    unfit: Unfit | None = None
     most: int | None = None
     candidates: int = 0
     left_out: Counter[str] = field(default_factory=Counter)
@@ -147,12 +137,13 @@ class Chooser:
             )
             draw = _digest(scene.sha256, who, f"{moment.time_s:.3f}")
             fit.append(_Fit(draw, scene.name, moment))
-        for candidate in self._apart(fit):
-            reason = self.unfit and self.unfit(scene, candidate.moment)
-            if reason:
-                self.left_out[reason] += 1
-            else:
-                self._fit.append(candidate)
+        self._fit += self._apart(fit)
+
+    def drop(self, keys: Container[Key], reason: str) -> None:
+        """Leave out, for a reason, moments that nothing else speaks against, by their keys."""
+        kept = [each for each in self._fit if key_of(each.moment) not in keys]
+        self.left_out[reason] += len(self._fit) - len(kept)
+        self._fit = kept
 
     @property
     def moments(self) -> list[Moment]:
@@ -230,13 +221,13 @@ class Chooser:
         Decisive ones go first, and then the draw decides.
         """
         order = sorted(fit, key=lambda each: (each.moment.hidden is None, each.draw))
-        times: dict[str, list[float]] = {}
+        near: dict[str, set[float]] = {}  # seconds of a vehicle that are too near to one's taken
         apart = []
         for candidate in order:
             time_s = candidate.moment.time_s
-            of_vehicle = times.setdefault(candidate.moment.vehicle, [])
-            if all(abs(time_s - other) >= APART_S for other in of_vehicle):
-                of_vehicle.append(time_s)
+            of_vehicle = near.setdefault(candidate.moment.vehicle, set())
+            if time_s not in of_vehicle:
+                of_vehicle.update(time_s + each for each in AROUND_S)
                 apart.append(candidate)
         self.left_out[NEAR] += len(fit) - len(apart)
         return apart
@@ -356,50 +347,103 @@ def _turn_rad(one: Floats, other: Floats) -> Floats:
 Pairs = dict[tuple[int, int], tuple[Ints, Ints]]
 
 
-def _encroachments(frames: _Frames, gap: int) -> Pairs:
+def _encroachments(frames: _Frames, counts: Bools, gap: int) -> Pairs:
     """Return where one track is where another was at most `gap` frames before.
 
-    The key is the first and the second track. The value is each frame at which the first was there,
-    rising, and the earliest frame at which the second is where the first was then or later.
+    The key is the first and the second track, of which one `counts` at least, (N,). The value is
+    each frame at which the first was there, rising, and the earliest frame at which the second is
+    where the first was then or later.
     """
-    need("recorded traffic", "scipy")
-    from scipy.spatial import KDTree
-
-    order = np.argsort(frames.frame, kind="stable")
-    by_frame = frames.frame[order]
     reach_m = np.hypot(frames.sizes_m[:, 0], frames.sizes_m[:, 1]) / 2
-    radius_m = 2 * float(reach_m.max(initial=0.0))
-    layer_m = radius_m + 1  # in the third axis: only rows of one layer meet
-    parts: list[Ints] = []
-    for begin in range(int(by_frame[0]), int(by_frame[-1]) + 1, BLOCK):
-        ends = np.searchsorted(by_frame, (begin, begin + BLOCK, begin + BLOCK + gap))
-        block, later = order[ends[0] : ends[1]], order[ends[0] : ends[2]]
-        if not len(block):
-            continue
-        tree = KDTree(_layers(frames, block, 0, layer_m))
-        for lag in range(gap + 1):
-            seconds = KDTree(_layers(frames, later, lag, layer_m))
-            near = tree.sparse_distance_matrix(seconds, radius_m, output_type="ndarray")
-            first, second = block[near["i"]], later[near["j"]]
-            one, other = frames.track[first], frames.track[second]
-            may = (one != other) & (near["v"] <= reach_m[one] + reach_m[other])
-            first, second, one, other = first[may], second[may], one[may], other[may]
-            apart_m = separation_m(
-                frames.poses[first, :3],
-                frames.sizes_m[one],
-                frames.poses[second, :3],
-                frames.sizes_m[other],
-            )
-            meet = apart_m <= 0
-            here, there = frames.frame[first[meet]], frames.frame[second[meet]]
-            parts.append(np.stack([one[meet], other[meet], here, there], axis=-1))
+    stretches = _Stretches.of(frames, max(gap, EVERY), reach_m)
+    parts = [np.empty((0, 4), dtype=np.int64)]
+    for first, second in stretches.near():
+        one, other = stretches.track[first], stretches.track[second]
+        may = (one != other) & (counts[one] | counts[other])
+        first, second = first[may], second[may]
+        for start in range(0, len(first), STRETCHES):
+            part = slice(start, start + STRETCHES)
+            parts.append(_meetings(frames, stretches, first[part], second[part], gap, reach_m))
     return dict(_by_pair(np.concatenate(parts)))
 
 
-def _layers(frames: _Frames, rows: Ints, lag: int, layer_m: float) -> Floats:
-    """Return positions of rows, (n, 3), those of a frame in the layer of `lag` frames before."""
-    layer = (frames.frame[rows] - lag) * layer_m
-    return np.column_stack([frames.poses[rows, :2], layer])
+@dataclass(frozen=True)
+class _Stretches:
+    """All tracks cut into stretches of so many frames, in the order of time: S of them."""
+
+    length: int  # frames of a whole one; a track's first and last may be shorter
+    number: Ints  # of each: of its first frame, if it is whole, by the length, (S,)
+    track: Ints  # whose it is, (S,)
+    low_m: Floats  # least x and y of outlines in it, (S, 2)
+    high_m: Floats  # and greatest
+
+    @classmethod
+    def of(cls, frames: _Frames, length: int, reach_m: Floats) -> "_Stretches":
+        """Cut tracks whose outlines reach so far from their centres, (N,) m."""
+        number = frames.frame // length
+        changes = (np.diff(number) != 0) | (np.diff(frames.track) != 0)
+        begins = np.concatenate([[0], np.flatnonzero(changes) + 1])
+        around_m = reach_m[frames.track[begins], None]
+        low_m = np.minimum.reduceat(frames.poses[:, :2], begins) - around_m
+        high_m = np.maximum.reduceat(frames.poses[:, :2], begins) + around_m
+        order = np.argsort(number[begins], kind="stable")
+        begins = begins[order]
+        return cls(length, number[begins], frames.track[begins], low_m[order], high_m[order])
+
+    def near(self) -> Iterator[tuple[Ints, Ints]]:
+        """Yield pairs of stretches that overlap: of one number, or the second of the next."""
+        span_m = float(np.ptp([self.low_m[:, 0].min(), self.high_m[:, 0].max()])) + 1
+        for begin in np.unique(self.number // LAYERS) * LAYERS:
+            bounds = np.searchsorted(self.number, (begin, begin + LAYERS, begin + LAYERS + 1))
+            firsts, laters = np.arange(*bounds[:2]), np.arange(bounds[0], bounds[2])
+            boxes = self._boxes(firsts, begin, span_m)
+            for lag in (0, 1):
+                tree = shapely.STRtree(self._boxes(laters, begin + lag, span_m))
+                first, second = tree.query(boxes)
+                yield firsts[first], laters[second]
+
+    def _boxes(self, which: Ints, begin: int, span_m: float) -> Any:
+        """Return boxes (n,) of stretches, beside each other so that only those of one number meet.
+
+        `begin` is the number of those that stay where they are.
+        """
+        aside_m = (self.number[which] - begin) * span_m - self.low_m[:, 0].min()
+        (west, south), (east, north) = self.low_m[which].T, self.high_m[which].T
+        return shapely.box(west + aside_m - LOOSE_M, south, east + aside_m + LOOSE_M, north)
+
+
+def _meetings(
+    frames: _Frames, stretches: _Stretches, first: Ints, second: Ints, gap: int, reach_m: Floats
+) -> Ints:
+    """Return where tracks of pairs of stretches are one place within `gap` frames, (m, 4).
+
+    Rows have the first and the second track, and the frame in which each is there.
+    """
+    every = np.arange(stretches.length)
+    one, other = stretches.track[first], stretches.track[second]
+    here = stretches.number[first, None, None] * stretches.length + every[:, None]
+    there = stretches.number[second, None, None] * stretches.length + every
+    both = (here <= there) & (there <= here + gap)
+    both &= _is_there(frames, one[:, None, None], here)
+    both &= _is_there(frames, other[:, None, None], there)
+    pair, a, b = both.nonzero()
+    one, other = one[pair], other[pair]
+    here, there = here[pair, a, 0], there[pair, 0, b]
+    one_rows, other_rows = frames.rows(one, here), frames.rows(other, there)
+    way_m = frames.poses[one_rows, :2] - frames.poses[other_rows, :2]
+    near = np.sqrt((way_m**2).sum(axis=1)) <= reach_m[one] + reach_m[other]
+    events = np.stack([one, other, here, there], axis=-1)[near]
+    apart_m = separation_m(
+        frames.poses[one_rows[near], :3],
+        frames.sizes_m[events[:, 0]],
+        frames.poses[other_rows[near], :3],
+        frames.sizes_m[events[:, 1]],
+    )
+    return np.asarray(events[apart_m <= 0])
+
+
+def _is_there(frames: _Frames, track: Ints, frame: Ints) -> Bools:
+    return np.asarray((frames.first[track] <= frame) & (frame <= frames.last[track]))
 
 
 def _by_pair(events: Ints) -> Iterator[tuple[tuple[int, int], tuple[Ints, Ints]]]:
@@ -446,7 +490,9 @@ def _hidden_conflicts(
 
 def _conflicts(frames: _Frames, rows: Ints, window_m: float, horizon: int, gap: int) -> _Meetings:
     """Return all conflicts of candidates within so many frames, of which none only follows."""
-    pairs = _encroachments(frames, gap)
+    counts = np.zeros(len(frames.tracks), dtype=bool)
+    counts[frames.track[rows]] = True
+    pairs = _encroachments(frames, counts, gap)
     of_track: dict[int, Ints] = {}
     for track in np.unique(frames.track[rows]).tolist():
         of_track[track] = rows[frames.track[rows] == track]
@@ -457,11 +503,11 @@ def _conflicts(frames: _Frames, rows: Ints, window_m: float, horizon: int, gap: 
             ego_rows = of_track.get(ego, nobody)
             now = frames.frame[ego_rows]
             meets = np.append(arrival, NEVER)[np.searchsorted(frame, now)]
-            counts = (frames.first[other] <= now) & (now <= frames.last[other])
-            counts &= meets <= now + horizon
-            rows_here = ego_rows[counts]
+            meet = (frames.first[other] <= now) & (now <= frames.last[other])
+            meet &= meets <= now + horizon
+            rows_here = ego_rows[meet]
             columns = [np.full(len(rows_here), track) for track in (other, first, second)]
-            parts.append(np.stack([rows_here, *columns, meets[counts]], axis=-1))
+            parts.append(np.stack([rows_here, *columns, meets[meet]], axis=-1))
     if not parts:
         return _Meetings(nobody, nobody, nobody)
     triples = np.concatenate(parts)

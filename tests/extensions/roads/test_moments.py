@@ -24,10 +24,11 @@ from harness.extensions.roads.moments import (
     STILL,
     TWICE,
     Choice,
-    choose,
+    Chooser,
+    key_of,
 )
 from harness.extensions.roads.sessions import Sessions, Traffic, dealt, part_of
-from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track, checked
+from harness.extensions.roads.tables import House, Lane, Scene, Track, checked
 
 HORIZON_S = 6.0
 EAST, NORTH = 0.0, np.pi / 2
@@ -68,8 +69,16 @@ def crossing(*tracks: Track, **changed: Any) -> Scene:
     return scene
 
 
+def chooser_of(*scenes: Scene, **changed: Any) -> Chooser:
+    """Return a chooser that has looked at some scenes."""
+    chooser = Chooser(80.0, HORIZON_S, **changed)
+    for scene in scenes:
+        chooser.look(scene)
+    return chooser
+
+
 def of(*scenes: Scene, **changed: Any) -> Choice:
-    choice = choose(scenes, 80.0, HORIZON_S, **changed)
+    choice = chooser_of(*scenes, **changed).choice()
     assert choice.candidates == len(choice.moments) + sum(choice.left_out.values())
     hides = [m.hidden is not None for m in choice.moments]
     assert hides == [True, False] * (len(hides) // 2) or not any(hides)
@@ -146,8 +155,10 @@ def test_each_candidate_that_falls_has_its_reason() -> None:
     assert [m.hidden for m in choice.moments] == [None, None], "nobody hidden is in conflict"
     assert of(crossing(against)).left_out == {LEAVES: 6, OFF_LANE: 9}
     assert of(replace(scene, lights=True)).left_out == {LIGHTS: 45}
-    lost = of(scene, unfit=lambda scene, moment: NOT_REACHED if moment.time_s > 3 else None)
-    assert lost.left_out[NOT_REACHED] + len(lost.moments) == 2
+    chooser = chooser_of(scene)
+    chooser.drop([key_of(choice.moments[0])], NOT_REACHED)
+    lost = chooser.choice()
+    assert (lost.left_out[NOT_REACHED], lost.moments) == (1, choice.moments[1:])
     assert lost.record["left_out"] == lost.left_out
     assert "no building" not in lost.rule
     assert "6 s more" in lost.rule
@@ -359,12 +370,7 @@ def test_who_is_hidden_and_in_conflict_is_as_one_by_one() -> None:
         corner = draws.uniform(-20, 10, 2)
         house = House("h", corner + np.array([[0, 0], [12, 0], [12, 12], [0, 12]]))
         scene = Scene("s", "s.xml", f"{number:064}", 0.1, False, tracks, lanes, (house,))
-        asked: list[Moment] = []
-
-        def note(scene: Scene, moment: Moment, asked: list[Moment] = asked) -> None:
-            asked.append(moment)
-
-        choose([scene], 80.0, HORIZON_S, unfit=note)
+        asked = chooser_of(scene).moments
         assert asked
         shapes = {key: outlines(track) for key, track in tracks.items()}
         for moment in asked:
