@@ -83,8 +83,10 @@ def _places(scene: Scene) -> Ints:
     poses, frames = poses[moves], np.round(times[moves] * FINE).astype(np.int64)
     order = np.lexsort((poses[:, 1], poses[:, 0], frames))
     poses, frames = poses[order], frames[order]
-    rounded = np.round(_turned(poses) / STEPS).astype(np.int64).astype(np.uint64)
-    one = _mixed((rounded * ODD).sum(axis=1, dtype=np.uint64))
+    one: Ints = np.zeros(len(poses), dtype=np.uint64)
+    for column, step, odd in zip(_turned(poses).T, STEPS, ODD, strict=True):
+        one = one + np.round(column / step).astype(np.int64).astype(np.uint64) * odd
+    one = _mixed(one)
     both = _mixed(one[:-1] * ODD[0] + one[1:])[frames[:-1] == frames[1:]]
     every = max(1, round(1 / scene.step_s))  # which are taken says their hash, and no clock
     return np.unique(both[both % np.uint64(every) == 0].view(np.int64))

@@ -288,6 +288,7 @@ class Recording:
         """Return a scene's rows of one of the recording's tables, such as `lanes.parquet`."""
         path = self.folder / file_name
         try:
+            pa.default_memory_pool().release_unused()  # what was read before may be as large
             with opened(path, "rows") as file:
                 if file_name not in self._files:
                     self._check_digest(file_name, file)
