@@ -292,13 +292,13 @@ def replacing(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def refuse_taken(option: str, folder: Path) -> None:
-    """Raise UserError if anything exists at `folder`, where a command is to make a new folder.
+def refuse_taken(option: str, path: Path, what: str = "folder") -> None:
+    """Raise UserError if anything exists at `path`, where a command is to make a new folder.
 
-    `option` names the option that gave it, such as `--out`.
+    `option` names the option that gave it, such as `--out`, and `what` is what is made.
     """
-    if os.path.lexists(folder):
-        raise UserError(f"{option} {printable(folder)} is there already; give a new folder")
+    if os.path.lexists(path):
+        raise UserError(f"{option} {printable(path)} is there already; give a new {what}")
 
 
 @contextmanager

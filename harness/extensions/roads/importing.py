@@ -413,6 +413,7 @@ def _refuse_picture(show: Path | None, out: Path) -> None:
         if show.suffix[1:] not in FORMATS:
             endings = [f".{name}" for name in FORMATS]
             raise unknown("--show, a file that ends in", show.suffix, endings)
+        refuse_taken("--show", show, "path")
 
 
 def _echo_json(recording: "Recording", taken: _Taken) -> None:

@@ -178,6 +178,10 @@ WRONG: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("hand-1.xml",),
         ("--licence", "x", "--show", "mine/a.svg"),
     ),
+    "--show files/tracks.svg is there already; give a new path": (
+        ("hand-1.xml",),
+        ("--licence", "x", "--show", "files/tracks.svg"),
+    ),
     "--window 5 is out of range": (("hand-1.xml",), ("--licence", "x", "--window", "5")),
     "--name '../x'; allowed: small letters": (
         ("hand-1.xml",),
@@ -200,8 +204,10 @@ def test_a_wrong_command_writes_nothing(
 ) -> None:
     given, more = WRONG[words]
     typed = [source / each if "." in each and "=" not in each else each for each in given]
+    (source / "tracks.svg").write_text("of another day")
     code, _, err = harness("dataset", "import", *typed, "--out", "mine", *more)
     assert (code, err.count("\n")) == (2, 1), err
+    assert (source / "tracks.svg").read_text() == "of another day"
     assert words in err
     assert sorted(path.name for path in source.parent.iterdir()) == ["files"]
 
