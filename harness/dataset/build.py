@@ -331,10 +331,10 @@ def _write_dataset(
     if is_lost := not forest.value[forest.root].any():
         _keep_unreachable(scenario, episodes, unreachable)
     findings = list[str]()
-    for name in AUDITS if audits else ():
+    for key in AUDITS if audits else ():
         more(episodes)
         findings.append(
-            AUDITS.ask(name, lambda audit: audit.found(scenario, episodes, seed, progress, workers))
+            AUDITS.ask(key, lambda audit: audit.found(scenario, episodes, seed, progress, workers))
         )
     command = _command(scenario, episodes, seed, audits) + (" --unreachable" if is_lost else "")
     files = {

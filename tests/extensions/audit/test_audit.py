@@ -11,6 +11,7 @@ import pytest
 
 from harness.core.errors import UserError
 from harness.dataset.build import build
+from harness.dataset.load import load
 from harness.extensions.audit.tells import FOLDS, HiddenPoints, Ranks, _hidden, audit, judge
 from harness.world import scenarios
 from harness.world.scenarios.occluded_intersection import NAME, SCENARIO, Parameters, layout
@@ -230,6 +231,8 @@ def test_the_card_of_a_dataset_says_what_its_audit_found(tmp_path, monkeypatch):
     assert f"with an AUC of {auc.value:.2f} [{auc.low:.2f}, {auc.high:.2f}]\n" in card
     assert "n = 20 layouts" in card
     assert "--no-audit" not in card
+    assert card.startswith("# audited\n")
+    assert load(tmp_path / "audited").manifest.name == "audited"
     assert counted == [20]
     monkeypatch.setattr("harness.dataset.build.AUDITS", {})
     build(scenario, tmp_path / "unaudited", 20, 0, 1, quiet, more=counted.append)
