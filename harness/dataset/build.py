@@ -49,7 +49,7 @@ from harness.dataset.schema import (
 from harness.dataset.verify import level_name, tree_name
 from harness.world import scenarios
 from harness.world.drivers import drivers_of
-from harness.world.families import keep
+from harness.world.families import family_of, keep
 from harness.world.reference import drive_all
 from harness.world.scenario import Scenario
 from harness.world.scenario_of_package import is_ours
@@ -336,7 +336,8 @@ def _write_dataset(
         findings.append(
             AUDITS.ask(key, lambda audit: audit.found(scenario, episodes, seed, progress, workers))
         )
-    command = _command(scenario, episodes, seed, audits) + (" --unreachable" if is_lost else "")
+    command = _command(scenario, name, episodes, seed, audits)
+    command += " --unreachable" if is_lost else ""
     files = {
         "README.md": _readme(name, command, config, forest, findings).encode(),
         "scene.schema.json": _pretty(record_schema(scenario)),
@@ -454,13 +455,20 @@ def _pretty(value: Any) -> bytes:
     return (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
 
 
-def _command(scenario: Scenario, episodes: int, seed: int, audits: bool) -> str:
-    """Return the command that builds a dataset."""
+def _command(scenario: Scenario, name: str, episodes: int, seed: int, audits: bool) -> str:
+    """Return the command that builds a dataset again, where its folder, `name`, lies.
+
+    The new one has the same name, in another folder, and so the same bytes.
+    """
     default, p = scenarios.get(scenario.name).parameters, scenario.parameters
-    name = shlex.quote(scenarios.argument(scenario))
+    text = scenarios.argument(scenario)
+    family = family_of(text)
+    typed = family.typed(text, name) if family else [text]
+    out = shlex.join(["--out", f"again/{name}"])
     lag = f" --lag {p.decision_lag_s:g}" if p.decision_lag_s != default.decision_lag_s else ""
     unaudited = "" if audits or episodes < LEAST_AUDITED else " --no-audit"
-    return f"harness dataset build {name} --episodes {episodes} --seed {seed}{lag}{unaudited}"
+    layouts = f"--episodes {episodes} --seed {seed}"
+    return f"harness dataset build {shlex.join(typed)} {layouts}{lag}{unaudited} {out}"
 
 
 def _origin(config: dict[str, Any]) -> str:

@@ -41,6 +41,13 @@ class Family(Protocol):
         """Make the scenario of a name such as `env:merge-v0`. Raises UserError if there is none."""
         ...
 
+    def typed(self, text: str, folder: str) -> list[str]:
+        """Return the words by which a command names a scenario of a dataset: options, or its text.
+
+        `text` is its name with or without settings, and the dataset lies in `folder`.
+        """
+        ...
+
     def split(self, text: str) -> tuple[str, str | None]:
         """Split the text of a scenario into its name and its settings, such as `decisions=5`.
 

@@ -295,7 +295,8 @@ def test_another_lag_is_another_dataset_and_everybody_has_it(small, tmp_path):
     assert small.scenario.parameters.lag_frames == 8  # 145 ms in frames of 20 ms
     assert data.trees[0].levels[0][0].scene == small.trees[0].levels[0][0].scene
     assert {b.scene for b in data.trees[0].levels[1]} != {b.scene for b in small.trees[0].levels[1]}
-    command = f"harness dataset build {argument(SCENARIO)} --episodes 1 --seed {FIRST_SEED} --lag 0"
+    layouts = f"--episodes 1 --seed {FIRST_SEED} --lag 0 --out again/at-once"
+    command = f"harness dataset build {argument(SCENARIO)} {layouts}"
     assert f"Built by `{command}`." in (tmp_path / "at-once/README.md").read_text()
 
 

@@ -54,6 +54,9 @@ class Environments:
 
         return scenario(name)
 
+    def typed(self, text: str, folder: str) -> list[str]:
+        return [text]
+
     def split(self, text: str) -> tuple[str, str | None]:
         from harness.extensions.environments import environment
 

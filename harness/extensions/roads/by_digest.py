@@ -46,5 +46,8 @@ class ByDigest:
     def joined(self, name: str, settings: Sequence[str]) -> str:
         return ":".join([name, *([",".join(settings)] if settings else [])])
 
+    def typed(self, text: str, folder: str) -> list[str]:
+        return [text]
+
     def allow(self, name: str) -> str | None:
         return None  # a dataset has the files of its scenario

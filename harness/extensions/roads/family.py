@@ -41,6 +41,10 @@ class Recordings(ByDigest):
         _FOLDERS.remember(folder)
         return self.joined(name_of(recording), [settings] if settings else [])
 
+    def typed(self, text: str, folder: str) -> list[str]:
+        _, settings = self.split(text)
+        return [f"--{OPTION}", self.joined(folder, [settings] if settings else [])]
+
     def scenario(self, name: str) -> "Scenario":
         from harness.extensions.roads.world import scenario  # imports highway-env
 

@@ -1,5 +1,6 @@
 """Recorded traffic: replayed to the centimetre, or reacting to an ego that drives otherwise."""
 
+import filecmp
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -327,7 +328,10 @@ def test_what_is_beside_a_dataset_goes_before_what_a_variable_names(
 
 @pytest.mark.slow
 def test_a_dataset_is_sound_and_has_its_recording(
-    scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scenario: Scenario,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    harness: Callable[..., tuple[int, str, str]],
 ) -> None:
     build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None)
     monkeypatch.setenv(family.FOLDERS, "")  # from here on it has its own
@@ -340,6 +344,13 @@ def test_a_dataset_is_sound_and_has_its_recording(
     assert {name: bool(success[name][0]) for name in closed} == {
         name: outcome.success for name, outcome in closed.items()
     }
+    card = (tmp_path / "set/README.md").read_text()
+    command = card.split("Built by `harness ")[1].split("`")[0]
+    assert command.startswith("dataset build --recording set --episodes 2 --seed 0")
+    assert harness(*command.split())[0] == 0
+    written = [path.name for path in (tmp_path / "set").iterdir()]
+    same, *others = filecmp.cmpfiles(tmp_path / "set", tmp_path / "again/set", written, False)
+    assert (sorted(same), others) == (sorted(written), [[], []])
 
 
 def test_a_recording_is_found_by_its_digest_alone(
