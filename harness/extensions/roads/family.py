@@ -109,8 +109,8 @@ def _recording(name: str, folders: Sequence[str]) -> "Recording":
                 )
             return recording
     raise UserError(
-        f"recording {printable(name, 80)} is in no folder that is known; type its folder: "
-        f"--{OPTION} FOLDER, or set {FOLDERS}=FOLDER"
+        f"recording {printable(name, 80)} is in no folder that is known; set its folder: "
+        f"{FOLDERS}=FOLDER"
     )
 
 

@@ -90,8 +90,8 @@ def _inputs(name: str, folders: Sequence[str]) -> "Inputs":
         if inputs.digest.startswith(digest):
             return inputs
     raise UserError(
-        f"the files of sumo:{printable(name, 80)} are in no folder that is known; type them: "
-        f"--{NET} NET --{ROUTES} ROUTES, or set {FOLDERS}=FOLDER of a dataset"
+        f"the files of sumo:{printable(name, 80)} are in no folder that is known; set that of a "
+        f"dataset that has them: {FOLDERS}=FOLDER"
     )
 
 

@@ -31,7 +31,7 @@ def test_the_name_has_the_digest_of_the_files_as_sumo_is_given_them(monkeypatch,
     assert FRESH.joined(name, ["decisions=2"]) == f"{name}:decisions=2"
     with pytest.raises(UserError, match="give --sumo NET --routes ROUTES"):
         FRESH.named({"sumo": typed["sumo"]})
-    with pytest.raises(UserError, match="are in no folder that is known; type them: --sumo NET"):
+    with pytest.raises(UserError, match=r"are in no folder that is known; .*: SWARMDRIVE_SUMO=F"):
         inputs_named("sumo:crossing@000000000000")
 
 

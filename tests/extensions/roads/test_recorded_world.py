@@ -362,7 +362,7 @@ def test_a_recording_is_found_by_its_digest_alone(
     monkeypatch.setenv(family.FOLDERS, "")
     (tmp_path / "recording.json").write_text("{}")
     RECORDINGS.kept_in(name, tmp_path)
-    with pytest.raises(UserError, match="is in no folder that is known"):
+    with pytest.raises(UserError, match="folder that is known; set its folder: SWARMDRIVE_R"):
         recording_of(name)
     RECORDINGS.kept_in(name, folder)
     assert recording_of(name).folder == folder
