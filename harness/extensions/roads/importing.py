@@ -11,7 +11,7 @@ import typer
 from harness.cli import options
 from harness.cli.progress import bar
 from harness.core.errors import UserError, in_range, printable, sayable, unknown
-from harness.core.figures import amount
+from harness.core.figures import amount, some_of
 from harness.core.files import making, refuse_taken
 from harness.core.progress import Progress
 
@@ -209,6 +209,7 @@ class _Taken:
     lanes: int = 0
     lights: int = 0  # scenes with traffic lights
     left_out: Counter[str] = field(default_factory=Counter)
+    without: dict[str, str] = field(default_factory=dict)  # files left out, with the reason
     _speeds: "Speeds" = field(default_factory=_speeds)
 
     def add(self, scene: "Scene") -> None:
@@ -220,6 +221,11 @@ class _Taken:
         self.lanes += len(scene.lanes)
         self.lights += scene.lights
         self.left_out.update(scene.left_out)
+
+    def leave_out(self, scene: "Scene", reason: str) -> None:
+        """Count a scene that nobody can decide in, and what was left out of it."""
+        self.without[scene.file] = reason
+        self.left_out.update({**scene.left_out, reason: 1})
 
     def targets_mps(self) -> tuple[float, float, float]:
         """Return the ego's target speeds."""
@@ -253,6 +259,8 @@ def _imported(
                 speeds_mps = taken.targets_mps()
                 recording = tables.chosen(recording, speeds_mps, (), {})
                 moments, choice = _chosen(recording, progress)
+            if taken.without:
+                choice = {**choice, "files_left_out": taken.without}
             recording = tables.chosen(recording, speeds_mps, moments, choice)
             if show:
                 _draw(recording, show)
@@ -327,11 +335,31 @@ def _unique(scenes: Iterable["Scene"]) -> Iterator["Scene"]:
 
 
 def _watched(scenes: Iterable["Scene"], taken: _Taken, progress: Progress) -> Iterator["Scene"]:
+    """Yield the scenes in which there is something to decide, and take note of all.
+
+    Raises UserError, which says what the first lacks, if there is none such.
+    """
+    from harness.extensions.roads.tables import checked
+
+    first_without: Scene | None = None
     for scene in scenes:
+        progress(1)
+        if reason := _lack(scene):
+            taken.leave_out(scene, reason)
+            first_without = first_without or scene
+            continue
         whole = without_overlaps(scene)
         yield whole  # which writes it, and refuses it where it cannot be
         taken.add(whole)
-        progress(1)
+    if first_without and not taken.kinds:
+        checked(first_without)
+
+
+def _lack(scene: "Scene") -> str | None:
+    """Return why nobody can decide in a scene that is sound; None if somebody can."""
+    if not scene.tracks:
+        return "scene without road users"
+    return None if scene.lanes else "scene without lanes"
 
 
 def without_overlaps(scene: "Scene") -> "Scene":
@@ -451,6 +479,9 @@ def _echo(recording: "Recording", taken: _Taken, show: Path | None) -> None:
         echo_text(f"traffic lights: in {taken.lights} of {scenes}, and their signals are not known")
     if taken.left_out:
         echo_text(f"left out: {_reasons(taken.left_out)}")
+    if taken.without:
+        names = [printable(name, 40) for name in taken.without]
+        echo_text(f"files without road users or lanes: {some_of(names)}")
     slow, middle, fast = facts.speeds_mps
     echo_text(
         f"episodes: {facts.window_m:g} m around the ego, {amount(facts.decisions, 'decision')}, "

@@ -1,6 +1,7 @@
 """`harness dataset import` as typed: what is taken, what is left out, and what is refused."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,7 @@ FILES = {
     "lanes.csv": files.LANES,
     "houses.csv": files.BUILDINGS,
 }
+NOBODY = re.sub(r"<obstacle.*</obstacle>", "", files.COMMONROAD_2018B, flags=re.DOTALL)
 COLUMNS = "time_s=frame/25,id=track,x_m=cx*0.3048,y_m=cy*0.3048,kind=class"
 
 
@@ -59,22 +61,27 @@ def test_what_stands_in_a_file_says_what_it_is(source: Path) -> None:
 def test_a_folder_of_files_is_a_recording(harness: Callable[..., Said], source: Path) -> None:
     for name in ("tracks.csv", "lanes.csv", "houses.csv"):
         (source / name).unlink()
+    for name in ("empty.xml", "void.xml"):
+        (source / name).write_text(NOBODY)
     code, out, err = harness("dataset", "import", source, "--out", "mine", "--licence", "CC0-1.0")
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         "wrote mine: 3 scenes of 0.0 minutes, 7 road users, 8 lanes",
         "road users: 3 cars, 2 trucks, 2 pedestrians; 4 of them never move",
         "traffic lights: in 2 of 3 scenes, and their signals are not known",
-        "left out: 1 file of another kind; 1 tram (a class of no road user); 1 building",
-        "  in degrees of longitude and latitude; 3 for other reasons",
+        "left out: 2 scene without road users; 1 file of another kind; 1 tram (a class of",
+        "  no road user); 4 for other reasons",
+        "files without road users or lanes: empty.xml and void.xml",
         "episodes: 80 m around the ego, 4 decisions, target speeds 0, 5 and 10 m/s",
-        *out.splitlines()[6:],
+        *out.splitlines()[7:],
     ]
     assert len(out.splitlines()) <= 15
     recording = tables.read(Path("mine"))
     assert [scene.file for scene in recording.scenes_stated] == [
         *("my.fcd.xml", "hand-1.xml", "hand-2.cr"),
     ]
+    reason = "scene without road users"
+    assert recording.choice["files_left_out"] == {"empty.xml": reason, "void.xml": reason}
     assert recording.licence == "CC0-1.0"
     assert recording.scene("my").lights
     code, _, err = harness("dataset", "import", source, "--out", "mine", "--licence", "CC0-1.0")
@@ -193,6 +200,9 @@ WRONG: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "0 files are nets of SUMO": (("my.fcd.xml",), ("--licence", "x")),
     "tables of tracks need one map": (("tracks.csv", "--columns", COLUMNS), ("--licence", "x")),
     "no file has road users": (("lanes.csv",), ("--licence", "x")),
+    "nobody moves or stands there; it needs a track": (("nobody.xml",), ("--licence", "x")),
+    "torn.xml: it is no XML": (("hand-1.xml", "nobody.xml", "torn.xml"), ("--licence", "x")),
+    "10: a time or pose is no number": (("hand-1.xml", "nan.xml"), ("--licence", "x")),
     "nowhere.xml: No such file": (("nowhere.xml",), ("--licence", "x")),
     "unknown column of tracks.csv, for time_s": (("tracks.csv", "lanes.csv"), ("--licence", "x")),
 }
@@ -204,7 +214,10 @@ def test_a_wrong_command_writes_nothing(
 ) -> None:
     given, more = WRONG[words]
     typed = [source / each if "." in each and "=" not in each else each for each in given]
-    (source / "tracks.svg").write_text("of another day")
+    broken = files.COMMONROAD_2018B.replace("<x>5</x>", "<x>nan</x>")
+    more_files = {"nobody.xml": NOBODY, "nan.xml": broken, "torn.xml": broken[:-20]}
+    for name, text in {**more_files, "tracks.svg": "of another day"}.items():
+        (source / name).write_text(text)
     code, _, err = harness("dataset", "import", *typed, "--out", "mine", *more)
     assert (code, err.count("\n")) == (2, 1), err
     assert (source / "tracks.svg").read_text() == "of another day"
