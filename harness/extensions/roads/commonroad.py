@@ -177,7 +177,7 @@ class _File:
         lanes = {}
         for key, element in self.lanelets.items():
             self.place = f"lanelet {printable(key, 40)}"
-            lanes[key] = _lane(key, element, self.lanelets, self.limits)
+            lanes[key] = _lane(key, element, self.lanelets, self.limits, self.left_out)
         self._stand()
         return Scene(
             name_of(self.name),
@@ -279,8 +279,13 @@ def _middle(part: Element) -> Floats:
 
 
 def _lane(
-    key: str, element: Element, lanelets: Mapping[str, Element], limits: Mapping[str, float]
+    key: str,
+    element: Element,
+    lanelets: Mapping[str, Element],
+    limits: Mapping[str, float],
+    left_out: dict[str, int],
 ) -> Lane:
+    """Return a lanelet as a lane, and count what it names that is no other lanelet of the file."""
     left, right = _points(element.find("leftBound")), _points(element.find("rightBound"))
     if min(len(left), len(right)) < 2:
         raise ValueError("a bound has fewer than two points")
@@ -288,7 +293,7 @@ def _lane(
         right = _spaced(right, len(left))
     width_m = float(np.median(np.hypot(*(left - right).T)))
     successors = [each.get("ref", "") for each in element.iterfind("successor")]
-    here = [other for other in successors if other in lanelets and other != key]
+    after = [other for other in successors if _is_other(other, key, lanelets, left_out)]
     signs = [each.get("ref", "") for each in element.iterfind("trafficSignRef")]
     stated_mps = [number(element, "speedLimit"), *(limits.get(sign, np.nan) for sign in signs)]
     limits_mps = [limit for limit in stated_mps if limit > 0]
@@ -297,9 +302,9 @@ def _lane(
         distinct((left + right) / 2),
         width_m,
         min(limits_mps, default=None),
-        tuple(dict.fromkeys(here)),
-        _beside(key, element.find("adjacentLeft"), lanelets),
-        _beside(key, element.find("adjacentRight"), lanelets),
+        tuple(dict.fromkeys(after)),
+        _beside(key, element.find("adjacentLeft"), lanelets, left_out),
+        _beside(key, element.find("adjacentRight"), lanelets, left_out),
     )
 
 
@@ -310,9 +315,24 @@ def _spaced(line: Floats, n: int) -> Floats:
     return np.stack([np.interp(at, along, line[:, 0]), np.interp(at, along, line[:, 1])], axis=1)
 
 
-def _beside(key: str, element: Element | None, lanelets: Mapping[str, Element]) -> str | None:
+def _beside(
+    key: str,
+    element: Element | None,
+    lanelets: Mapping[str, Element],
+    left_out: dict[str, int],
+) -> str | None:
     """Return the id of the lanelet beside one, if it leads the same way and is in the file."""
     if element is None or element.get("drivingDir") != "same":
         return None
     other = element.get("ref", "")
-    return other if other in lanelets and other != key else None
+    return other if _is_other(other, key, lanelets, left_out) else None
+
+
+def _is_other(
+    name: str, key: str, lanelets: Mapping[str, Element], left_out: dict[str, int]
+) -> bool:
+    """Return whether a lanelet names another one of the file; count it if it does not."""
+    is_other = name in lanelets and name != key
+    if not is_other:
+        sum_up(left_out, "lanelet that is named and not in the file")
+    return is_other

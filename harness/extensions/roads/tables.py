@@ -669,7 +669,7 @@ def _problems(scene: Scene) -> Iterator[str]:
 def _problems_of_numbers(scene: Scene) -> Iterator[str]:
     if not scene.tracks:
         left_out = ", ".join(printable(reason, 80) for reason in list(scene.left_out)[:3])
-        others = f" but those left out: {left_out}; kinds: {', '.join(KINDS)}" if left_out else ""
+        others = f"; left out: {left_out}; kinds: {', '.join(KINDS)}" if left_out else ""
         yield f"nobody moves or stands there{others or '; it needs a track'}"
     if not scene.lanes:
         yield "it has no lanes; give a map"

@@ -135,7 +135,7 @@ WRONG: dict[str, dict[str, Any]] = {
         "tracks": {"a": straight("a", 0, 1), "b": straight("b", 3, 1)}
     },
     "nobody moves or stands there": {"tracks": {}},
-    "there but those left out: dragon (a kind that none is made of); kinds: car, van": {
+    "there; left out: dragon (a kind that none is made of); kinds: car, van": {
         "tracks": {},
         "left_out": {"dragon (a kind that none is made of)": 2},
     },

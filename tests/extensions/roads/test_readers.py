@@ -44,7 +44,8 @@ def test_commonroad_of_2018(tmp_path: Path) -> None:
     assert close(car.time_s, 0, 0.5)
     assert close(car.poses, [5, 0, 0.1, 10], [10, 0, 0.1, 10])  # middles of what is uncertain
     assert (parked.kind, parked.still, parked.end_s) == ("car", True, 0.5)
-    assert scene.left_out == {"train (a kind that none is made of)": 1}
+    missing = {"lanelet that is named and not in the file": 1}
+    assert scene.left_out == {"train (a kind that none is made of)": 1, **missing}
     assert len(scene.tracks) == 2  # the ego of a planning problem is no track
 
 
