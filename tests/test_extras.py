@@ -131,7 +131,7 @@ except harness.UserError as error:
     assert said.endswith(f"{needs.format('torch', 'transformers')}exit 2\n")
 
 
-SWEEP = "study sweep a --over loss --grid 0,0.4 --seeds 0"
+SWEEP = "study sweep a --over loss --grid 0,0.4 --seeds 0 --pictures"
 NO_FIGURES = (
     "harness: drawing figures needs matplotlib, which is not installed; "
     "run `pip install 'swarmdrive-harness[report]'`\n"
@@ -174,7 +174,8 @@ STUDIES = {  # what draws besides, and where it writes by itself
 
 @pytest.mark.exhaustive
 def test_every_study_ends_well_without_matplotlib(tmp_path: Path) -> None:
-    said = bare(tmp_path, "eval --model proxy --limit 2 --quiet --out a", *STUDIES)
+    lines = [f"{line} --pictures" for line in STUDIES]
+    said = bare(tmp_path, "eval --model proxy --limit 2 --quiet --out a", *lines)
     assert re.findall(r"^exit (\S+)", said, re.MULTILINE) == ["0"] * (1 + len(STUDIES)), said
     assert said.count(NO_FIGURES) == len(STUDIES)
     for folder in STUDIES.values():

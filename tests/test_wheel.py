@@ -101,7 +101,8 @@ def test_a_bare_install_evaluates_and_reports_outside_the_checkout(
     }
     assert {p.name for p in run.iterdir()} == {*files, "run.toml", "sources"}
     assert harness("--help").startswith("Usage: harness [OPTIONS] COMMAND")
-    swept = typed("study", "sweep", str(run), "--over", "loss", "--grid", "0,0.4", "--out", "swept")
+    over = ("--over", "loss", "--grid", "0,0.4")
+    swept = typed("study", "sweep", str(run), *over, "--out", "swept", "--pictures")
     assert (swept.returncode, swept.stderr.splitlines()[-1]) == (0, NO_FIGURES), swept.stderr
     assert re.search(r"^0\.4 +\d", swept.stdout, re.MULTILINE)
     assert (tmp_path / "swept/conditions.csv").read_text().startswith("source,panel,")

@@ -199,6 +199,9 @@ Verbose = Annotated[
         rich_help_panel=stated.OUTPUT,
     ),
 ]
+Pictures = Annotated[
+    bool, Option("--pictures", help="Also draw figures: in the page, and as SVG, PDF and PNG.")
+]
 
 
 def takes(

@@ -25,17 +25,22 @@ SENTENCE = re.compile(r"(?<=[.;]) ")
 
 
 def finish(
-    study: "Study", out: Path, as_json: bool = False, quiet: bool = False, verbose: bool = False
+    study: "Study",
+    out: Path,
+    as_json: bool = False,
+    quiet: bool = False,
+    verbose: bool = False,
+    pictures: bool = True,
 ) -> None:
     """Write a study to a folder, and print it as JSON or as text.
 
     `out` is the folder to make. It is JSON if `as_json`, and nothing is printed as text if `quiet`;
-    `verbose` prints all tables and how the study was made.
+    `verbose` prints all tables and how the study was made. Figures are drawn with `pictures`.
     """
     from harness.studies.study import undrawn, write_study
 
-    page = write_study(study, out)
-    if (error := undrawn(study)) and not quiet:
+    page = write_study(study, out, pictures)
+    if pictures and not quiet and (error := undrawn(study)):
         typer.echo(f"harness: {error}", err=True)
     if as_json:
         echo_answer(study)

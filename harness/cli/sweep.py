@@ -53,6 +53,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Score a run's stored answers at other operating points.
 
@@ -80,4 +81,4 @@ def command(
         sources: list[Source] = [*replayed, *([SOURCES[PROXY]] if proxy else [])]
         progress.more(len(sources) * sum(map(len, panels.values())))
         study = run_sweep(sources, panels, draws, where, progress)
-    finish(study, where, as_json, quiet, verbose)
+    finish(study, where, as_json, quiet, verbose, pictures)

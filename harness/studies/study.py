@@ -94,15 +94,15 @@ def percent(row: Any, value: str, low: str, high: str) -> str:
     return PERCENT.interval(row[value], row[low], row[high])
 
 
-def write_study(study: Study, out: Path) -> Path:
+def write_study(study: Study, out: Path, draws: bool = True) -> Path:
     """Write a study's figures, tables, page and manifest into a folder; return the page's path.
 
-    Figures are skipped if matplotlib is not installed. Raises UserError if the folder holds
-    something else.
+    Figures are left out unless `draws`, and if matplotlib, whose import alone takes longer than
+    many a study, is not installed. Raises UserError if the folder holds something else.
     """
     refuse_taken(out, study.kind)
     out.mkdir(parents=True, exist_ok=True)
-    pictures = _pictures(study, out) if undrawn(study) is None else {}
+    pictures = _pictures(study, out) if draws and undrawn(study) is None else {}
     for stem, table in study.data.items():
         write_table(table, out / stem)
     section = Section(

@@ -59,8 +59,16 @@ def studies(small, tmp_path_factory):
         "paper": ["paper"],
     }  # fmt: skip
     for name, typed in commands.items():
-        drawn[name] = ["study", *typed, "--out", folder / name, "--quiet"]
-    drawn["fidelity"] = ["study", "fidelity", run, driven, "--out", folder / "fidelity"]
+        drawn[name] = ["study", *typed, "--out", folder / name, "--quiet", "--pictures"]
+    drawn["fidelity"] = [
+        "study",
+        "fidelity",
+        run,
+        driven,
+        "--out",
+        folder / "fidelity",
+        "--pictures",
+    ]
     for name, typed in drawn.items():
         (folder / name).mkdir(exist_ok=True)
         done = CliRunner().invoke(app, [*map(str, typed)])

@@ -55,6 +55,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Compare contents of messages: intents, objects, both.
 
@@ -93,7 +94,7 @@ def command(
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_in(runs[0], "contents")
         results = run_contents(swarms, panels, draws, where, progress)
-    finish(contents_study(results, draws), where, as_json, quiet, verbose)
+    finish(contents_study(results, draws), where, as_json, quiet, verbose, pictures)
 
 
 def _show_counts(counts: dict[str, dict[str, dict[str, int]]]) -> None:

@@ -28,10 +28,12 @@ def paper(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Compare the calibrated proxy with the paper's numbers.
 
-    It plays the paper's study, and writes a page with both numbers, and Figures A and B.
+    It plays the paper's study, and writes a page with both numbers.
+    With --pictures, it draws Figures A and B.
     """
     from harness.extensions.paper.panels import panels, run_paper
     from harness.studies.study import refuse_other
@@ -48,7 +50,7 @@ def paper(
         "grid points", sum(len(panel.settings) for panel in settings), as_json or quiet
     ) as progress:
         study = run_paper(settings, draws, progress)
-    finish(study, out, as_json, quiet, verbose)
+    finish(study, out, as_json, quiet, verbose, pictures)
 
 
 def closed_loop(
@@ -74,10 +76,11 @@ def closed_loop(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Run the paper's panels with a model in closed loop.
 
-    It draws Figures A and B.
+    With --pictures, it draws Figures A and B.
     """
     from harness.backends import cards
     from harness.backends.cache import default_file
@@ -105,4 +108,4 @@ def closed_loop(
     refuse_taken(where, "closed-loop")
     with bar("layouts", episodes, as_json or quiet) as progress:
         study = run_closed_loop(spec, where, who, progress, default_file())
-    finish(study, where, as_json, quiet, verbose)
+    finish(study, where, as_json, quiet, verbose, pictures)

@@ -88,6 +88,7 @@ def compare(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Compare schedules (whom to ask, and when) on stored answers.
 
@@ -118,4 +119,5 @@ def compare(
         draws = parse_seeds(seeds) if seeds else replayed[0].seeds
         where = out or folder_in(runs[0], "schedules")
         compared = run_schedules(replayed, tuned, condition, names, draws, budget, where, progress)
-    finish(schedule_study(compared, [*replayed, *tuned], draws), where, as_json, quiet, verbose)
+    study = schedule_study(compared, [*replayed, *tuned], draws)
+    finish(study, where, as_json, quiet, verbose, pictures)

@@ -65,6 +65,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Play every attack against every consensus rule.
 
@@ -105,7 +106,7 @@ def command(
             bench = run_bench(
                 replayed, condition, rule_names, attack_names, shares, draws, where, progress
             )
-    finish(trust_study(bench), where, as_json, quiet, verbose)
+    finish(trust_study(bench), where, as_json, quiet, verbose, pictures)
 
 
 def _spec(model: str, prompt: str | None, condition: str, seeds: str | None) -> "Spec":

@@ -24,7 +24,7 @@ def done(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_without_an_axis_it_draws_the_papers_panels_beside_the_proxys(
     harness: Callable[..., Said], done: Path
 ) -> None:
-    code, out, err = harness("study", "sweep", done, "--proxy", "--out", "swept")
+    code, out, err = harness("study", "sweep", done, "--proxy", "--out", "swept", "--pictures")
     assert (code, err) == (0, "")
     assert max(map(len, out.splitlines())) <= 80
     assert out.splitlines()[-1] == "wrote swept/index.html"

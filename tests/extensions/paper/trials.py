@@ -13,7 +13,7 @@ TRIALS = {
         "It is no evidence that a language model would give them",
     ),
     "closed-loop": Trial(
-        "study closed-loop --model proxy --workers 1", "--episodes 1 --seeds 0",
+        "study closed-loop --model proxy --workers 1 --pictures", "--episodes 1 --seeds 0",
         "--episodes 1 --seeds 0 --prompt v1", 
             "was begun with --prompt v2, "
             "and not with --prompt v1",

@@ -556,6 +556,7 @@ def test_the_command_prints_writes_and_gates(
 ) -> None:
     code, out, err = harness(
         "study", "twins", "--model", "proxy-faulty", "--sample", "3", "--workers", "1", "--out", "faulty",
+        "--pictures",
         "--fail-if", "order:invariance_rate < 0.99", "--fail-if", "ids:tv_distance > 0.5",
     )  # fmt: skip
     assert (code, err) == (1, "")

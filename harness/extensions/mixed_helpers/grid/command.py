@@ -38,6 +38,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Evaluate every combination of ego and helper agents.
 
@@ -83,7 +84,7 @@ def command(
     with bar(f"{cells} combinations", quiet=as_json or quiet, grows=True) as progress:
         cache = None if no_cache else default_file()
         grid = run_cells(spec, egos, helpers, folder, progress, cache)
-    finish(grid_study(grid, spec, folder), folder, as_json, quiet, verbose)
+    finish(grid_study(grid, spec, folder), folder, as_json, quiet, verbose, pictures)
 
 
 def _of_helpers(settings: Settings) -> Settings:

@@ -23,6 +23,7 @@ def command(
     out: Annotated[Path, Option(help="Folder to write.")] = Path("reports/reaction"),
     as_json: options.Json = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Compare courses where others react and where they replay.
 
@@ -37,4 +38,4 @@ def command(
     refuse_other(out, "reaction", {"sources": manifest["sources"]})
     with bar("following courses", len(react.episodes), quiet=as_json) as progress:
         study = reaction_study(reaction(react, replay, progress), manifest)
-    finish(study, out, as_json, verbose=verbose)
+    finish(study, out, as_json, verbose=verbose, pictures=pictures)

@@ -14,6 +14,7 @@ def command(
     out: Path = typer.Option(Path("reports/fidelity"), help="Folder to write."),
     as_json: options.Json = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Compare frozen with closed-loop success, paired by episode.
 
@@ -26,4 +27,4 @@ def command(
     with bar("comparing frozen with closed loop", quiet=as_json):
         study = fidelity_study(fidelity(runs), runs)
         refuse_other(out, study.kind, {"sources": study.manifest["sources"]})
-    finish(study, out, as_json, verbose=verbose)
+    finish(study, out, as_json, verbose=verbose, pictures=pictures)

@@ -40,6 +40,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.QuietOutput = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Evaluate several times, with other draws of answers.
 
@@ -87,7 +88,7 @@ def command(
         bar(text, quiet=quiet or as_json, grows=True) as progress,
     ):
         done = run_repeats(spec, repeats, folder, progress, cache)
-    finish(repeats_study(done), folder, as_json, quiet, verbose)
+    finish(repeats_study(done), folder, as_json, quiet, verbose, pictures)
 
 
 def _check(spec: "Spec", repeats: int) -> None:

@@ -56,6 +56,7 @@ def command(
     as_json: options.Json = False,
     quiet: options.Quiet = False,
     verbose: options.Verbose = False,
+    pictures: options.Pictures = False,
 ) -> None:
     """Test whether answers to a question and its twin agree.
 
@@ -120,6 +121,7 @@ def command(
         rows = scoring.rows(pairs, twins, data.episodes, data.clusters)
         verdicts = [scoring.judge(each, rows) for each in gates]
         write_pairs(pairs, where)
-        finish(twins_study(questions, rows, verdicts, unanswered), where, as_json, quiet, verbose)
+        study = twins_study(questions, rows, verdicts, unanswered)
+        finish(study, where, as_json, quiet, verbose, pictures)
     work.tidy(where)
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
