@@ -122,8 +122,10 @@ def package_versions() -> dict[str, str]:
     for group in filter(lambda group: group.startswith("swarmdrive."), groups):
         for entry in entries(group).values():
             name = _name_of(getattr(entry, "dist", None))
-            version = getattr(getattr(entry, "dist", None), "version", None)
-            if name and name != OURS and isinstance(version, str):
+            if not name or name == OURS:  # before the version, for which metadata are read
+                continue
+            version = getattr(entry.dist, "version", None)
+            if isinstance(version, str):
                 versions[printable(name)] = printable(version)
     return dict(sorted(versions.items()))
 
