@@ -1,6 +1,7 @@
 """Holm's correction and p-values of intervals, by hand and against SciPy."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from harness.core.multiplicity import LEAST, holm, p_of_bootstrap, p_value
-from harness.core.statistics import episode_interval, rate_difference
+from harness.core.multiplicity import LEAST, LEVEL, clear, holm, p_of_bootstrap, p_value
+from harness.core.statistics import Estimate, episode_interval, rate_difference
 
 SHARES = st.lists(st.floats(0, 1), min_size=1, max_size=12)
 
@@ -39,6 +40,20 @@ def test_holm_lies_between_no_correction_and_bonferroni_and_keeps_the_order(
     assert shown == pytest.approx(sorted(corrected)[: len(picked)]), (
         "the least are corrected as among all"
     )
+
+
+def of_values(values: list[int], level: float) -> Estimate:
+    return episode_interval(np.array(values, dtype=float), level=level)
+
+
+@given(st.lists(st.lists(st.integers(-9, 9), min_size=1, max_size=9), max_size=6))
+@pytest.mark.slow
+def test_what_is_clear_is_what_a_corrected_p_says(differences: list[list[int]]) -> None:
+    intervals = {str(n): partial(of_values, values) for n, values in enumerate(differences)}
+    p_values = [p_value(interval) for interval in intervals.values()]
+    corrected = holm([1.0 if p is None else p for p in p_values])
+    below = {name for name, p in zip(intervals, corrected, strict=True) if p <= LEVEL}
+    assert clear(intervals) == below
 
 
 def test_false_alarms_among_many_true_nothings_stay_at_five_percent() -> None:

@@ -55,7 +55,6 @@ def after_run(run: "Run") -> None:
     many layouts decide it, and any other run for one to compare it with.
     """
     from harness.backends.registry import is_from_file
-    from harness.core.multiplicity import LEVEL
     from harness.report.words import compared, gain
     from harness.runs.listing import FAILED, UNREAD
     from harness.runs.metric_names import ALL
@@ -73,7 +72,7 @@ def after_run(run: "Run") -> None:
             echo_next("prompt", "check", prompt, "--model", model)
         return
     best, base = compared(run)
-    if base and gain(run, best, base)[1] > LEVEL and _may_plan(run, best):
+    if base and not gain(run, best, base)[1] and _may_plan(run, best):
         echo_next("plan", run.path)
         return
     for other in _beside(run):

@@ -1,7 +1,7 @@
 """p-values of differences between two runs, and Holm's correction for many comparisons."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -52,6 +52,23 @@ def p_of_bootstrap(value: float, low: float, high: float) -> float | None:
     if half <= 0:  # without spread on that side, only whether 0 is excluded is known
         return LEVEL if value else 1.0
     return float(2 * normal_share(-abs(value) / half * normal_quantile(0.975)))
+
+
+def clear(intervals: Mapping[str, Callable[[float], Estimate]]) -> set[str]:
+    """Return the names of the differences whose p-value, corrected by Holm's method, is `LEVEL` at
+    most.
+
+    `intervals` are by name, each as `p_value` takes it. One or two of each tell, where its p-value
+    needs some twenty and SciPy's search for a root.
+    """
+    names = set[str]()
+    while rest := intervals.keys() - names:
+        here = {name: intervals[name](1 - LEVEL / len(rest)) for name in rest}
+        more = {name for name, each in here.items() if each.low > 0 or each.high < 0}
+        if not more:
+            break
+        names |= more
+    return names
 
 
 def holm(p_values: Sequence[float], comparisons: int | None = None) -> list[float]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from markupsafe import Markup
@@ -10,7 +11,7 @@ from harness.core.covariate import worth
 from harness.core.errors import printable
 from harness.core.figures import PERCENT, POINTS, within
 from harness.core.figures import interval_of as shown_estimate
-from harness.core.multiplicity import LEVEL, holm
+from harness.core.multiplicity import clear
 from harness.core.statistics import Estimate
 from harness.report.caveats import doubted
 from harness.runs.estimates import written
@@ -72,30 +73,31 @@ def headline(run: Run | SuiteRun) -> str:
         unwarned = " without a warning" if doubted(*_runs(run)) else ""
         return f"{text}, and no other condition{unwarned} does better."
     pairs = plays(_runs(run), metric).pairs(best, base)
-    clear = judged(*gain(run, best, base))
+    change = judged(*gain(run, best, base))
     if metric == SUCCESS:
         text = f"Under {best}, {model} clears {value} of the episodes{families}; under {base}, "
-        return f"{text}{_value_text(run, base, metric)}: {clear}."
+        return f"{text}{_value_text(run, base, metric)}: {change}."
     shares = [_value_text(run, best, half) for half in entry(metric).halves]
     changes = [shown_change(half_difference(pairs, dangerous)) for dangerous in (True, False)]
     return (
         f"Under {best}, {model} succeeds in {shares[0]} of the layouts with a danger, {changes[0]} "
         f"against {base}, and in {shares[1]} of those without, {changes[1]}{families}; the mean of "
-        f"both is {value}, {clear}."
+        f"both is {value}, {change}."
     )
 
 
-def gain(run: Run | SuiteRun, best: str, base: str) -> tuple[Estimate, float]:
-    """Return what success gains in one condition over another, and its p-value.
+def gain(run: Run | SuiteRun, best: str, base: str) -> tuple[Estimate, bool]:
+    """Return what success gains in one condition over another, and whether that is clear.
 
     `best` and `base` name the conditions (sets of settings). Success is balanced if the run has
-    that. The p-value is corrected by Holm's method for all of the run's conditions, of which the
-    best was chosen.
+    that. It is clear by Holm's method for all of the run's conditions, of which the best was
+    chosen.
     """
-    p = p_values(run, base)
-    corrected = dict(zip(p, holm(list(p.values())), strict=True))
-    pairs = plays(_runs(run), headline_of(run)).pairs(best, base)
-    return mean_difference(pairs), corrected[best]
+    played, intervals = plays(_runs(run), headline_of(run)), {}
+    for condition in run.conditions:
+        if condition != base:
+            intervals[condition] = partial(mean_difference, played.pairs(condition, base))
+    return intervals[best](), best in clear(intervals)
 
 
 def questions(run: Run) -> str:
@@ -125,8 +127,8 @@ def shown_change(change: Estimate) -> str:
     return f"{shown_estimate(change, POINTS, '+')} points"
 
 
-def judged(change: Estimate, p: float, bounded: bool = True) -> str:
-    """Return a difference of success as text that says whether it is clear (`p` is at most 0.05).
+def judged(change: Estimate, is_clear: bool, bounded: bool = True) -> str:
+    """Return a difference of success as text that says whether it is clear.
 
     If it is not clear, the text says how large the difference can be by its interval, unless
     `bounded` is false.
@@ -137,7 +139,7 @@ def judged(change: Estimate, p: float, bounded: bool = True) -> str:
     unclear = "not clear"
     if bounded:
         unclear += f", but within {within(change.low, change.high)}"
-    return f"{text}, {'a clear difference' if p <= LEVEL else unclear}"
+    return f"{text}, {'a clear difference' if is_clear else unclear}"
 
 
 def compared(run: Run | SuiteRun) -> tuple[str, str]:
