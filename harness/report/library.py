@@ -10,7 +10,6 @@ here: what another package or release puts in its place runs in no page.
 import base64
 import gzip
 import hashlib
-import json
 import re
 from functools import cache
 from importlib.metadata import distribution, version
@@ -18,6 +17,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from markupsafe import Markup
 
 from harness.core.errors import UserError
@@ -104,10 +104,18 @@ def licence() -> str:
 
 def packed(value: Any) -> Markup:
     """Return text, or any other value as JSON, compressed by gzip and encoded in base64."""
-    text = value
-    if not isinstance(value, str):
-        text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return Markup(base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode())
+    data = value.encode() if isinstance(value, str) else _JSON.encode(value)
+    return Markup(base64.b64encode(gzip.compress(data, 6, mtime=0)).decode())
+
+
+def _base(value: Any) -> Any:
+    """Return a float or text of another class, such as NumPy's, as a plain one."""
+    if isinstance(value, float | str):
+        return float(value) if isinstance(value, float) else str(value)
+    raise NotImplementedError
+
+
+_JSON = msgspec.json.Encoder(enc_hook=_base)
 
 
 def picture(content: bytes, kind: str = "svg+xml") -> str:
