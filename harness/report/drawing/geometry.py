@@ -154,9 +154,13 @@ def spots(
     wanted = {*who, state.ego.id, *(conflict.vehicle for conflict in conflicts)}
     wanted |= {graph.viewer} if graph else set()
     at = [(v.x_m, v.y_m) for v in state.vehicles if v.id in wanted]
-    points: Floats = np.concatenate([north_up(np.array([*at, zone_m])), crossings])
-    near: Floats = points[np.abs(points - points[0]).max(axis=1) <= NEAR_M]
-    return near
+    points = [[x_m, -y_m] for x_m, y_m in (*at, zone_m)]
+    points += crossings.tolist()
+    (east_m, north_m), near = points[0], []
+    for x_m, y_m in points:
+        if abs(x_m - east_m) <= NEAR_M and abs(y_m - north_m) <= NEAR_M:
+            near.append((x_m, y_m))
+    return np.array(near)
 
 
 def view_of(held: Floats, shape: float = 1.0) -> View:
@@ -164,7 +168,8 @@ def view_of(held: Floats, shape: float = 1.0) -> View:
 
     It is centred on them as far as the world's edge allows; its height is `shape` times its width.
     """
-    (west, south), (east, north) = held.min(axis=0).tolist(), held.max(axis=0).tolist()
+    eastward, northward = held.T.tolist()  # of a few points, for which NumPy takes longer
+    west, east, south, north = min(eastward), max(eastward), min(northward), max(northward)
     width = max(LEAST_M, east - west + 2 * MARGIN_M, (north - south + 2 * MARGIN_M) / shape)
 
     def start(low: float, high: float, size: float) -> float:
