@@ -12,7 +12,6 @@ from harness.core.plugins import Plugins
 # The package and its extra, by the module that is imported.
 OPTIONAL = Plugins[tuple[str, str]]("swarmdrive.extras", tuple, {
     "highway_env": ("highway-env", "sim"),
-    "scipy": ("scipy", "sim"),
     "matplotlib": ("matplotlib", "report"),
     "PIL": ("pillow", "report"),
     "libsumo": ("libsumo", "sumo"),

@@ -15,7 +15,7 @@ from harness.core.plugins import package_versions
 # version is not resumed.
 PARSER, DECISIONS = 2, 1
 FIGURES = 2  # of what summary.csv has of decisions and answers; runs that state none are of 1
-PACKAGES = ("numpy", "scipy", "jinja2", "highway-env", "torch", "transformers", "llama-cpp-python")
+PACKAGES = ("numpy", "jinja2", "highway-env", "torch", "transformers", "llama-cpp-python")
 
 
 _version = cache(metadata.version)

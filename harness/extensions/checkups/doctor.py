@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 MARGIN = 10
 PACKAGES = (
     "numpy",
-    "scipy",
     "pandas",
     "jinja2",
     "highway-env",

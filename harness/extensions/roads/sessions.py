@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.core.extras import need
 from harness.core.seeds import FIRST, Purpose
 from harness.extensions.roads.tables import Scene, Track
 
@@ -136,21 +135,24 @@ class Sessions:
 
 def _firsts(places: Sequence[Ints]) -> Iterable[int]:
     """Return for each of n scenes the first that it shares traffic with, itself or by others."""
-    need("recorded traffic", "scipy")
-    from scipy.sparse import csgraph, csr_array
+    firsts = list(range(len(places)))
+    for (one, other), common in sorted(_common(places).items()):
+        if common * SHARED > min(len(places[one]), len(places[other])):
+            first, second = sorted((firsts[one], firsts[other]))
+            firsts = [first if each == second else each for each in firsts]
+    return firsts
 
-    counts = np.array([len(each) for each in places])
-    scenes = np.repeat(np.arange(len(places)), counts)
-    _, columns = np.unique(np.concatenate([*places, np.empty(0, np.int64)]), return_inverse=True)
-    shape = len(places), max(int(counts.sum()), 1)
-    has = csr_array((np.ones(len(scenes), dtype=np.int64), (scenes, columns)), shape=shape)
-    common = (has @ has.T).tocoo()
-    many = common.data * SHARED > np.minimum(counts[common.row], counts[common.col])
-    pairs = common.row[many], common.col[many]
-    links = csr_array((np.ones(int(many.sum())), pairs), shape=(len(places), len(places)))
-    _, group = csgraph.connected_components(links, directed=False)
-    _, first = np.unique(group, return_index=True)
-    return [int(first[each]) for each in group]
+
+def _common(places: Sequence[Ints]) -> Counter[tuple[int, int]]:
+    """Return how many places two of n scenes have in common, where they have one."""
+    common = Counter[tuple[int, int]]()
+    scenes_of: dict[int, list[int]] = {}
+    for scene, each in enumerate(places):
+        for place in each.tolist():
+            scenes = scenes_of.setdefault(place, [])
+            common.update((earlier, scene) for earlier in scenes)
+            scenes.append(scene)
+    return common
 
 
 def dealt(session: str) -> Purpose:
