@@ -5,8 +5,9 @@ runs the benchmarks that have rows in it.
 
 A benchmark says in constants with which options it is run: `TABLE` for the table (some minutes in
 all), and `SMALLEST` in seconds, as the tests run it. Its last line is JSON with `rows` (rows.py).
-Others' load is the mean number of cores that other processes took meanwhile. What fails is named
-under the table.
+Others' load is the mean number of cores that other processes took meanwhile. Before is the figure
+on the page that is committed, and what is 10 % worse than it is marked. What fails is named under
+the table.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import ast
 import json
 import os
 import platform
+import re
 import resource
 import shlex
 import subprocess
@@ -28,7 +30,12 @@ from rows import Row
 
 SMALLEST = "--smallest --only coordinate"
 HERE = Path(__file__).parent
-HEADS = ("what", "measured", "n", "aim", "limit", "measured / limit", "peer", "others' load")
+HEADS = (
+    *("what", "measured", "before", "n", "aim", "limit", "measured / limit", "peer"),
+    "others' load",
+)
+WORSE = 1.1  # times as much, or as little where more is better, is marked
+MORE = ("/s", "times")  # units of which more is better
 BUSY = ("user", "nice", "system", "irq", "softirq")  # of the times in /proc/stat
 TIMES = ("user", "nice", "system", "idle", "iowait", "irq", "softirq")
 
@@ -43,6 +50,7 @@ def main() -> None:
     )
     given = arguments.parse_args()
     lines, failed = [heads(HEADS)], []
+    before = figures(committed(given.page)) if given.page else {}
     start = perf_counter()
     for script, stated in scripts().items():
         if "TABLE" not in stated or given.only not in script.stem:
@@ -62,7 +70,7 @@ def main() -> None:
             failed.append(f"`{script.name}` failed.")
         else:
             found = json.loads(done.stdout.splitlines()[-1])["rows"]
-            lines += [line(Row(**row), load) for row in found]
+            lines += [line(Row(**row), load, before) for row in found]
     took = f"{perf_counter() - start:.0f} s in all."
     text = "\n".join([machine(), "", *lines, "", " ".join([took, *failed])])
     print(text)
@@ -95,16 +103,41 @@ def heads(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |\n|{'---|' * len(cells)}"
 
 
-def line(row: Row, load: float) -> str:
-    """Return a row's line."""
+def committed(page: Path) -> str:
+    """Return a page as it is committed; nothing of one that is not."""
+    words = ["git", "-C", str(page.parent), "show", f"HEAD:./{page.name}"]
+    printed: str = subprocess.run(words, capture_output=True, text=True).stdout
+    return printed
+
+
+def figures(text: str) -> dict[str, str]:
+    """Return what a page's table says was measured, by the row's name."""
+    return dict(re.findall(r"^\| ([^|]+) \| (\d[^|]*) \|", text, flags=re.MULTILINE))
+
+
+def line(row: Row, load: float, before: Mapping[str, str]) -> str:
+    """Return a row's line; `before` has former figures by the row's name."""
     limit, ratio = "", ""
     if row.limit is not None:
         limit, ratio = (
             shown(row.limit, row.unit),
             f"{row.measured / row.limit:.2g}" if row.limit else "",
         )
-    cells = (row.what, shown(row.measured, row.unit), str(row.n), row.aim, limit, ratio, row.peer)
+    former = before.get(row.what, "")
+    mark = ", **worse**" if is_worse(row, former) else ""
+    figure = shown(row.measured, row.unit)
+    cells = (row.what, figure, former + mark, str(row.n), row.aim, limit, ratio, row.peer)
     return f"| {' | '.join(cells)} | {load:.1f} |"
+
+
+def is_worse(row: Row, former: str) -> bool:
+    """Return whether a figure is `WORSE` than a former one, such as `2 ms`, in the same unit."""
+    number, _, unit = former.partition(" ")
+    if unit != row.unit or not row.measured:
+        return False
+    is_more_better = unit in MORE or "of ideal" in row.what
+    ratio = row.measured / float(number)
+    return (1 / ratio if is_more_better else ratio) > WORSE
 
 
 def shown(value: float, unit: str) -> str:

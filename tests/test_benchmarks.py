@@ -56,7 +56,7 @@ def test_a_benchmark_runs_at_its_smallest(
     if "TABLE" in stated:
         found = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
         assert found
-        assert all(table.line(rows.Row(**row), 0.0).count("|") == 9 for row in found)
+        assert all(table.line(rows.Row(**row), 0.0, {}).count("|") == 10 for row in found)
 
 
 def test_the_page_names_every_benchmark() -> None:
@@ -64,6 +64,27 @@ def test_the_page_names_every_benchmark() -> None:
     assert set(re.findall(r"python benchmarks/(\w+)\.py", page)) == {
         script.stem for script in SCRIPTS
     }
+
+
+@pytest.mark.parametrize(
+    ("unit", "measured", "mark"),
+    [
+        ("s", 1.2, ", **worse**"),
+        ("s", 1.05, ""),
+        ("s", 0.5, ""),
+        ("/s", 0.9, ", **worse**"),
+        ("/s", 2.0, ""),
+        ("ms", 9.0, ""),  # the page has another unit
+    ],
+)
+def test_what_is_a_tenth_worse_than_the_page_is_marked(
+    unit: str, measured: float, mark: str
+) -> None:
+    """The page is one that a table itself was written to."""
+    former = "/s" if unit == "/s" else "s"
+    page = "\n".join([table.heads(table.HEADS), table.line(rows.Row("it", 1, former, 1), 0, {})])
+    line = table.line(rows.Row("it", measured, unit, 1), 0, table.figures(page))
+    assert line.split(" | ")[2] == f"1 {former}{mark}"
 
 
 @pytest.mark.slow
