@@ -1,6 +1,6 @@
 """Hold what a recording states against its tables: nothing that can be computed is taken."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
@@ -9,6 +9,7 @@ import numpy as np
 
 from harness.core.errors import UserError, printable
 from harness.extensions.environments.place import AFTER
+from harness.extensions.roads.moments import conflicts_at
 from harness.extensions.roads.sessions import Sessions, Traffic
 from harness.extensions.roads.tables import EARLY_S, FACTS, SLACK_M, Facts, Moment, Recording, Scene
 
@@ -57,8 +58,14 @@ def _computed(recording: Recording) -> _Computed:
     for scene in recording.scenes():
         traffic[scene.name] = Traffic.of(scene)
         speeds.add(scene)
+        possible_moments: list[Moment] = []
         for moment in by_scene.get(scene.name, ()):
-            problems += _problems(scene, moment, recording.facts)
+            of_moment = list(_problems(scene, moment, recording.facts))
+            problems += of_moment
+            if not of_moment:
+                possible_moments.append(moment)
+        if possible_moments:
+            problems += _other_conflicts(scene, possible_moments, recording.facts)
     return _Computed(Sessions.of(traffic), speeds.targets_mps(), next(iter(problems), None))
 
 
@@ -71,7 +78,7 @@ def hold(recording: Recording) -> None:
     """Raise UserError where a recording states what its tables do not give.
 
     Such are target speeds, purposes of moments, moments of somebody who is not there so long, and
-    those of a scene that is another one again.
+    those of a scene that is another one again; and who is hidden at a moment, and when both meet.
     """
     computed, until_s = _computed(recording), horizon_s(recording.facts)
     problem = computed.problem
@@ -113,6 +120,22 @@ def _problems(scene: Scene, moment: Moment, facts: Facts) -> Iterator[str]:
             yield f"{_which(moment)}; its hidden road user is not there then"
         elif np.hypot(*(here - there_then)[:2]) > facts.window_m + SLACK_M:
             yield f"{_which(moment)}; its hidden road user is beyond {facts.window_m:g} m"
+
+
+def _other_conflicts(scene: Scene, moments: Sequence[Moment], facts: Facts) -> Iterator[str]:
+    """Yield what moments whose vehicles are there state of a conflict that the tables do not."""
+    conflicts = conflicts_at(scene, moments, facts.window_m, horizon_s(facts))
+    for moment, conflict in zip(moments, conflicts, strict=True):
+        claim = moment.hidden, moment.conflict_s
+        if claim != conflict:
+            given = _conflict_text(*conflict)
+            yield f"{_which(moment)} with {_conflict_text(*claim)}; its tables give {given}"
+
+
+def _conflict_text(hidden: str | None, conflict_s: float | None) -> str:
+    if hidden is None:
+        return "nobody hidden in conflict"
+    return f"{printable(hidden, 60)} hidden and in conflict after {conflict_s:g} s"
 
 
 def _which(moment: Moment) -> str:

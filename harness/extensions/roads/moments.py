@@ -469,6 +469,23 @@ class _Meetings:
         return _Meetings(self.row[which], self.other[which], self.arrival[which])
 
 
+def conflicts_at(
+    scene: Scene, moments: Sequence[Moment], window_m: float, horizon_s: float
+) -> list[tuple[str | None, float | None]]:
+    """Return for moments of a scene who is hidden, and after how many seconds both meet, or None.
+
+    Their vehicles must be there then.
+    """
+    frames = _Frames.of(scene)
+    numbers = {track.id: number for number, track in enumerate(frames.tracks)}
+    track = np.array([numbers[moment.vehicle] for moment in moments], dtype=np.int64)
+    frame = np.array([round(moment.time_s * MOMENTS_HZ) for moment in moments], dtype=np.int64)
+    rows = frames.rows(track, frame)
+    horizon, gap = round(horizon_s * MOMENTS_HZ), round(SHORT_PET_S * MOMENTS_HZ)
+    conflicts = _hidden_conflicts(scene, frames, rows, window_m, horizon, gap)
+    return [conflicts.get(row, (None, None)) for row in rows.tolist()]
+
+
 def _hidden_conflicts(
     scene: Scene, frames: _Frames, rows: Ints, window_m: float, horizon: int, gap: int
 ) -> dict[int, tuple[str, float]]:

@@ -46,6 +46,9 @@ EDITS: dict[str, Edit | None] = {
     "no\\x1bbody at 1 s, and nobody there is called so": of_moment(vehicle="no\x1bbody"),
     "e1 at 1 s; its hidden road user is not there": of_moment(hidden="e1", conflict_s=1.0),
     "e1 at 1 s; its hidden road user is beyond 80 m": of_moment(hidden="q", conflict_s=1.0),
+    "e1 at 1 s with e0 hidden and in conflict after 1 s; its tables give nobody": of_moment(
+        hidden="e0", conflict_s=1.0
+    ),
     "one of hidden and conflict_s": of_moment(hidden="e0"),
     "decisions 4, and moments of another number": lambda facts: facts.update(
         decisions=4, choice={"horizon_s": 5.0}
