@@ -12,10 +12,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from msgspec import structs
 
 from harness.core.files import sha256_file
 from harness.core.progress import Progress
-from harness.dataset.card import hub_size
+from harness.dataset.card import Table, hub_size, readme
 from harness.dataset.columns import COLUMNS
 from harness.dataset.load import Dataset
 from harness.dataset.publish import publish
@@ -114,6 +115,31 @@ def test_the_card_and_the_croissant_file_name_every_table_and_column(
     assert [field["name"] for field in table["field"]] == [column.name for column in COLUMNS]
     assert all(f"| `{column.name}` |" in text for column in COLUMNS)
     assert "license" not in document  # nobody has stated it
+
+
+@pytest.mark.parametrize(
+    ("licences", "word"),
+    [
+        (["CC-BY-4.0"], "cc-by-4.0"),
+        (["Apache-2.0", "apache-2.0"], "apache-2.0"),
+        (["CC-BY-4.0", "CC0-1.0"], "other"),
+        (["terms of highD"], "other"),
+        (["unknown"], "unknown"),
+        (["CC-BY-4.0", None], "unknown"),
+        ([""], "unknown"),
+    ],
+)
+def test_the_front_matter_says_of_terms_what_the_page_says(
+    licences: list[str | None], word: str, small: Dataset
+) -> None:
+    tables = []
+    for n, licence in enumerate(licences):
+        manifest = structs.replace(small.manifest, name=f"set-{n}", licence=licence)
+        tables.append(Table(manifest, "0" * 64, "", 0.1, False, "v", 9, "0" * 64, 9, {}))
+    [_, head, text] = readme("sets", tables).split("---\n", 2)
+    assert yaml.safe_load(head)["license"] == word
+    terms = [f"- `set-{n}`: `{each}`" for n, each in enumerate(licences) if each]
+    assert "\n".join(terms) in text
 
 
 @pytest.mark.parametrize(

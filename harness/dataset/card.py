@@ -33,6 +33,11 @@ PAPER = "https://arxiv.org/abs/2604.22852"
 SIMULATED = "The scenes are simulated: no recording of a real road, vehicle or person is in them."
 UNSTATED = "Not stated: whoever built the dataset decides. Write it here and above."
 LICENCE = "https://www.apache.org/licenses/LICENSE-2.0"
+# The hub's words for licences that data have and SPDX writes so, too, but for capitals.
+HUB_LICENCES = {
+    *("apache-2.0", "mit", "bsd-2-clause", "bsd-3-clause", "cc0-1.0"),
+    *(f"cc-by{kind}-4.0" for kind in ("", "-sa", "-nc", "-nd", "-nc-sa", "-nc-nd")),
+}
 # rows at which the hub's sizes end
 SIZES = (1_000, 10_000, 100_000, 1_000_000, 10_000_000, 100_000_000)
 KINDS = {"string": "sc:Text", "int64": "sc:Integer", "double": "sc:Float", "bool": "sc:Boolean"}
@@ -109,9 +114,25 @@ def readme(name: str, tables: Sequence[Table]) -> str:
 
 def _licence(tables: Sequence[Table]) -> str:
     """Return what datasets state of the terms of their traffic; a line that asks for it if none."""
-    licences = {t.name: t.manifest.licence for t in tables if t.manifest.licence}
-    lines = _lines(f"- `{name}`: {_code(licence)}" for name, licence in licences.items())
+    licences = {t.name: _stated_licence(t) for t in tables}
+    lines = _lines(f"- `{name}`: {_code(text)}" for name, text in licences.items() if text)
     return lines or UNSTATED
+
+
+def _stated_licence(t: Table) -> str | None:
+    return "Apache-2.0" if t.released else t.manifest.licence
+
+
+def hub_licence(licences: Sequence[str | None]) -> str:
+    """Return the hub's word for the terms of tables, of which each states a licence or none.
+
+    It is `unknown` if any has none, and `other` if the hub has no word, or tables differ.
+    """
+    words = {(licence or "unknown").lower() for licence in licences}
+    if "unknown" in words:
+        return "unknown"
+    word, *others = words
+    return word if word in HUB_LICENCES and not others else "other"
 
 
 def _origin(tables: Sequence[Table]) -> str:
@@ -129,7 +150,7 @@ def _front_matter(name: str, tables: Sequence[Table]) -> dict[str, Any]:
         files = [{"split": t.split, "path": t.path}]
         configs.append({"config_name": t.name, "data_files": files})
     return {
-        "license": "apache-2.0" if all(t.released for t in tables) else "unknown",
+        "license": hub_licence([_stated_licence(t) for t in tables]),
         "pretty_name": name,
         "language": ["en"],
         "task_categories": ["text-generation", "reinforcement-learning", "robotics"],
