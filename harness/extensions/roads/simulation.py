@@ -144,8 +144,12 @@ def version() -> str:
 def _sumo() -> Any:
     need("traffic of SUMO", "libsumo")
     os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")  # else it prints a warning about pyarrow
-    import libsumo
-
+    try:
+        import libsumo
+    except ImportError as error:  # it imports packages of SUMO's that come apart from it
+        raise UserError(
+            f"libsumo cannot be imported ({one_line(error)}); run `pip install traci sumolib`"
+        ) from None
     return libsumo
 
 

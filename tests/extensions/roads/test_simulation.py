@@ -1,5 +1,6 @@
 """Traffic of SUMO: a run is a function of files, seed and commands, and opens no other file."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,16 @@ def test_without_the_package_one_line_says_how_to_install_it(monkeypatch):
     monkeypatch.setattr("harness.core.extras.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"run `pip install 'swarmdrive-harness\[sumo\]'`"):
         run(Inputs(b"", b""), 0, 0, 1)
+
+
+def test_without_what_libsumo_imports_it_says_what_to_install(tmp_path, monkeypatch):
+    (tmp_path / "libsumo.py").write_text("from traci import connection\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "libsumo", raising=False)
+    monkeypatch.setitem(sys.modules, "traci", None)
+    simulation._sumo.cache_clear()
+    with pytest.raises(UserError, match=r"libsumo cannot be .*; run `pip install traci sumolib`"):
+        simulation.version()
 
 
 @pytest.mark.exhaustive
