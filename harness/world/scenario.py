@@ -202,6 +202,11 @@ class Scenario:
         """
         return self.world is not None
 
+    @property
+    def caveat(self) -> str:
+        """Return a sentence that whoever learns from it is told; empty for none."""
+        return ""
+
     def at(self, seed: int) -> "Scenario":
         """Return the scenario as the layout of a seed has it, with that layout's road.
 

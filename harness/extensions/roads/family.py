@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 PREFIX, OPTION = "recording:", "recording"
 FOLDERS = "SWARMDRIVE_RECORDINGS"  # environment variable: folders that may hold recordings
+REPLAYED = (
+    "The others do not react (react=false): they drive as they were recorded to, and strike an ego "
+    "that is slower than the recorded driver was."
+)
 _FOLDERS = Folders(FOLDERS)
 
 

@@ -9,6 +9,7 @@ from harness.core.errors import printable
 from harness.core.figures import POINTS, interval_of
 from harness.core.statistics import Estimate, rate_interval
 from harness.dataset.forest import Forest
+from harness.extensions.roads.family import REPLAYED
 from harness.report.document import Section, Table
 from harness.runs.folder import Run
 from harness.runs.headline import SUCCESS
@@ -18,10 +19,7 @@ from harness.runs.success import Success
 
 REGRET = "regret_rate"
 SHOWN = 20  # layouts that the page lists
-REPLAYED = (
-    "The others do not react (react=false): they drive as they were recorded to, and strike an ego "
-    "that is slower than the recorded driver was. `harness study reaction` says what that is worth."
-)
+WORTH = "`harness study reaction` says what that is worth."
 HEADS = ("who", "success %", "regret %", "minus the recorded driver", "better", "worse")
 
 
@@ -66,7 +64,7 @@ def section(run: Run) -> Section | None:
             "over what layouts are cut from."
         ],
         tables,
-        caveats=() if reacts else (REPLAYED,),
+        caveats=() if reacts else (f"{REPLAYED} {WORTH}",),
     )
 
 

@@ -13,7 +13,7 @@ from harness.extensions.environments.place import LIMIT
 from harness.extensions.environments.world import EnvironmentScenario, EnvironmentWorld
 from harness.extensions.environments.world import scenario as scenario_of_environment
 from harness.extensions.roads import driver
-from harness.extensions.roads.family import recording_of
+from harness.extensions.roads.family import REPLAYED, recording_of
 from harness.extensions.roads.held import sessions_of
 from harness.extensions.roads.tables import FACTS, SCHEMAS
 from harness.extensions.roads.traffic import LIMITS_MPS2, Recorded, nth, setting
@@ -184,6 +184,10 @@ class RecordedScenario(EnvironmentScenario):
         if self.layouts is not None:
             layouts = self.by_seed(self.name, self.parameters)
             object.__setattr__(self, "layouts", layouts)
+
+    @property
+    def caveat(self) -> str:
+        return "" if getattr(self.parameters, "react", True) else REPLAYED
 
 
 @dataclass(frozen=True)

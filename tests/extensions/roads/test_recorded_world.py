@@ -353,6 +353,30 @@ def test_a_dataset_is_sound_and_has_its_recording(
     assert (sorted(same), others) == (sorted(written), [[], []])
 
 
+@pytest.mark.slow
+def test_who_learns_from_others_that_do_not_react_is_told(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    harness: Callable[..., tuple[int, str, str]],
+) -> None:
+    moments = [Moment("s", "e1", 2.0, None, None, "train")]
+    facts = {"rule": "by hand", "candidates": 1, "left_out": {}}
+    place = tmp_path / "street"
+    place.mkdir()
+    speeds_mps = (0.0, 5.0, 10.0)
+    tables.write(place, "hand", "", "CC0-1.0", 80.0, [crossing()], moments, facts, speeds_mps, 1)
+    name = RECORDINGS.named({"recording": str(place)})
+    harness("init", "project")
+    monkeypatch.chdir("project")
+    for settings, lines in ((":react=true", 1), (":react=false", 2)):
+        Path("prompts/mine/examples.json").unlink(missing_ok=True)
+        typed = ("prompt", "examples", "mine", "--scenario", name + settings, "--count", 1)
+        code, out, err = harness(*typed)
+        assert (code, err) == (0, "")
+        assert len(out.splitlines()) == lines
+        assert (family.REPLAYED in out) == (lines == 2)
+
+
 def test_a_recording_is_found_by_its_digest_alone(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,6 +19,7 @@ from harness.core.seeds import FIRST, LAST_SEED, purpose, seeds_text
 
 if TYPE_CHECKING:
     from harness.backends.card import Card
+    from harness.world.scenario import Scenario
 
 SAMPLES = "60000,160000,30000,50000"
 BATCH = 16
@@ -138,6 +139,7 @@ def distill(
     drawn = layouts * len(learnt)
     for each in learnt:
         typer.echo(printable(scenarios.title(each)))
+        _say_caveat(each)
     with bar("drawing layouts", drawn) as progress:
 
         def show(stage: str, seen: int, loss: float, *watched: float) -> None:
@@ -206,6 +208,12 @@ def examples(
         drawn = prompt_examples.examples(draft, played, count, first_seed, progress)
     write_whole(file, text_of(drawn))
     typer.echo(f"wrote {printable(file)} of {printable(scenarios.title(played))}: {drawn}")
+    _say_caveat(played)
+
+
+def _say_caveat(scenario: "Scenario") -> None:
+    if scenario.caveat:
+        typer.echo(scenario.caveat)
 
 
 def _counts(text: str, least: int) -> list[int]:
