@@ -419,6 +419,8 @@ class Recorded(AbstractEnv):  # type: ignore[misc]
                     "type": "DiscreteMetaAction",
                     "target_speeds": list(recording.speeds_mps),
                 },
+                # which nobody reads, and highway-env's own is as slow as a second of driving
+                "observation": {"type": "AttributesObservation", "attributes": []},
                 "simulation_frequency": frames_a_second(recording.scenes_stated[0].step_s),
                 "policy_frequency": 1 / facts.period_s,
             }
