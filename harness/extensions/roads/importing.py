@@ -242,6 +242,7 @@ def _imported(
 ) -> "tuple[Recording, _Taken]":
     """Write a recording, all of it or nothing, and return it with what was read."""
     from harness.extensions.roads import tables
+    from harness.extensions.roads.sources import Unpacked
 
     taken = _Taken()
     if sources.others:
@@ -250,7 +251,10 @@ def _imported(
     texts = (about.name, about.source, about.licence, window_m)
     try:
         with making(out) as part:
+            first_byte = Unpacked.bytes_read
             with bar("reading files", sources.count, quiet) as progress:
+                # one file may be all that there is
+                progress.spent = lambda: f"{(Unpacked.bytes_read - first_byte) / 1e6:.1f} MB"
                 scenes = _watched(_unique(scenes_of(sources, columns)), taken, progress)
                 recording = tables.write(part, *texts, scenes, (), {}, decisions=decisions)
             count = len(recording.scenes_stated)

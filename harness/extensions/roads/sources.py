@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
@@ -35,6 +35,8 @@ def no_use(path: Path, reason: object) -> UserError:
 class Unpacked:
     """Read a file, or what a gzip file unpacks to, no more than such files ever do."""
 
+    bytes_read: ClassVar[int] = 0  # of all files in this process, for whoever shows how far it is
+
     def __init__(self, file: BinaryIO, size: int) -> None:
         is_packed = file.read(2) == GZIP
         file.seek(0)
@@ -45,6 +47,7 @@ class Unpacked:
     def read(self, size: int = -1) -> bytes:
         data: bytes = self._file.read(CHUNK if size < 0 else size)
         self._count += len(data)
+        Unpacked.bytes_read += len(data)
         if self._count > self._most:
             raise ValueError("it unpacks to more than such files do")
         return data

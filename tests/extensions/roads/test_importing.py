@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import road_files as files
 
+from harness.cli.progress import Bar, bar
 from harness.core.errors import UserError
 from harness.core.progress import Progress
 from harness.extensions.roads import fitness, importing, moments, tables
@@ -92,13 +94,25 @@ def test_a_folder_of_files_is_a_recording(harness: Callable[..., Said], source: 
 STREET = Path(__file__).parent / "street"
 
 
-def test_a_street_whose_moments_are_known(harness: Callable[..., Said]) -> None:
+def test_a_street_whose_moments_are_known(
+    harness: Callable[..., Said], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every 10 s a car from the south is 1.6 s, then 5 s before one from the west, behind a house.
 
     Where it is 1.6 s each of the two is hidden from the other, and in conflict with it.
     """
+    read_so_far: list[str] = []
+
+    @contextmanager
+    def watched(label: str, *given: Any, **named: Any) -> Iterator[Bar]:
+        with bar(label, *given, **named) as progress:
+            yield progress
+        read_so_far.append(progress.spent())
+
+    monkeypatch.setattr(importing, "bar", watched)
     code, out, err = harness("dataset", "import", STREET, "--out", "my", "--licence", "CC0-1.0")
     assert (code, err) == (0, "")
+    assert list(filter(None, read_so_far)) == ["0.1 MB"]  # the header, the form and all rows
     assert "wrote my: 1 scene of 3.0 minutes, 38 road users, 4 lanes" in out
     assert "32 cars, 4 vans, 1 truck, 1 pedestrian; 1 of them never move" in out
     assert len(out.splitlines()) <= 15
