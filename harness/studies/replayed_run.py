@@ -50,7 +50,7 @@ from harness.studies.axes import Setting
 from harness.studies.play import Read, WalkResult, metric_columns, walk_through
 
 SILENT = Progress()
-WALKS = 1 << 17  # most that are walked together, unless one grid point has more: some 120 MB
+WALKS = 1 << 15  # most that are walked together, unless one grid point has more: some 30 MB
 _GIVE_IT = (
     "to ask it, give --model with its folder, .gguf file or hub id, or write a card "
     "models/NAME.toml"

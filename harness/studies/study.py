@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from harness.report.drawing.pictures import Format
 
 DRAWN: "tuple[Format, ...]" = ("svg", "pdf", "png")  # the kinds of picture in a study's folder
+ROWS_AT_ONCE = 1 << 14  # of a table that is written as JSON
 WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency", "dataset_sha256")  # of a source, what makes a study another one
 
@@ -161,8 +162,10 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
             safe[name] = column.astype(object).map(neutral)
     with replacing(path.with_name(f"{path.name}.csv")) as part:
         safe.to_csv(part, index=False, lineterminator="\n", compression=None)
-    with replacing(path.with_name(f"{path.name}.jsonl")) as part:
-        table.to_json(part, orient="records", lines=True, compression=None)
+    with replacing(path.with_name(f"{path.name}.jsonl")) as part, part.open("w") as file:
+        # Of all rows at once, the text would take more memory than what it was made of.
+        for start in range(0, max(len(table), 1), ROWS_AT_ONCE):
+            table[start : start + ROWS_AT_ONCE].to_json(file, orient="records", lines=True)
 
 
 def refuse_taken(out: Path, kind: str) -> None:
