@@ -25,7 +25,7 @@ from harness.studies.axes import Setting
 if TYPE_CHECKING:
     import pandas as pd
 
-NAMES = ("source", "panel", "condition", "variable")
+FIRST = ("source", "panel", "condition", "variable", "value")
 EPISODE_COLUMNS = {
     "success": "success_rate",
     "trigger_rate": "trigger_rate",
@@ -205,7 +205,7 @@ def play(
     """
     import pandas as pd
 
-    rows, episodes = list[dict[str, Any]](), list[pd.DataFrame]()
+    rows, places, episodes = list[dict[str, Any]](), list[dict[str, Any]](), list[dict[str, Any]]()
     for setting, walks in zip(settings, source.walked(settings, seeds), strict=True):
         parts = [_part(walk, len(seeds)) for walk in walks]
         metrics = {}
@@ -218,7 +218,8 @@ def play(
         latency_ms = np.array(by_seed)
         # Where axes are crossed, the columns of each come last.
         place = {"source": source.name, "panel": panel, **setting.place}
-        first = {name: place.pop(name) for name in (*NAMES, "value")}
+        first = {name: place.pop(name) for name in FIRST}
+        places.append({**first, **place})
         for metric, estimate, interval in _estimates(source, metrics, latency_ms):
             row = {
                 **first,
@@ -232,19 +233,21 @@ def play(
             }
             rows.append(row)
         numbers = np.concatenate([part.episodes for part in parts])
-        table = pd.DataFrame(
-            {
-                **first,
-                "seed": np.repeat(seeds, len(numbers)),
-                "episode": np.tile(numbers, len(seeds)),
-                **{name: metrics[metric].ravel() for name, metric in EPISODE_COLUMNS.items()},
-                **place,
-            }
-        )
-        episodes.append(table[table.success.notna()].astype({"success": bool, "messages": int}))
+        played = {
+            "seed": np.repeat(seeds, len(numbers)),
+            "episode": np.tile(numbers, len(seeds)),
+            **{name: metrics[metric].ravel() for name, metric in EPISODE_COLUMNS.items()},
+        }
+        is_known = ~np.isnan(played["success"])
+        episodes.append({name: values[is_known] for name, values in played.items()})
         progress(1)
-    whole = pd.concat(episodes, ignore_index=True).round({"latency_ms": 3, "effective_loss": 6})
-    return PanelResult(pd.DataFrame(rows), whole)
+    # One frame of all points, since one of each takes longer than to play it.
+    counts = [len(played["episode"]) for played in episodes]
+    whole = pd.DataFrame(places).loc[np.repeat(np.arange(len(counts)), counts)]
+    for n, name in enumerate(episodes[0], len(FIRST)):
+        whole.insert(n, name, np.concatenate([played[name] for played in episodes]))
+    whole = whole.reset_index(drop=True).astype({"success": bool, "messages": int})
+    return PanelResult(pd.DataFrame(rows), whole.round({"latency_ms": 3, "effective_loss": 6}))
 
 
 class _Part(NamedTuple):

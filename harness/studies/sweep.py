@@ -313,22 +313,23 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
     point varied over an axis; the operating points themselves share a table.
     """
     heads, rows = dict[str, tuple[str, str]](), dict[str, list[Sequence[str]]]()
-    places = ["source", "panel", "condition", "value"]
-    scores = summary.assign(value=summary.value.where(summary.panel != CORE, None))
-    for (source, panel, condition, value), group in scores.groupby(
-        places, sort=False, dropna=False
-    ):
+    of_places: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for score in summary.to_dict("records"):
+        value = None if score["panel"] == CORE else score["value"]
+        place = score["source"], score["panel"], score["condition"], value
+        metrics = of_places.setdefault(place, {})
         # Over episodes, but where a seed has episodes of its own.
-        metrics = group.sort_values("interval", ascending=False, kind="stable").set_index("metric")
-        metrics = metrics[~metrics.index.duplicated(keep="last")]
-        means = [f"{scale * metrics['mean'][name]:.1f}" for name, scale in HEADS.values()]
+        if score["interval"] == "episodes" or score["metric"] not in metrics:
+            metrics[score["metric"]] = score
+    for (source, panel, condition, value), metrics in of_places.items():
+        means = [f"{scale * metrics[name]['mean']:.1f}" for name, scale in HEADS.values()]
         if panel == CORE:
             title, axis, name = str(source), "condition", str(condition)
         else:
             title, axis, name = f"{source} · {condition} over {panel}", str(panel), _text(value)
-        metric = headline_metric(set(metrics.index))
+        metric = headline_metric(set(metrics))
         heads[title] = axis, f"{IN_WORDS[metric]} %, 95 % CI"
-        success = percent(metrics.loc[metric], *ESTIMATE)
+        success = percent(metrics[metric], *ESTIMATE)
         rows.setdefault(title, []).append((name, success, *means))
     tables = []
     for title, columns in heads.items():
