@@ -2,6 +2,7 @@
 and one writer of its folder and page.
 """
 
+import csv
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -160,12 +161,25 @@ def write_table(table: "pd.DataFrame", path: Path) -> None:
         # Few texts are in many rows: one check of each is cheaper than `neutral` of every cell.
         if any(neutral(text) is not text for text in column.unique()):
             safe[name] = column.astype(object).map(neutral)
-    with replacing(path.with_name(f"{path.name}.csv")) as part:
-        safe.to_csv(part, index=False, lineterminator="\n", compression=None)
-    with replacing(path.with_name(f"{path.name}.jsonl")) as part, part.open("w") as file:
-        # Of all rows at once, the text would take more memory than what it was made of.
-        for start in range(0, max(len(table), 1), ROWS_AT_ONCE):
+    # Of all rows at once, the text would take more memory than what it was made of.
+    starts = range(0, max(len(table), 1), ROWS_AT_ONCE)
+    csv_path, json_path = (path.with_name(f"{path.name}.{kind}") for kind in ("csv", "jsonl"))
+    with replacing(csv_path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")  # `to_csv` writes the same in twice the time
+        writer.writerow(safe.columns)
+        for start in starts:
+            rows = safe[start : start + ROWS_AT_ONCE]
+            writer.writerows(zip(*(_cells(rows[name]) for name in rows), strict=True))
+    with replacing(json_path) as part, part.open("w") as file:
+        for start in starts:
             table[start : start + ROWS_AT_ONCE].to_json(file, orient="records", lines=True)
+
+
+def _cells(column: "pd.Series[Any]") -> list[Any]:
+    """Return a column's values, with None for what is unknown."""
+    if column.hasnans:
+        column = column.astype(object).where(column.notna(), None)
+    return column.tolist()
 
 
 def refuse_taken(out: Path, kind: str) -> None:
