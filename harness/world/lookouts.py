@@ -20,7 +20,7 @@ from harness.core import noise
 from harness.core.errors import UserError
 from harness.world.parameters import Parameters
 from harness.world.perception.rays import Look, surfaces
-from harness.world.perception.sensors import reports
+from harness.world.perception.sensors import reported
 from harness.world.scenario import Draws, Layout, Scenario, Spawn
 from harness.world.state import WorldState
 
@@ -147,7 +147,7 @@ def _witnessed(
     """
     for attempt in range(MOST_ATTEMPTS):
         start = draft(Draws(scenario.name, seed, attempt, SEATS), parameters)
-        if all(_fits(scenario, start, phantom, seed, parameters) for phantom in start.phantoms):
+        if _fits(scenario, start, seed, parameters):
             break
     else:
         raise UserError(
@@ -164,23 +164,31 @@ def _witnessed(
     return Layout.arranged(spawns, danger, danger_id, start.layout.buildings)
 
 
-def _fits(
-    scenario: Scenario, start: Draft, phantom: Spawn, seed: int, parameters: Parameters
-) -> bool:
-    """Return whether exactly the lookouts have a phantom of the danger in sight.
+def _fits(scenario: Scenario, start: Draft, seed: int, parameters: Parameters) -> bool:
+    """Return whether exactly the lookouts have each phantom of the danger in sight.
 
     They have it with all blind seats taken, and nobody else has it with no other one taken:
     so it holds whichever seats are.
     """
-    spawns = [spawn for spawn in start.layout.spawns if spawn.id != phantom.id]
-    spawns.append(phantom)
-    full = _state(scenario, start.layout, [*spawns, *start.seats], seed)
-    lookouts = [(full, full.vehicle(id_)) for id_ in LOOKOUTS]
-    if not all(_see(parameters, lookouts, phantom.id)):
-        return False
-    empty = _state(scenario, start.layout, spawns, seed)  # nobody is in a blind seat
-    blind = [(empty, empty.ego)] + [(empty, full.vehicle(seat.id)) for seat in start.seats]
-    return not any(_see(parameters, blind, phantom.id))
+    looks: list[Look] = []
+    targets: list[str] = []
+    sees: list[bool] = []  # whether the viewer is a lookout
+    for phantom in start.phantoms:
+        spawns = [spawn for spawn in start.layout.spawns if spawn.id != phantom.id]
+        spawns.append(phantom)
+        full = _state(scenario, start.layout, [*spawns, *start.seats], seed)
+        empty = _state(scenario, start.layout, spawns, seed)  # nobody is in a blind seat
+        blind = [empty.ego, *(full.vehicle(seat.id) for seat in start.seats)]
+        looks += [(full, full.vehicle(id_)) for id_ in LOOKOUTS]
+        looks += [(empty, viewer) for viewer in blind]
+        sees += [True] * len(LOOKOUTS) + [False] * len(blind)
+        targets += [phantom.id] * (len(LOOKOUTS) + len(blind))
+    around = surfaces(looks)
+    pairs = reported(looks, around, parameters)
+    return all(
+        ((n, ids.index(target)) in pairs) == is_lookout
+        for n, (ids, target, is_lookout) in enumerate(zip(around.ids, targets, sees, strict=True))
+    )
 
 
 def _state(scenario: Scenario, layout: Layout, spawns: Sequence[Spawn], seed: int) -> WorldState:
@@ -190,10 +198,3 @@ def _state(scenario: Scenario, layout: Layout, spawns: Sequence[Spawn], seed: in
     road = populated(scenario, replace(layout, spawns=tuple(spawns)))
     vehicles = tuple(state_of(v, origin_m=scenario.road().origin_m) for v in road.vehicles)
     return WorldState(scenario.name, seed, 0, 0.0, 0.0, vehicles, layout.buildings)
-
-
-def _see(parameters: Parameters, looks: Sequence[Look], target: str) -> list[bool]:
-    """Return whether each viewer's sensors report a vehicle."""
-    around = surfaces(looks)
-    reported = reports(looks, around, parameters)
-    return [(n, ids.index(target)) in reported for n, ids in enumerate(around.ids)]

@@ -12,6 +12,7 @@ episode, step, viewer and object.
 
 from collections.abc import Collection, Sequence
 from itertools import compress, product
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -37,6 +38,9 @@ SENSORS = {
     flags: tuple(compress(("camera", "lidar", "radar"), flags))
     for flags in product((False, True), repeat=3)
 }
+
+Pair = tuple[int, int]  # indices of a viewer, and of a vehicle among its surfaces
+Line = tuple[WorldState, VehicleState, VehicleState]  # a state, a viewer, and whom it looks at
 
 
 class Detection(Struct, frozen=True):
@@ -72,7 +76,7 @@ def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> l
 
 def reports(
     looks: Sequence[Look], around: Surfaces, parameters: Parameters
-) -> dict[tuple[int, int], Detection]:
+) -> dict[Pair, Detection]:
     """Return what the sensors of several viewers report, by (viewer, vehicle).
 
     Both parts of a key are indices from 0: the viewer's in `looks`, each a state and the vehicle
@@ -80,31 +84,31 @@ def reports(
     `surfaces(looks)`. A vehicle that is hit by too few rays or out of range is not reported. Under
     `parameters.perception` 1 it still hides what is behind it, under 2 it hides nothing.
     """
-    nearby: list[list[VehicleState]] = []
-    for state, viewer in looks:
-        nearby.append([v for v in state.vehicles if v.id != viewer.id])
-    least = _least_rays(around, nearby)
-    detection_of: dict[tuple[int, int], Detection | None] = {}
+    pairs, nearby = reported(looks, around, parameters), _nearby(looks)
+    seen = detections([(*looks[n], nearby[n][place]) for n, place in pairs], parameters.light)
+    return {pair: d for pair, d in zip(pairs, seen, strict=True) if d}
 
-    def reported(count: Ints) -> dict[tuple[int, int], Detection]:
-        """Return what sensors report where so many rays end on each surface, (n,)."""
+
+def reported(looks: Sequence[Look], around: Surfaces, parameters: Parameters) -> Collection[Pair]:
+    """Return whom the sensors of several viewers report: the keys of what `reports` returns."""
+    nearby = _nearby(looks)
+    least = _least_rays(around, nearby)
+    is_sensed: dict[Pair, bool] = {}
+
+    def sensed(count: Ints) -> dict[Pair, None]:
+        """Return whom sensors report where so many rays end on each surface, (n,)."""
         enough = around.by_viewer(np.where(around.vehicle, count, 0)) >= least
         viewers, places = np.nonzero(enough)
         pairs = list(zip(viewers.tolist(), places.tolist(), strict=True))
-        new = [pair for pair in pairs if pair not in detection_of]
-        seen = detections([(*looks[n], nearby[n][place]) for n, place in new], parameters.light)
-        detection_of.update(zip(new, seen, strict=True))
-        now = {}
-        for pair in pairs:
-            detection = detection_of[pair]
-            if detection:
-                now[pair] = detection
-        return now
+        new = [pair for pair in pairs if pair not in is_sensed]
+        lines = [(*looks[n], nearby[n][place]) for n, place in new]
+        is_sensed.update(zip(new, _sensed(lines, parameters.light), strict=True))
+        return dict.fromkeys(pair for pair in pairs if is_sensed[pair])
 
     rays = cast(around, around.vehicle)
     before = np.ones(len(around.place), dtype=bool)
     count, first = rays_on(around, rays, before)
-    now = reported(count)
+    now = sensed(count)
     if parameters.perception == 1:
         return now
     solid = ~around.vehicle | among(around, now)
@@ -115,15 +119,23 @@ def reports(
     if not (~solid[rays.surface] & (rays.t < np.inf) & (rays.surface != first)).any():
         return now
     while True:
-        then = reported(certain + rays_on(around, rays, solid)[0])
+        then = sensed(certain + rays_on(around, rays, solid)[0])
         after = ~around.vehicle | among(around, then)
         if np.array_equal(after, solid):
             return then
         if np.array_equal(after, before):
             # Vehicles that run into each other may hide each other in turns: none of them is
             # reported.
-            return {pair: d for pair, d in then.items() if pair in now}
+            return [pair for pair in then if pair in now]
         before, solid, now = solid, after, then
+
+
+def _nearby(looks: Sequence[Look]) -> list[list[VehicleState]]:
+    """Return the vehicles around each viewer, in the order of its surfaces."""
+    nearby = []
+    for state, viewer in looks:
+        nearby.append([v for v in state.vehicles if v.id != viewer.id])
+    return nearby
 
 
 def _least_rays(around: Surfaces, nearby: Sequence[Sequence[VehicleState]]) -> Ints:
@@ -156,12 +168,41 @@ def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
 def _motion(vehicles: Sequence[VehicleState]) -> Floats:
     """Return x, y, heading and speed of vehicles, (4, n)."""
     rows = [(v.x_m, v.y_m, v.heading_rad, v.speed_mps) for v in vehicles]
-    return np.array(rows).T.copy()
+    return np.array(rows).reshape(-1, 4).T.copy()
 
 
-def detections(
-    pairs: Sequence[tuple[WorldState, VehicleState, VehicleState]], ambient: Ambient
-) -> list[Detection | None]:
+class _Lines(NamedTuple):
+    """Hold what lies between n viewers and the vehicles that they look at, each (n,)."""
+
+    viewers: Floats  # x, y, heading and speed of the viewers, (4, n)
+    vehicles: Floats  # the same of the vehicles
+    distance_m: Floats
+    bearing_rad: Floats  # of the line in the road's frame
+    sensors: Bools  # whether camera, LiDAR and radar report the vehicle, (3, n)
+
+
+def _lines(pairs: Sequence[Line], ambient: Ambient) -> _Lines:
+    viewers = _motion([viewer for _, viewer, _ in pairs])
+    vehicles = _motion([target for *_, target in pairs])
+    dx, dy = vehicles[:2] - viewers[:2]
+    distance, bearing = np.hypot(dx, dy), np.arctan2(dy, dx)
+    off_axis = np.abs(turned(bearing - viewers[2]))
+    in_field = np.minimum(off_axis, np.pi - off_axis) <= HALF_FIELD_RAD
+    camera = in_field & (distance <= ambient.camera_m)
+    if ambient.glare_rad:
+        camera &= ~_dazzled([state.episode_seed for state, *_ in pairs], bearing, ambient)
+    lidar = distance <= LIDAR_RANGE_M
+    radar = in_field & (distance <= RADAR_RANGE_M)
+    return _Lines(viewers, vehicles, distance, bearing, np.stack([camera, lidar, radar]))
+
+
+def _sensed(pairs: Sequence[Line], ambient: Ambient) -> list[bool]:
+    """Return whether any sensor of a viewer reports a vehicle, for each pair of `detections`."""
+    is_sensed: list[bool] = np.asarray(_lines(pairs, ambient).sensors.any(axis=0)).tolist()
+    return is_sensed
+
+
+def detections(pairs: Sequence[Line], ambient: Ambient) -> list[Detection | None]:
     """Return what a viewer's sensors report of a vehicle, for each pair; None if nothing.
 
     Each of `pairs` is a state, a viewer, and a vehicle that the viewer has a line of sight to,
@@ -169,22 +210,15 @@ def detections(
     """
     if not pairs:
         return []
-    from_x, from_y, from_heading, from_speed = _motion([viewer for _, viewer, _ in pairs])
-    x, y, heading, speed = _motion([target for *_, target in pairs])
-    dx, dy = x - from_x, y - from_y
-    distance, bearing = np.hypot(dx, dy), np.arctan2(dy, dx)
-    off_axis = np.abs(turned(bearing - from_heading))
-    in_field = np.minimum(off_axis, np.pi - off_axis) <= HALF_FIELD_RAD
-    camera = in_field & (distance <= ambient.camera_m)
-    if ambient.glare_rad:
-        camera &= ~_dazzled([state.episode_seed for state, *_ in pairs], bearing, ambient)
-    lidar = distance <= LIDAR_RANGE_M
-    radar = in_field & (distance <= RADAR_RANGE_M)
-    reported = camera | lidar | radar
+    lines = _lines(pairs, ambient)
+    (from_x, from_y, from_heading, from_speed), (x, y, heading, speed) = lines[:2]
+    distance, bearing, (_, lidar, radar) = lines[2:]
     z = np.zeros((8, len(pairs)))
-    for k in np.flatnonzero(reported).tolist():
-        state, viewer, v = pairs[k]
-        draws = noise.generator("sensors", state.episode_seed, state.step, viewer.id, v.id)
+    sensed = np.flatnonzero(lines.sensors.any(axis=0)).tolist()
+    keys = []
+    for state, viewer, v in (pairs[k] for k in sensed):
+        keys.append(("sensors", state.episode_seed, state.step, viewer.id, v.id))
+    for k, draws in zip(sensed, noise.generators(keys), strict=True):
         z[:, k] = draws.standard_normal(8)
 
     # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both
@@ -201,7 +235,7 @@ def detections(
     heading_rad = heading + np.radians(2.0) * z[3]
     speed_noise_mps = np.where(radar, SPEED_NOISE_MPS[True], SPEED_NOISE_MPS[False])
     speed_mps = np.maximum(speed + speed_noise_mps * z[4], 0.0)
-    flags = np.stack([camera, lidar, radar], axis=-1).tolist()
+    flags = lines.sensors.T.tolist()
     estimates = np.stack([x_m, y_m, heading_rad, speed_mps, rate_mps], axis=-1).tolist()
     detected: list[Detection | None] = []
     for (*_, v), by_sensor, numbers in zip(pairs, flags, estimates, strict=True):
