@@ -35,6 +35,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, lru_cache
 from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -111,17 +112,39 @@ def lead_in(p: Parameters, poses: Floats) -> Floats:
     return np.stack([*course, *np.broadcast_arrays(heading, speed, time_s)[:2]], axis=-1)
 
 
+class Stretch(NamedTuple):
+    """Hold what vehicles that send beacons, messages about themselves, did in F frames.
+
+    `poses` are x and y (m), heading (rad) and speed (m/s) in each frame: of the 1+H vehicles that
+    `broadcast` is about, (F, 1+H, 4), or of the one that `announced` is about, (F, 4). A stretch
+    follows another without a gap.
+    """
+
+    poses: Floats
+    first_frame: int  # number of the first of these frames; the episode starts with frame 0
+    target_mps: float | None  # target speed that the first vehicle's beacons tell; None if none
+    # returns, for the index from 0 of one of these frames, the probability to lose a beacon on the
+    # link of the first vehicle and each other one, (H,), or to each receiver, (R,)
+    loss: Callable[[int], Floats]
+
+
+def waits(p: Parameters) -> bool:
+    """Return whether beacons may be made long after their frames: only when somebody asks.
+
+    They are vehicles' messages about themselves. Those of a physical radio hang on the state of the
+    world when they are sent, and under rule `cam` on all before.
+    """
+    return p.beacon_rule == "fixed" and beacon_radio(p.beacon_channel) is None
+
+
 def broadcast(
     p: Parameters,
     seed: int,
     before: Sequence[Beacon],
     radios: Sequence[str],
-    target_mps: float,
-    poses: Floats,
-    first_frame: int,
-    loss: Callable[[int], Floats],
+    stretches: Sequence[Stretch],
 ) -> tuple[Beacon, ...]:
-    """Return the beacons of the ego and its helpers that are still needed after F more frames.
+    """Return the beacons of the ego and its helpers that are still needed after more frames.
 
     These are the last one that each receiver has, and those on the air. The ego and each helper
     hear each other.
@@ -131,21 +154,17 @@ def broadcast(
         seed: seed of the episode's layout, which keys all draws.
         before: the beacons that were needed until now.
         radios: ids of the ego, which is first, and of the H helpers.
-        target_mps: the ego's target speed, m/s, which its beacons tell.
-        poses: x and y (m), heading (rad) and speed (m/s) of these 1+H vehicles in each frame,
-            (F, 1+H, 4).
-        first_frame: number of the first of these frames; the episode starts with frame 0.
-        loss: returns, for the index from 0 of one of these frames, the probability to lose a beacon
-            on the link of the ego and each helper, (H,).
+        stretches: what these 1+H vehicles did since; one, unless beacons may wait (`waits`).
     """
     kept: list[Beacon] = []
     for place, sender in enumerate(radios):
         receivers = tuple(radios[:1] if place else radios[1:])
-        target = None if place else target_mps
         links = slice(place - 1, place) if place else slice(None)
-        kept += _after(
-            p, seed, before, sender, receivers, target, poses[:, place], first_frame, loss, links
-        )
+        of_sender = []
+        for each in stretches:
+            target_mps = None if place else each.target_mps
+            of_sender.append(each._replace(poses=each.poses[:, place], target_mps=target_mps))
+        kept += _after(p, seed, before, sender, receivers, of_sender, links)
     return tuple(kept)
 
 
@@ -155,12 +174,9 @@ def announced(
     before: Sequence[Beacon],
     sender: str,
     receivers: Sequence[str],
-    target_mps: float | None,
-    poses: Floats,
-    first_frame: int,
-    loss: Callable[[int], Floats],
+    stretches: Sequence[Stretch],
 ) -> tuple[Beacon, ...]:
-    """Return the beacons of one sender that are still needed after F more frames.
+    """Return the beacons of one sender that are still needed after more frames.
 
     These are the last one that each receiver has, and those on the air. It is for a vehicle that
     all R `receivers` hear; `broadcast` is for the ego and its helpers.
@@ -171,16 +187,10 @@ def announced(
         before: the beacons, of any sender, that were needed until now.
         sender: id of the vehicle that sends.
         receivers: ids of the vehicles that hear it.
-        target_mps: target speed that its beacons tell, m/s; None if they tell none.
-        poses: its x and y (m), heading (rad) and speed (m/s) in each frame, (F, 4).
-        first_frame: number of the first of these frames; the episode starts with frame 0.
-        loss: returns, for the index from 0 of one of these frames, the probability to lose a beacon
-            on the link to each receiver, (R,).
+        stretches: what it did since; one, unless beacons may wait (`waits`).
     """
     every, heard_by = slice(None), tuple(receivers)
-    return tuple(
-        _after(p, seed, before, sender, heard_by, target_mps, poses, first_frame, loss, every)
-    )
+    return tuple(_after(p, seed, before, sender, heard_by, stretches, every))
 
 
 def _after(
@@ -189,10 +199,7 @@ def _after(
     before: Sequence[Beacon],
     sender: str,
     receivers: tuple[str, ...],
-    target_mps: float | None,
-    poses: Floats,
-    first_frame: int,
-    loss: Callable[[int], Floats],
+    stretches: Sequence[Stretch],
     links: slice,
 ) -> Sequence[Beacon]:
     """Return the beacons of one sender that matter after some frames, by time."""
@@ -200,10 +207,11 @@ def _after(
         return ()
     earlier = [b for b in before if b.sender == sender]
     newest_first = chain(
-        _sent(p, seed, sender, receivers, target_mps, poses, first_frame, earlier, loss, links),
+        *(_sent(p, seed, sender, receivers, each, earlier, links) for each in stretches[::-1]),
         reversed(earlier),
     )
-    time_s = (first_frame + len(poses) - 1) / p.simulation_hz
+    last = stretches[-1]
+    time_s = (last.first_frame + len(last.poses) - 1) / p.simulation_hz
     return _that_matter(newest_first, {*receivers}, time_s)[::-1]
 
 
@@ -231,17 +239,15 @@ def _sent(
     seed: int,
     sender: str,
     receivers: tuple[str, ...],
-    target_mps: float | None,
-    poses: Floats,
-    first_frame: int,
+    stretch: Stretch,
     before: Sequence[Beacon],
-    loss: Callable[[int], Floats],
     links: slice,
 ) -> Iterator[Beacon]:
-    """Yield the beacons of one vehicle with poses (F, 4) in these frames, the last first.
+    """Yield the beacons of one vehicle with poses (F, 4) in a stretch, the last first.
 
-    `links` selects the values of `loss` for its receivers.
+    `links` selects the values of its `loss` for its receivers.
     """
+    poses, first_frame, target_mps, loss = stretch
     phase, errors, uniforms = _draws(p, seed, sender, receivers)
     every, shift = p.simulation_hz / p.beacon_hz, _lead_frames(p)  # frames
 

@@ -4,15 +4,16 @@
 """
 
 import math
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from harness.core.arrays import Floats
 from harness.world import beacons, lockstep
+from harness.world.beacons import Stretch
 from harness.world.conflict_measures import Conflicts
 from harness.world.outcome import Outcome, fault, outline, striker
 from harness.world.scenario import Layout, Scenario
@@ -59,6 +60,14 @@ class Journey:
         self.braking_hard = hard[-1]
 
 
+class Drive(NamedTuple):
+    """Hold what V vehicles did in F frames: what their beacons say."""
+
+    poses: Floats  # x and y (m), heading (rad) and speed (m/s) in each frame, (F, V, 4)
+    first_frame: int  # number of the first one
+    targets_mps: Mapping[int, float]  # target speed of each agent, by its index
+
+
 @dataclass
 class World:
     """Simulate one episode: its vehicles, its agents' records and its clock.
@@ -75,9 +84,10 @@ class World:
     frame: int = 0  # number of frames simulated so far
     # what has become of each agent so far, by its index
     journeys: dict[int, Journey] = field(default_factory=lambda: {0: Journey()})
-    # the vehicles' broadcasts about themselves that still matter: the last that each receiver has,
-    # and those on the air
-    beacons: tuple[Beacon, ...] = ()
+    # the vehicles' broadcasts about themselves that mattered before the frames in `unsent`: the
+    # last that each receiver has, and those on the air
+    sent: tuple[Beacon, ...] = ()
+    unsent: tuple[Drive, ...] = ()  # frames of which nobody has asked for the beacons yet
 
     @classmethod
     def start(cls, scenario: Scenario, seed: int) -> "World":
@@ -95,7 +105,7 @@ class World:
         road = populated(scenario, layout, agents)
         world = cls(scenario, seed, layout, road, journeys={agent: Journey() for agent in agents})
         poses = beacons.lead_in(scenario.parameters, world._in_road_frame(world._poses()))
-        world._broadcast(poses, 1 - len(poses))
+        world._drove(poses, 1 - len(poses))
         return world
 
     @property
@@ -197,7 +207,7 @@ class World:
             road,
             state.step,
             snapshot.frame,
-            beacons=state.beacons,
+            sent=state.beacons,
         )
 
     def state(self, agent: int = 0) -> WorldState:
@@ -205,12 +215,15 @@ class World:
 
         `agent` is its index among the vehicles; 0 is the scenario's own ego.
         """
+        state = self._now(agent, self.beacons)
+        return seated(self.scenario, state, agent) if agent else state
+
+    def _now(self, agent: int = 0, known: tuple[Beacon, ...] = ()) -> WorldState:
         name, states = self.scenario.name, tuple(map(self._state_of, self.vehicles))
         target_mps, buildings = float(self.vehicles[agent].target_speed), self.layout.buildings
-        state = WorldState(
-            name, self.seed, self.step, self.time_s, target_mps, states, buildings, self.beacons
+        return WorldState(
+            name, self.seed, self.step, self.time_s, target_mps, states, buildings, known
         )
-        return seated(self.scenario, state, agent) if agent else state
 
     def _state_of(self, v: Any) -> VehicleState:
         return state_of(v, self.scenario.brake_lamps, self.scenario.road().origin_m)
@@ -278,7 +291,7 @@ class World:
         and y (m from the origin of the scenario's road), heading (rad) and speed (m/s) of each of V
         vehicles in each frame, (F, V, 4).
         """
-        self._broadcast(poses, self.frame + 1 - len(poses))
+        self._drove(poses, self.frame + 1 - len(poses))
 
     def _poses(self) -> list[tuple[float, ...]]:
         """Return x, y, heading and speed of each vehicle, in highway-env's own frame."""
@@ -290,8 +303,26 @@ class World:
         moved[..., :2] -= self.scenario.road().origin_m
         return moved
 
-    def _broadcast(self, poses: Floats, first_frame: int) -> None:
-        """Add the beacons of who has a radio in some frames, whose poses are (F, V, 4)."""
+    @property
+    def beacons(self) -> tuple[Beacon, ...]:
+        """Return the vehicles' broadcasts about themselves that still matter.
+
+        These are the last one that each receiver has, and those on the air.
+        """
+        if self.unsent:
+            self.sent, self.unsent = self._broadcast(), ()
+        return self.sent
+
+    def _drove(self, poses: Floats, first_frame: int) -> None:
+        """Note what vehicles did in some frames, (F, V, 4), for the beacons of these frames."""
+        targets = {n: float(self.vehicles[n].target_speed) for n in self.journeys}
+        self.unsent = (*self.unsent, Drive(poses, first_frame, targets))
+        # vehicles of other worlds may come and go
+        if self.scenario.has_own_world or not beacons.waits(self.scenario.parameters):
+            self.sent, self.unsent = self._broadcast(), ()
+
+    def _broadcast(self) -> tuple[Beacon, ...]:
+        """Return the beacons that matter after the frames in `unsent`."""
         p, radios = self.scenario.parameters, self.answering
         ids = [self.vehicles[n].spawn.id for n in radios]
         senders = [n for n, v in enumerate(self.vehicles) if v.spawn.radio]
@@ -299,20 +330,22 @@ class World:
         if len(self.journeys) > 1:  # everybody with a radio hears everybody
             senders = [*radios, *senders]
         else:
-            loss = beacons.losses(p, self.state, ids, poses)
-            target_mps = float(self.vehicles[0].target_speed)
-            sent = beacons.broadcast(
-                p, self.seed, self.beacons, ids, target_mps, poses[:, radios], first_frame, loss
-            )
+            stretches = [self._stretch(each, radios, ids, 0) for each in self.unsent]
+            sent = beacons.broadcast(p, self.seed, self.sent, ids, stretches)
         for n in senders:
             sender = self.vehicles[n].spawn.id
             hearers = [id_ for id_ in ids if id_ != sender]
-            loss = beacons.losses(p, self.state, [sender, *hearers], poses)
-            aim_mps = float(self.vehicles[n].target_speed) if n in self.journeys else None
-            sent += beacons.announced(
-                p, self.seed, self.beacons, sender, hearers, aim_mps, poses[:, n], first_frame, loss
-            )
-        self.beacons = sent
+            stretches = [self._stretch(each, n, [sender, *hearers], n) for each in self.unsent]
+            sent += beacons.announced(p, self.seed, self.sent, sender, hearers, stretches)
+        return sent
+
+    def _stretch(
+        self, drive: Drive, senders: int | list[int], ids: Sequence[str], first: int
+    ) -> Stretch:
+        """Return what some senders did; links are from the first one of `ids` to each other one."""
+        loss = beacons.losses(self.scenario.parameters, self._now, ids, drive.poses)
+        target_mps = drive.targets_mps.get(first)
+        return Stretch(drive.poses[:, senders], drive.first_frame, target_mps, loss)
 
     def _collision(self, ego: Any, wrecks: Sequence[Any]) -> dict[str, str]:
         """Return whom an agent hit, and how; empty if it hit an object on the road."""

@@ -114,7 +114,7 @@ class EnvironmentWorld(OwnWorld):
         danger, danger_id = world._danger()
         world.layout = replace(layout, danger=danger, danger_id=danger_id)
         poses = beacons.lead_in(p, world._in_road_frame(world._poses()))
-        world._broadcast(poses, 1 - len(poses))
+        world._drove(poses, 1 - len(poses))
         return world
 
     def _danger(self) -> tuple[str | None, str | None]:
