@@ -237,18 +237,30 @@ def read_tree(file: ZipFile, manifest: Manifest, episode: int, trusted: bool = F
     return tree
 
 
-def read_level(file: ZipFile, tree: Tree, step: int) -> list[bytes]:
+def read_level(file: ZipFile, tree: Tree, step: int) -> list[memoryview]:
     """Read the scenes of one step of a decision tree as JSON lines, one for each decision point.
 
     They are in the order of the tree. `file` is the archive `layouts.zip`, and `step` the number of
     the decision, from 0. Raises Damaged if the digest or the number of lines is wrong.
     """
     name = level_name(tree.episode, step)
-    lines = _entry(file, name, tree.scenes_sha256[step]).splitlines()
+    lines = _lines(_entry(file, name, tree.scenes_sha256[step]))
     if len(lines) != len(tree.levels[step]):
         raise Damaged(
             f"{LAYOUTS} {name}: {len(lines)} scenes, the tree has {len(tree.levels[step])}"
         )
+    return lines
+
+
+def _lines(data: bytes) -> list[memoryview]:
+    """Return the lines without copying them, since a walk reads one of ten."""
+    view, lines, start = memoryview(data), list[memoryview](), 0
+    while start < len(data):
+        end = data.find(b"\n", start)
+        if end < 0:
+            end = len(data)
+        lines.append(view[start:end])
+        start = end + 1
     return lines
 
 
@@ -319,7 +331,7 @@ def tree_contradictions(tree: Tree, manifest: Manifest, number: int) -> list[str
 
 
 def decoded(
-    scenario: Scenario, line: bytes, manifest: Manifest, name: str
+    scenario: Scenario, line: memoryview, manifest: Manifest, name: str
 ) -> tuple[Record | None, list[str]]:
     """Decode a scene's JSON line; return the scene's record, and a line for each problem.
 
@@ -349,7 +361,7 @@ def unusable(path: Path, problem: str) -> UserError:
     )
 
 
-def misfit(error: msgspec.ValidationError, text: bytes, kind: type, what: str) -> str:
+def misfit(error: msgspec.ValidationError, text: bytes | memoryview, kind: type, what: str) -> str:
     """Return in one line where a JSON text does not fit the type `kind`, for an error.
 
     `text` was decoded as that, and `what` names it; `error` is msgspec's, which is used if no
