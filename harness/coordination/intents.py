@@ -11,7 +11,7 @@ import numpy as np
 from harness.coordination.claims import Claims
 from harness.coordination.plans import Plans
 from harness.coordination.scheduling import Outlook
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, taken
 from harness.radio.channel import Site
 
 
@@ -79,7 +79,7 @@ class Intents:
             outlook=self.outlook and self.outlook.take(at),
             claims=self.claims and self.claims.take(at),
             plans=self.plans and self.plans.take(at),
-            **{name: array[at] for name, array in self.arrays().items()},
+            **{name: taken(array, at) for name, array in self.arrays().items()},
         )
 
     def replaced(self, at: Ints, newer: "Intents") -> "Intents":

@@ -30,6 +30,15 @@ def summed(values: Floats, axis: int) -> Floats:
     return total
 
 
+def taken(values: Any, at: Any) -> Any:
+    """Return the rows of an array, (n, ...), at indices or a mask of its leading axis.
+
+    It is `values[at]`, in a tenth of the time where rows are short.
+    """
+    places = np.asarray(at)
+    return values.take(np.flatnonzero(places) if places.dtype == np.bool_ else places, axis=0)
+
+
 def any_of(flags: Bools) -> Bools:
     """Return whether any flag is true along the last axis, which is dropped.
 

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkab
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats, Ints, Texts
+from harness.core.arrays import Bools, Floats, Ints, Texts, taken
 from harness.core.errors import UserError
 from harness.radio.fading import Trips
 
@@ -141,8 +141,9 @@ class Draws:
 
     def take(self, at: Any) -> "Draws":
         """Return the draws of the decisions at `at`, indices or a mask of the leading axis."""
-        given = None if self.given is None else self.given[at]
-        return Draws(self.link[at], self.jitter[at], self.trips and self.trips.take(at), given)
+        given = None if self.given is None else taken(self.given, at)
+        link, jitter = taken(self.link, at), taken(self.jitter, at)
+        return Draws(link, jitter, self.trips and self.trips.take(at), given)
 
     def of_helpers(self, places: Ints) -> "Draws":
         """Return the draws for other helpers: in each of n decisions those that `places` names.
