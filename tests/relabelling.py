@@ -12,6 +12,7 @@ import pytest
 from former import SCENARIO
 
 from harness.core.files import sha256_bytes
+from harness.core.seeds import purpose
 from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.dataset.schema import scene_id
@@ -44,7 +45,7 @@ def run_of_it(once: Callable[..., Path], relabelled: Path) -> Path:
 
 def relabel(
     dataset: Path, seeds: dict[int, int], of_tree: Callable[[Any], None] | None = None,
-    of_scenes: Callable[[Any], None] | None = None, purpose: str = "tune",
+    of_scenes: Callable[[Any], None] | None = None,
 ) -> None:  # fmt: skip
     """Give a dataset's layouts other seeds, and change trees and scenes,
     as somebody who means harm would.
@@ -73,7 +74,7 @@ def relabel(
             of_tree(tree)
         entries[f"{number:05d}/tree.json"] = json.dumps(tree).encode()
         manifest["trees_sha256"][number] = sha256_bytes(entries[f"{number:05d}/tree.json"])
-    manifest |= {"seed": seeds[0], "purpose": purpose}
+    manifest |= {"seed": seeds[0], "purpose": purpose(seeds[0], manifest["episodes"])}
     (dataset / "manifest.json").write_text(json.dumps(manifest))
     with ZipFile(dataset / "layouts.zip", "w") as file:
         for name, data in entries.items():

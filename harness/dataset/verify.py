@@ -18,6 +18,7 @@ from harness.core.config import convert
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import bytes_of, refuse_bomb, sha256_bytes, sha256_file
 from harness.core.files import opened as opened_file
+from harness.core.seeds import purposes, seeds_text
 from harness.core.zips import BROKEN_ZIP
 from harness.dataset.schema import (
     LAYOUTS,
@@ -69,16 +70,16 @@ def read_manifest(path: Path) -> tuple[Manifest, str]:
     for problem in _manifest_problems(manifest, scenario):
         raise UserError(f"{printable(file)}: manifest {problem}; build the dataset again")
     try:
-        scenario_of(manifest)
+        built_from = scenario_of(manifest)
     except UserError as error:
         raise UserError(f"{printable(file)}: {error}; build the dataset again") from None
+    for problem in _contradictions_of(manifest, built_from):
+        raise UserError(f"{printable(file)}: manifest {problem}; build the dataset again")
     return manifest, sha256_bytes(data)
 
 
 def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
     """Yield what is wrong with a manifest that no type can state."""
-    if len(set(manifest.actions)) < len(manifest.actions):
-        yield "[actions]: an action stands there twice"
     if len(manifest.trees_sha256) != manifest.episodes:
         yield (
             f"[trees_sha256] has {len(manifest.trees_sha256)} digests for {manifest.episodes} "
@@ -107,6 +108,26 @@ def _manifest_problems(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
             "[environment]: here its configuration has another "
             f"{', '.join(differing) or 'set of keys'}"
         )
+
+
+def _contradictions_of(manifest: Manifest, scenario: Scenario) -> Iterator[str]:
+    """Yield what a manifest states otherwise than its seeds and its scenario, as it was built from.
+
+    The order of actions counts, for values of actions go by it.
+    """
+    count, here = manifest.episodes, ", ".join(scenario.actions)
+    if manifest.actions != list(scenario.actions):
+        there = printable(", ".join(manifest.actions), 100)
+        yield f"[actions] is {there}; those of its scenario are {here}, in this order"
+    if purposes(manifest.seed, count) != [manifest.purpose]:
+        yield f"[purpose] is {manifest.purpose}, but it is of {seeds_text(manifest.seed, count)}"
+    texts = (
+        ("source", manifest.source, scenario.source),
+        ("licence", manifest.licence, scenario.licence),
+    )
+    for key, there, here in texts:
+        if there != here:
+            yield f"[{key}] is {printable(there, 80)!r}; that of its scenario is {here!r}"
 
 
 def scenario_of(manifest: Manifest) -> Scenario:

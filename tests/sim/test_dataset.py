@@ -22,6 +22,7 @@ from together import act_together
 
 from harness.core.errors import UserError
 from harness.core.files import canonical_json, sha256_bytes
+from harness.core.seeds import FIRST
 from harness.dataset import verify
 from harness.dataset.build import build
 from harness.dataset.load import find, load
@@ -595,6 +596,12 @@ HOSTILE_MANIFESTS: dict[str, dict[str, object]] = {
     "another format": {"format": "swarmdrive-dataset/1"},
     "one action": {"actions": ["IDLE"]},
     "actions that are no names": {"actions": [["IDLE"], {}]},
+    "actions in another order": {"actions": [*SCENARIO.actions[::-1]]},
+    "an action twice": {"actions": [*SCENARIO.actions, "IDLE"]},
+    "a purpose that its seeds have not": {"purpose": "report"},
+    "seeds of two purposes": {"seed": FIRST["train"] - 1, "purpose": "train"},
+    "a licence that its scenario does not state": {"licence": "MIT"},
+    "a source that its scenario does not state": {"source": "a road"},
     "an allowance that is a text": {"parameters": {"delay_allowance_s": "1"}},
     "decisions at one time": {"parameters": {**USUAL, "decision_period_s": 0.0}},
     "an unknown field": {"extra": 1},

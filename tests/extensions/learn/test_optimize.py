@@ -411,7 +411,7 @@ def test_a_winner_is_not_certified_where_it_was_tuned(
     """Layouts under report seeds that are those of the search, and learnt from by nobody."""
     report = shutil.copytree(small_path, tmp_path / "datasets" / "report")
     count = len(load(small_path).episodes)
-    relabel(report, {number: 300_000 + number for number in range(count)}, purpose="report")
+    relabel(report, {number: 300_000 + number for number in range(count)})
     code, _, wrong = optimize("--dataset", report)
     assert (code, wrong.count("\n")) == (2, 1), wrong
     assert "and numbers are reported of that; build one of other seeds" in wrong

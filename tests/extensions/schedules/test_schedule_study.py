@@ -399,7 +399,7 @@ def train(two_path: Path, tmp_path_factory: pytest.TempPathFactory) -> ReplayedR
     """A run on layouts that say that they are of train seeds."""
     folder = tmp_path_factory.mktemp("train")
     shutil.copytree(two_path, folder / "data")
-    relabel(folder / "data", {0: 150_000, 1: 150_001}, purpose="train")
+    relabel(folder / "data", {0: 150_000, 1: 150_001})
     return ReplayedRun(run(spec_of(load(folder / "data")), folder / "run").out)
 
 
