@@ -16,7 +16,7 @@ from msgspec import structs
 
 from harness.core.files import sha256_file
 from harness.core.progress import Progress
-from harness.dataset.card import Table, hub_size, readme
+from harness.dataset.card import SIMULATED, Table, hub_size, readme
 from harness.dataset.columns import COLUMNS
 from harness.dataset.load import Dataset
 from harness.dataset.publish import publish
@@ -140,6 +140,31 @@ def test_the_front_matter_says_of_terms_what_the_page_says(
     assert yaml.safe_load(head)["license"] == word
     terms = [f"- `set-{n}`: `{each}`" for n, each in enumerate(licences) if each]
     assert "\n".join(terms) in text
+
+
+@pytest.mark.parametrize(
+    ("tables", "lines"),
+    [
+        ([("", True)], [f"The scenes {SIMULATED}"]),
+        ([("A8", False)], ["- Traffic of `set-0`: `A8`"]),
+        (
+            [("", False), ("", True)],
+            ["- Traffic of `set-0`: not stated", f"- Scenes of `set-1` {SIMULATED}"],
+        ),
+    ],
+)
+def test_only_scenes_that_the_harness_draws_are_called_simulated(
+    tables: list[tuple[str, bool]], lines: list[str], small: Dataset
+) -> None:
+    described = []
+    for n, (source, simulated) in enumerate(tables):
+        manifest = structs.replace(small.manifest, name=f"set-{n}", source=source)
+        table = Table(manifest, "0" * 64, "", 0.1, False, "v", 9, "0" * 64, 9, {}, None, simulated)
+        described.append(table)
+    text = readme("sets", described)
+    assert "\n\n" + "\n".join(lines) + "\n\n" in text
+    assert text.count("simulated: no recording") == sum(simulated for _, simulated in tables)
+    assert text.count("- Consequences are of one simulator") == (tables[0] != ("", True))
 
 
 @pytest.mark.parametrize(

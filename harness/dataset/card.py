@@ -30,7 +30,7 @@ TAGS = (
     "benchmark",
 )
 PAPER = "https://arxiv.org/abs/2604.22852"
-SIMULATED = "The scenes are simulated: no recording of a real road, vehicle or person is in them."
+SIMULATED = "are simulated: no recording of a real road, vehicle or person is in them."
 UNSTATED = "Not stated: whoever built the dataset decides. Write it here and above."
 LICENCE = "https://www.apache.org/licenses/LICENSE-2.0"
 # The hub's words for licences that data have and SPDX writes so, too, but for capitals.
@@ -63,6 +63,7 @@ class Table:
     # situations
     references: Mapping[str, Estimate]
     recordings: int | None = None  # how many its layouts are cut from; None if each is drawn alone
+    simulated: bool = False  # whether a scenario of the harness draws its scenes
 
     @property
     def name(self) -> str:
@@ -137,10 +138,16 @@ def hub_licence(licences: Sequence[str | None]) -> str:
 
 def _origin(tables: Sequence[Table]) -> str:
     """Return where the traffic of datasets comes from, as far as they state it."""
-    sources = {t.name: t.manifest.source for t in tables if t.manifest.source}
-    if not sources:
-        return SIMULATED
-    return _lines(f"- Traffic of `{name}`: {_code(source)}" for name, source in sources.items())
+    if all(t.simulated for t in tables):
+        return f"The scenes {SIMULATED}"
+    lines = []
+    for t in tables:
+        source = t.manifest.source
+        if t.simulated:
+            lines.append(f"- Scenes of `{t.name}` {SIMULATED}")
+        else:
+            lines.append(f"- Traffic of `{t.name}`: {_code(source) if source else 'not stated'}")
+    return _lines(lines)
 
 
 def _front_matter(name: str, tables: Sequence[Table]) -> dict[str, Any]:
@@ -207,8 +214,8 @@ def limits(tables: Sequence[Table]) -> Iterator[str]:
         f"An action acts {lags} ms after the moment of its decision, whoever decides. The trees do "
         "not say what becomes of a slower model."
     )
-    elsewhere = any(t.manifest.source for t in tables)
-    made = "Consequences" if elsewhere else "Scenes, traffic and drivers"
+    simulated = all(t.simulated for t in tables)
+    made = "Scenes, traffic and drivers" if simulated else "Consequences"
     yield (
         f"{made} are of one simulator, and texts are English: nothing here shows that a model is "
         "safe on a road."

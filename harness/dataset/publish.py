@@ -22,6 +22,7 @@ from harness.dataset.load import Dataset, Scene, load
 from harness.dataset.schema import FILE_NAME
 from harness.dataset.verify import read_manifest
 from harness.world.scenario import Scenario
+from harness.world.scenario_of_package import is_ours
 from harness.world.scenarios import title
 from harness.world.scene_graph import SceneGraph
 
@@ -103,6 +104,7 @@ def _table(
         file.stat().st_size,
         references,
         None if clusters is None else int(clusters.max()) + 1,
+        is_ours(scenario.layout) and not scenario.has_own_world,
     )
 
 
