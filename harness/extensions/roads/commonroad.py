@@ -183,7 +183,6 @@ class _File:
             name_of(self.name),
             self.path.name,
             sha256_of(self.path),
-            self.step_s,
             self.lights,
             self.tracks,
             lanes,

@@ -28,7 +28,6 @@ from harness.extensions.roads.sources import (
     once,
     sha256_of,
     stem_of,
-    step_of,
     sum_up,
     tracks_of,
     unpacked,
@@ -44,6 +43,7 @@ from harness.extensions.roads.tables import (
     Scene,
     Track,
     runs_of,
+    step_of,
 )
 
 NEEDED = ("time_s", "id", "x_m", "y_m")
@@ -187,12 +187,11 @@ def scenes(
         sha256 = sha256_of(path)
         for name, begin, end in rows.scenes:
             part = rows.part(begin, end)
-            tracks, left_out, step_s = _tracks(path, part)
+            tracks, left_out = _tracks(path, part)
             yield Scene(
                 name_of(f"{stem_of(path)}-{name}" if name else stem_of(path)),
                 path.name,
                 sha256,
-                step_s,
                 lights,
                 tracks,
                 lanes,
@@ -364,8 +363,8 @@ def _labels(table: pa.Table, place: Column) -> tuple[Ints, list[str]]:
     return column.indices.to_numpy().astype(np.int64), column.dictionary.to_pylist()
 
 
-def _tracks(path: Path, rows: _Rows) -> tuple[dict[str, Track], dict[str, int], float]:
-    """Return the tracks of one scene's rows, what was left out, and the step, s."""
+def _tracks(path: Path, rows: _Rows) -> tuple[dict[str, Track], dict[str, int]]:
+    """Return the tracks of one scene's rows, and what was left out."""
     numbers, n = rows.numbers, len(rows.numbers["time_s"])
     runs = runs_of(rows.codes["id"])
     with_limit(path, len(runs), MOST_TRACKS, "road users")
@@ -395,7 +394,7 @@ def _tracks(path: Path, rows: _Rows) -> tuple[dict[str, Track], dict[str, int], 
                 track = _from_front(track)
             once(tracks, track.id, "tracks", path)
             tracks[track.id] = track
-    return tracks, left_out, step_s
+    return tracks, left_out
 
 
 def _kind(rows: _Rows, row: int) -> str:

@@ -12,7 +12,7 @@ from harness.core import noise
 from harness.core.errors import UserError
 from harness.extensions.roads.moments import Chooser
 from harness.extensions.roads.replay import AHEAD_S
-from harness.extensions.roads.simulation import STEP_S, Inputs, map_of, run
+from harness.extensions.roads.simulation import Inputs, map_of, run
 from harness.extensions.roads.tables import Moment, Scene
 
 ATTEMPTS = 8
@@ -56,7 +56,6 @@ def drawn(
             f"seed-{seed}",
             "net",
             f"{inputs.digest}-{of_sumo}",
-            STEP_S,
             net.lights,
             tracks,
             net.lanes,

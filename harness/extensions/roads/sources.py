@@ -243,11 +243,6 @@ def distinct(points: Floats) -> Floats:
     return np.asarray(points[np.append(True, ~(steps_m <= SAME_M))[: len(points)]])
 
 
-def step_of(steps_s: Floats) -> float:
-    """Return the usual time from one pose to the next, s, without what differences round off."""
-    return round(float(np.median(steps_s)), 6)
-
-
 def sum_up(counts: dict[str, int], reason: str, amount: int = 1) -> None:
     """Count something that is left out, by its reason."""
     counts[reason] = counts.get(reason, 0) + amount

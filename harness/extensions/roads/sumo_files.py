@@ -26,7 +26,6 @@ from harness.extensions.roads.sources import (
     sha256_of,
     starts,
     stem_of,
-    step_of,
     sum_up,
     tracks_of,
 )
@@ -39,6 +38,7 @@ from harness.extensions.roads.tables import (
     Lane,
     Scene,
     Track,
+    step_of,
 )
 
 NET, POSITIONS = "net", "fcd-export"
@@ -384,7 +384,6 @@ def _scene(path: Path, net: Map, types: Mapping[str, VehicleType]) -> Scene:
         name_of(stem_of(path)),
         path.name,
         sha256_of(path),
-        step_s,
         net.lights,
         tracks,
         net.lanes,

@@ -129,6 +129,11 @@ class House:
     outline: Floats  # (n, 2) m, without the first point again
 
 
+def step_of(steps_s: Floats) -> float:
+    """Return the usual time from one pose to the next, s, without what differences round off."""
+    return round(float(np.median(steps_s)), 6)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Hold what one source file has: one map, one clock, and who moved there."""
@@ -136,13 +141,20 @@ class Scene:
     name: str
     file: str  # name of the source file
     sha256: str  # its hex digest
-    step_s: float  # time from one pose to the next
     lights: bool  # whether traffic lights stand there
     tracks: Mapping[str, Track]
     lanes: Mapping[str, Lane]
     houses: tuple[House, ...] = ()
     # how many things a reader left out, by the reason; no table keeps it
     left_out: Mapping[str, int] = field(default_factory=dict)
+
+    @cached_property
+    def step_s(self) -> float:
+        """Return the usual time from one pose of a mover to the next, s; 1 if none has two."""
+        times = [track.time_s for track in self.tracks.values() if not track.still]
+        steps = [np.diff(each) for each in times]
+        steps_s = np.concatenate([*steps, np.empty(0)])
+        return step_of(steps_s) if len(steps_s) else 1.0
 
     @property
     def begin_s(self) -> float:
@@ -362,20 +374,29 @@ def _scene(recording: Recording, name: str) -> Scene:
         name,
         facts.file,
         facts.sha256,
-        facts.step_s,
         facts.lights,
         _tracks_of(tracks),
         {lane.id: lane for lane in _lanes_of(lanes)},
         tuple(House(str(row["id"]), _line(row)) for row in houses.to_pylist()),
     )
     checked(scene)
-    if (len(scene.tracks), len(scene.lanes)) != (facts.tracks, facts.lanes):
-        reason = (
-            f"scene {printable(name)} states {facts.tracks} tracks and {facts.lanes} lanes, and "
-            f"has {len(scene.tracks)} and {len(scene.lanes)}"
-        )
-        raise _broken(recording.folder / FACTS, reason)
+    for key, given in _computed_facts(scene).items():
+        claim = getattr(facts, key)
+        if claim != given:
+            reason = f"scene {printable(name)} states {key} {claim:g}; its tables give {given:g}"
+            raise _broken(recording.folder / FACTS, reason)
     return scene
+
+
+def _computed_facts(scene: Scene) -> dict[str, float]:
+    """Return what is stated of a scene that its tables give, by the names of `SceneFacts`."""
+    return {
+        "step_s": scene.step_s,
+        "begin_s": scene.begin_s,
+        "end_s": scene.end_s,
+        "tracks": len(scene.tracks),
+        "lanes": len(scene.lanes),
+    }
 
 
 def _tracks_of(table: pa.Table) -> dict[str, Track]:
@@ -589,17 +610,8 @@ def _write_scene(writers: Mapping[str, pq.ParquetWriter], scene: Scene) -> Scene
     if scene.houses:
         outlines = [(house.id, house.outline) for house in scene.houses]
         writers[BUILDINGS].write_table(_table(_line_columns(scene.name, outlines), BUILDINGS))
-    return SceneFacts(
-        scene.name,
-        scene.file,
-        scene.sha256,
-        scene.step_s,
-        scene.begin_s,
-        scene.end_s,
-        scene.lights,
-        len(tracks),
-        len(lanes),
-    )
+    stated: dict[str, Any] = _computed_facts(scene)
+    return SceneFacts(scene.name, scene.file, scene.sha256, lights=scene.lights, **stated)
 
 
 def _table(columns: Sequence[Any], file_name: str) -> pa.Table:
@@ -653,6 +665,8 @@ def _problems(scene: Scene) -> Iterator[str]:
     yield from _problems_of_numbers(scene)
     for track in scene.tracks.values():
         yield from _problems_of_track(track)
+    if not 0.001 <= scene.step_s <= 10:
+        yield f"a step of {scene.step_s:g} s; allowed: 0.001 to 10"
     for lane in scene.lanes.values():
         yield from _problems_of_lane(lane, scene.lanes)
     for house in scene.houses:
@@ -685,8 +699,6 @@ def _problems_of_numbers(scene: Scene) -> Iterator[str]:
         if amount > most:
             yield f"{amount} {what}; allowed: at most {most}: cut it"
     yield from _problems_of_density(scene)
-    if not 0.001 <= scene.step_s <= 10:
-        yield f"a step of {scene.step_s:g} s; allowed: 0.001 to 10"
 
 
 def _problems_of_density(scene: Scene) -> Iterator[str]:

@@ -28,7 +28,7 @@ def column() -> Scene:
         poses = np.stack([100 - 25 * n + 10 * times_s, still, still, still + 10], axis=-1)
         tracks[f"e{n}"] = Track(f"e{n}", "car", 4.6, 1.8, times_s, poses)
     lane = Lane("a", np.array([[0.0, 0.0], [600.0, 0.0]]), 3.5, 14.0, (), None, None)
-    return Scene("s", "s.xml", "0" * 64, 0.1, False, tracks, {"a": lane})
+    return Scene("s", "s.xml", "0" * 64, False, tracks, {"a": lane})
 
 
 def of_moment(**values: Any) -> Edit:

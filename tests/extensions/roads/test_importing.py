@@ -169,7 +169,7 @@ def scene_of(tracks: int, places_m: float) -> Scene:
         poses = np.array([[0.0, n * places_m, 0.0, 0.0]])
         cars[f"{n:02}"] = Track(f"{n:02}", "car", 4, 2, np.array([0.0]), poses)
     lanes = {"1": Lane("1", points, 4, None, (), None, None)}
-    return Scene("s", "s.xml", "0" * 64, 0.1, False, cars, lanes)
+    return Scene("s", "s.xml", "0" * 64, False, cars, lanes)
 
 
 def test_a_few_that_appear_where_others_are_are_left_out() -> None:

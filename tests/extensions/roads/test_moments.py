@@ -64,7 +64,7 @@ def crossing(*tracks: Track, **changed: Any) -> Scene:
         "north": Lane("north", np.stack([0 * ends, ends], axis=-1), 4.0, None, (), None, None),
     }
     by_id = {track.id: track for track in tracks}
-    scene = replace(Scene("s", "s.xml", "0" * 64, 0.1, False, by_id, lanes), **changed)
+    scene = replace(Scene("s", "s.xml", "0" * 64, False, by_id, lanes), **changed)
     checked(scene)
     return scene
 
@@ -369,7 +369,7 @@ def test_who_is_hidden_and_in_conflict_is_as_one_by_one() -> None:
             lanes[key] = Lane(key, points, 4.0, None, (), None, None)
         corner = draws.uniform(-20, 10, 2)
         house = House("h", corner + np.array([[0, 0], [12, 0], [12, 12], [0, 12]]))
-        scene = Scene("s", "s.xml", f"{number:064}", 0.1, False, tracks, lanes, (house,))
+        scene = Scene("s", "s.xml", f"{number:064}", False, tracks, lanes, (house,))
         asked = chooser_of(scene).moments
         assert asked
         shapes = {key: outlines(track) for key, track in tracks.items()}
@@ -403,7 +403,7 @@ def crowd(cars: int, seconds: int) -> Scene:
         speed = np.gradient(x_m, times_s)
         poses = np.stack([x_m, y_m, heading, speed], axis=-1)
         tracks[f"c{n}"] = Track(f"c{n}", "car", 4.6, 1.9, times_s, poses)
-    return Scene("us", "us.xml", "7" * 64, 0.1, False, tracks, lanes)
+    return Scene("us", "us.xml", "7" * 64, False, tracks, lanes)
 
 
 @pytest.mark.slow

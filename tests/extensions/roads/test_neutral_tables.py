@@ -38,7 +38,7 @@ def road(**changed: Any) -> Scene:
     }
     tracks = {"a": straight("a", 0.0, 10.0), "b": straight("b", 50.0, 0.0, 4.0)}
     house = House("h", np.array([[10.0, 10.0], [20.0, 10.0], [20.0, 20.0]]))
-    return replace(Scene("s", "s.xml", SHA, 1.0, False, tracks, lanes, (house,)), **changed)
+    return replace(Scene("s", "s.xml", SHA, False, tracks, lanes, (house,)), **changed)
 
 
 def written(folder: Path, *scenes: Scene, moments: Any = ()) -> tables.Recording:
@@ -107,7 +107,7 @@ def drawn(draw: Callable[..., Any]) -> Scene:
         beside = draw(st.sampled_from([None, *others]))
         limit = draw(st.none() | st.floats(1, 50))
         lanes[key] = Lane(key, line, 3.5, limit, tuple(others[:2]), beside, None)
-    return Scene("s", "f", SHA, 0.1, draw(st.booleans()), tracks, lanes)
+    return Scene("s", "f", SHA, draw(st.booleans()), tracks, lanes)
 
 
 @settings(max_examples=20)
@@ -149,7 +149,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "track \\x1b: its id has characters that nothing can show": {
         "tracks": {"\x1b": straight("\x1b", 0, 1)}
     },
-    "a step of 0 s": {"step_s": 0.0},
+    "a step of 1e-06 s": {"tracks": {"a": straight("a", 0, 1, time_s=np.arange(4) / 1e6)}},
     "its times are from 0 to 1000000000 s; allowed: 1e+06 s": {
         "tracks": {"a": straight("a", 0, 1, time_s=np.array([0.0, 1, 2, 1e9]))}
     },
@@ -193,7 +193,11 @@ EDITS = {
         '"moments":[{"scene":"s","vehicle":"a","time_s":0,"hidden":null,"conflict_s":null,"purpose":"mine"}',
     ),
     "speeds_mps do not rise": ('"speeds_mps":[0.0', '"speeds_mps":[9.0'),
-    "scene s states 9 tracks": ('"tracks":2', '"tracks":9'),
+    "scene s states tracks 9; its tables give 2": ('"tracks":2', '"tracks":9'),
+    "scene s states lanes 9; its tables give 2": ('"lanes":2', '"lanes":9'),
+    "scene s states step_s 0.001; its tables give 1": ('"step_s":1.0', '"step_s":0.001'),
+    "scene s states begin_s -1; its tables give 0": ('"begin_s":0.0', '"begin_s":-1.0'),
+    "scene s states end_s 9; its tables give 3": ('"end_s":3.0', '"end_s":9.0'),
 }
 
 

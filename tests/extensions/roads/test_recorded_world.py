@@ -73,9 +73,7 @@ def crossing() -> Scene:
     corner = np.array([(175.0, -30.0), (193, -30), (193, -8), (175, -8)])
     houses = (House("h", corner),)
     by_id = {each.id: each for each in tracks}
-    return Scene(
-        "s", "s.xml", "0" * 64, 0.1, False, by_id, {each.id: each for each in lanes}, houses
-    )
+    return Scene("s", "s.xml", "0" * 64, False, by_id, {each.id: each for each in lanes}, houses)
 
 
 MOMENTS = (

@@ -29,7 +29,7 @@ def column() -> Scene:
         "q", "car", 4.6, 1.8, np.array([0.0, 40.0]), np.array([[0, 900, 0, 0.0]] * 2)
     )
     lanes = {"a": Lane("a", ends, 3.5, 14.0, (), None, None)}
-    return Scene("s", "s.xml", "0" * 64, 0.1, False, tracks, lanes, ())
+    return Scene("s", "s.xml", "0" * 64, False, tracks, lanes, ())
 
 
 def recorded(out: Path) -> None:
