@@ -120,7 +120,7 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
         typer.echo("\n".join(problems))
     else:
         typer.echo(
-            f"{manifest.name} is sound: {dataset_size(manifest.episodes, manifest.nodes)}\n"
+            f"{printable(dataset)} is sound: {dataset_size(manifest.episodes, manifest.nodes)}\n"
             f"manifest sha256 {digest}"
         )
         if not built_again:

@@ -100,7 +100,7 @@ def test_a_dataset_is_built_checked_and_ranked(harness, tmp_path):
     code, out, _ = harness("dataset", "check", out_folder)
     assert (code, out.splitlines()[0]) == (
         0,
-        f"two-v1 is sound: 2 layouts, {nodes} decision points",
+        f"{printable(out_folder)} is sound: 2 layouts, {nodes} decision points",
     )
     code, out, _ = harness("dataset", "rank", out_folder, "--workers", 1, "--json")
     ranked = json.loads(out)
