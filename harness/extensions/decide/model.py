@@ -89,16 +89,18 @@ class ServedModel:
         if len(enquiry.images) > 1:
             raise Refusal(f"{len(enquiry.images)} pictures; give one", code="picture")
         image = picture(enquiry.images[0]) if enquiry.images else None
-        return [self._request(each, image) for each in enquiry.questions]
+        questions = enumerate(enquiry.questions, 1)
+        return [self._request(number, each, image) for number, each in questions]
 
-    def _request(self, query: Asked, image: Image | None) -> Request:
-        """Return a question as a request, with a picture if there is one.
+    def _request(self, number: int, query: Asked, image: Image | None) -> Request:
+        """Return the question of a number, from 1, as a request, with a picture if there is one.
 
         Raises Refusal if it has too many options, or is too long.
         """
         if self._reads_letters and len(query.options) > len(LETTERS):
+            which = number if query.name is None else repr(printable(query.name, 40))
             raise Refusal(
-                f"question {printable(query.name, 40)!r} has {len(query.options)} options; "
+                f"question {which} has {len(query.options)} options; "
                 f"{printable(self.name)} answers by a letter each, and takes {len(LETTERS)} at "
                 "most",
                 code="options",

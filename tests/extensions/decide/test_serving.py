@@ -403,7 +403,12 @@ def test_a_model_that_reads_letters_says_what_it_cannot_read() -> None:
     with answering(needs("swarm-tiny")) as there:
         many = post(there, "systemone", {"state": "s", "questions": {"a": choice(11)}})
         assert (many.status_code, many.json()["error"]["code"]) == (400, "options")
+        assert "question 'a' has 11 options" in many.text
         assert "answers by a letter each, and takes 10 at most" in many.text
+        options = [{"value": str(n)} for n in range(11)]
+        unnamed = {"type": "choice", "instructions": "i", "choices": options}
+        many = post(there, "decisions", {"input": "s", "questions": [unnamed]})
+        assert "question 1 has 11 options" in many.text
         for state in ("a word " * 3000, "x" * 500_000):
             long = post(there, "systemone", {"state": state, "questions": {"a": choice()}})
             assert (long.status_code, long.json()["error"]["code"]) == (
