@@ -254,13 +254,18 @@ def _shape(element: Element | None) -> Shape:
     for part in () if element is None else element:
         if part.tag == "rectangle":
             half = np.array([number(part, "length"), number(part, "width")]) / 2
+            if (half <= 0).any():
+                raise ValueError("its rectangle has a length or width that is not above 0")
             corners = half * [[1, 1], [-1, 1], [-1, -1], [1, -1]]
             turn = number(part, "orientation")
             outlines.append(_turned(corners, 0.0 if turn != turn else turn) + _middle(part))
         elif part.tag == "circle":
             angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
             around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-            outlines.append(number(part, "radius") * around + _middle(part))
+            radius_m = number(part, "radius")
+            if radius_m <= 0:
+                raise ValueError(f"its circle has radius {radius_m:g}; allowed: above 0")
+            outlines.append(radius_m * around + _middle(part))
         elif part.tag == "polygon":
             outlines.append(_points(part))
     if not outlines:

@@ -384,7 +384,7 @@ def _tracks(path: Path, rows: _Rows) -> tuple[dict[str, Track], dict[str, int]]:
         if kind not in KINDS:
             sum_up(left_out, f"{printable(kind, 30)} (a kind that none is made of)")
             continue
-        size_m = _size(numbers, start, kind)
+        size_m = _size(path, key, numbers, start, kind)
         times = numbers["time_s"][start:stop]
         if (np.diff(times) == 0).any():
             again_s = times[:-1][np.diff(times) == 0][0]
@@ -405,12 +405,25 @@ def _kind(rows: _Rows, row: int) -> str:
     return rows.kinds.get(word, SYNONYMS.get(word.lower(), word))
 
 
-def _size(numbers: Mapping[str, Floats], row: int, kind: str) -> tuple[float, float]:
-    """Return length and width, m, of a row's road user; what is usual where they are unknown."""
+def _size(
+    path: Path, key: str, numbers: Mapping[str, Floats], row: int, kind: str
+) -> tuple[float, float]:
+    """Return length and width, m, of a row's road user; what is usual where they are unknown.
+
+    Raises UserError for one that is not above 0; some recordings have 0 for people and bicycles.
+    """
     sizes_m = []
     for name, usual_m in zip(("length_m", "width_m"), SIZES_M[kind], strict=True):
         value = float(numbers[name][row]) if name in numbers else np.nan
-        sizes_m.append(value if value > 0 else usual_m)
+        if value == 0 and kind in ("bicycle", "pedestrian"):
+            value = np.nan
+        if value <= 0:
+            raise no_use(
+                path,
+                f"{printable(key, 60)} has {name} {value:g}; allowed: above 0, or none for "
+                f"{usual_m:g}",
+            )
+        sizes_m.append(usual_m if np.isnan(value) else value)
     return sizes_m[0], sizes_m[1]
 
 
@@ -431,10 +444,11 @@ def lanes_of(path: Path) -> dict[str, Lane]:
     lanes: dict[str, Lane] = {}
     for key, points, first in _lines(path, "id", LANE_COLUMNS, MOST_LANES):
         once(lanes, key, "lanes", path)
+        width_m = _number_of(path, first, "width_m")
         lanes[key] = Lane(
             key,
             distinct(points),
-            _number_of(path, first, "width_m") or LANE_WIDTH_M,
+            LANE_WIDTH_M if width_m is None else width_m,
             _number_of(path, first, "limit_mps"),
             tuple(each for each in first.get("successors", "").split(SEPARATOR) if each),
             first.get("left") or None,

@@ -132,8 +132,8 @@ TRACKS = """frame,track,class,cx,cy,len,wid
 25,a,Car,32.8084,0,4.5,1.8
 50,a,Car,65.6168,0,4.5,1.8
 0,b,Tram,50,50,30,2
-0,c,2,80,13.1234,0,0
-25,c,2,80,13.1234,0,0
+0,c,2,80,13.1234,,
+25,c,2,80,13.1234,,
 """
 
 LANES = """id,x_m,y_m,width_m,limit_mps,successors,left,right

@@ -120,7 +120,7 @@ def test_a_table_is_read_by_its_declared_columns(tmp_path: Path) -> None:
     assert close(car.poses, [0, 0, 0, 10], [10, 0, 0, 10], [20, 0, 0, 10])
     assert (car.kind, car.length_m, scene.step_s) == ("car", 4.5, 1)
     assert (van.kind, van.still) == ("van", True)
-    assert (van.length_m, van.width_m) == csv_tracks.SIZES_M["van"]  # 0 is unknown
+    assert (van.length_m, van.width_m) == csv_tracks.SIZES_M["van"]  # none is stated
     assert scene.left_out == {"Tram (a kind that none is made of)": 1}
     turned = csv_tracks.columns_of("time_s=frame/25,id=track,front_x_m=cy,front_y_m=cx,scene=class")
     scenes = list(csv_tracks.scenes(path, columns=turned, lanes=lanes))
@@ -167,6 +167,9 @@ BAD_COMMONROAD = {
     ),
     "lanelet 3: a bound has fewer": files.COMMONROAD_2018B.replace(
         "<point><x>99</x><y>2</y></point>", ""
+    ),
+    "obstacle 11: its rectangle has a length or width": files.COMMONROAD_2018B.replace(
+        "<length>4</length>", "<length>-4</length>"
     ),
     "stand more than 50 in one another": ROOT_2018
     + "<lanelet>" * 60
@@ -258,6 +261,30 @@ def test_wrong_columns_are_refused_in_one_line(words: str, tmp_path: Path) -> No
         return list(csv_tracks.scenes(path, columns=columns, lanes={}))
 
     refused(words, read)
+
+
+SIZES = {
+    "Car,-4.5": "a has length_m -4.5; allowed: above 0, or none for 4.6",
+    "Car,0": "a has length_m 0; allowed",
+    "bicycle,0": 1.8,  # as some recordings have it
+    "pedestrian,": 0.4,
+}
+
+
+@pytest.mark.parametrize("text", SIZES)
+def test_a_size_that_is_none_is_refused_and_an_unknown_one_is_usual(
+    text: str, tmp_path: Path
+) -> None:
+    rows = files.TRACKS.replace("a,Car,", "a,KIND,").replace(",4.5,1.8", ",SIZE,1.8")
+    kind, size = text.split(",")
+    path = written(tmp_path, "t.csv", rows.replace("KIND", kind).replace("SIZE", size))
+    columns = csv_tracks.columns_of(MAPPED)._replace(kinds={"2": "van"})
+    expected = SIZES[text]
+    if isinstance(expected, str):
+        refused(expected, lambda: list(csv_tracks.scenes(path, columns=columns, lanes={})))
+    else:
+        [scene] = csv_tracks.scenes(path, columns=columns, lanes={})
+        assert scene.tracks["a"].length_m == expected
 
 
 HEAD = files.TRACKS.split("\n")[0]
