@@ -15,6 +15,7 @@ from harness.core.statistics import (
     Estimate,
     cluster_numbers,
     episode_interval,
+    joined_clusters,
     mean_of,
     paired_difference,
     paired_reach,
@@ -28,8 +29,10 @@ from harness.core.statistics import (
 from harness.report.caveats import clustered, few
 from harness.report.compare.difference import compare
 from harness.report.compare.pair import pair
+from harness.report.matrix import lines
 from harness.report.panels import errors, reliability
 from harness.report.plan import from_pilots
+from harness.report.runs import Runs
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run, read
 from harness.runs.metric_names import GAIN
@@ -47,6 +50,24 @@ def test_clusters_are_numbered_as_they_come_and_none_is_told_where_each_layout_i
     assert units_of(values, (4, 2, 7), None) is values
     for alone in (["a", "b"], [None, None], [None, "a"], []):
         assert cluster_numbers(alone) is None
+
+
+@pytest.mark.parametrize(
+    ("partitions", "joined"),
+    [
+        ([["a", "b", "c"], ["x", "x", None]], [0, 0, 1]),
+        ([["x", "x", None], ["a", "b", "c"]], [0, 0, 1]),
+        ([["a", "a", "b", "b"], [None, "x", "x", None]], [0, 0, 0, 0]),  # by way of both
+        ([["a", "b", "a", "b"], ["b", "a", "b", None]], [0, 1, 0, 1]),  # a name says nothing
+        ([["a", "b"], [None, None]], None),
+        ([[], []], None),
+    ],
+)
+def test_episodes_are_in_one_cluster_if_any_source_says_so(
+    partitions: list[list[str | None]], joined: list[int] | None
+) -> None:
+    clusters = joined_clusters(partitions)
+    assert (None if clusters is None else clusters.tolist()) == joined
 
 
 def test_a_clustered_difference_is_that_of_the_totals_by_hand() -> None:
@@ -233,3 +254,15 @@ def test_two_runs_are_compared_over_recordings(tmp_path: Path) -> None:
     assert whole.change.low < 0 < alone.change.low
     late = found[6]["latency_p95_ms"].change
     assert math.isnan(late.low)
+
+
+def test_a_run_that_states_finer_recordings_gains_nothing(tmp_path: Path) -> None:
+    whole = made(tmp_path / "whole", 24, (0, 1))
+    fine, best = made(tmp_path / "fine", 1, (0, 1)), made(tmp_path / "best", 24)
+    for one, other in ((whole, best), (fine, best), (best, fine), (best, whole)):
+        comparison = compare(pair(one.path, other.path))
+        changes = [change for each in comparison.conditions for change in each.differences]
+        of_success = [each for each in changes if each.metric == "success_rate"]
+        assert {each.p_value for each in of_success} == {None}
+        both = lines(Runs((one, other), ("one", "other"), None))
+        assert all(math.isnan(line.behind.change.low) for line in both if line.behind)

@@ -132,6 +132,29 @@ def cluster_numbers(names: Sequence[str | None]) -> Ints | None:
     return None if len(numbers) == len(each) else np.array(each, dtype=np.int64)
 
 
+def joined_clusters(partitions: Sequence[Sequence[str | None]]) -> Ints | None:
+    """Return the number from 0 of each of E episodes' cluster, (E,); None if each is of its own.
+
+    Each of `partitions` has the name of each episode's cluster, as one source has it. Two episodes
+    are in one cluster if any source says so: whoever states finer clusters gains nothing.
+    """
+    earlier = list(range(len(partitions[0])))  # of each: one of its cluster; the first is its own
+    for names in partitions:
+        first_of: dict[str, int] = {}
+        for place, name in enumerate(names):
+            if name is not None:
+                both = first_of.setdefault(name, place), place
+                one, other = sorted(_first(earlier, each) for each in both)
+                earlier[other] = one
+    return cluster_numbers([str(_first(earlier, place)) for place in range(len(earlier))])
+
+
+def _first(earlier: Sequence[int], place: int) -> int:
+    while earlier[place] != place:
+        place = earlier[place]
+    return place
+
+
 def units_of(episodes: Ints, numbers: Sequence[int], clusters: Ints | None) -> Ints:
     """Return the number of what each of n values is counted under: its cluster, or its episode.
 

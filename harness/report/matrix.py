@@ -11,7 +11,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.figures import some_of
 from harness.core.multiplicity import LEVEL, holm
-from harness.core.statistics import Estimate, cluster_numbers
+from harness.core.statistics import Estimate, cluster_numbers, joined_clusters
 from harness.report.runs import Runs
 from harness.report.words import score_texts
 from harness.runs.folder import Run
@@ -159,8 +159,20 @@ def _marks(runs: Runs, headline_metric: str) -> dict[str, list[Mark]]:
     episodes = [episode for run in runs.runs for episode in run.episodes]
     if headline_metric == BALANCED:
         dangerous = {each.episode for each in episodes if each.danger != "none"}
-    cluster_of = {each.episode: each.cluster for each in episodes}
-    return dict(zip(runs.conditions, marked(by_condition, dangerous, cluster_of), strict=True))
+    marks = marked(by_condition, dangerous, _clusters(runs))
+    return dict(zip(runs.conditions, marks, strict=True))
+
+
+def _clusters(runs: Runs) -> dict[int, str]:
+    """Return the cluster of each episode of the runs; two are in one if any run says so."""
+    numbers = sorted({number for run in runs.runs for number in run.grid.episodes})
+    partitions = []
+    for run in runs.runs:
+        cluster_of = {each.episode: each.cluster for each in run.episodes}
+        partitions.append([cluster_of.get(number) for number in numbers])
+    clusters = joined_clusters(partitions)
+    names = [] if clusters is None else [str(cluster) for cluster in clusters.tolist()]
+    return dict(zip(numbers, names, strict=False))
 
 
 def grids(results: Sequence[Line]) -> list[Grid]:

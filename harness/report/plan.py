@@ -176,9 +176,7 @@ def _gains(path: Path) -> _Sides:
 
 def _difference(a: Path, b: Path) -> _Sides:
     both = pair(a, b)
-    condition, seed = both.conditions[0], both.seeds[0]
-    ends = [both.a.ends[condition, seed, episode] for episode in both.episodes]
-    success = Success.of(ends, headline_of(both.a.run, both.b.run))
+    success = both.success_rule(both.conditions[0])
     values = {}
     for name in both.conditions:
         of_a, of_b = both.values(both.a, SUCCESS, name), both.values(both.b, SUCCESS, name)

@@ -18,7 +18,7 @@ from harness.report.compare.pair import OPENED, Pair, Side
 from harness.runs import percentiles, reliability
 from harness.runs.estimates import difference
 from harness.runs.folder import Run
-from harness.runs.headline import SUCCESS, headline_of
+from harness.runs.headline import SUCCESS
 from harness.runs.metric_names import ADJUSTED, ONE_OPTIMAL
 from harness.runs.metric_values import known_in
 from harness.runs.metrics import METRICS, entry
@@ -374,8 +374,7 @@ def _adjusted(pair: Pair, condition: str, a: Floats, b: Floats) -> Iterator[Diff
     pool = pair.pool
     if pool is None:
         return
-    ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
-    success = Success.of(ends, headline_of(pair.a.run, pair.b.run))
+    success = pair.success_rule(condition)
     for by in success.ways:
 
         def change(level: float, by: Success = by) -> Estimate:

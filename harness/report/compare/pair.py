@@ -1,7 +1,7 @@
 """Two finished runs on the same scenes with the same draws, as arrays of one layout."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,17 +14,19 @@ from harness.core.arrays import Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
-from harness.core.statistics import cluster_numbers
+from harness.core.statistics import joined_clusters
 from harness.report.words import facts
 from harness.runs.contradictions import sound
 from harness.runs.difficulty import Pool
 from harness.runs.folder import Run
+from harness.runs.headline import headline_of
 from harness.runs.metric_values import by_episode
 from harness.runs.metrics import metrics_of
 from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
 from harness.runs.reliability import Judged
 from harness.runs.settings import COMPARED
+from harness.runs.success import Success
 from harness.world.parameters import DIALS
 
 # The order in which settings are listed; one that is not here comes after them.
@@ -131,7 +133,17 @@ class Pair:
         for side in (self.a, self.b):
             ends = [side.ends[self.conditions[0], self.seeds[0], each] for each in self.episodes]
             names.append([episode.cluster for episode in ends])
-        return cluster_numbers([a or b for a, b in zip(*names, strict=True)])
+        return joined_clusters(names)
+
+    def success_rule(self, condition: str) -> Success:
+        """Return how success of the shared episodes is averaged, with the clusters of both runs.
+
+        `condition` is the name of a set of settings of the radio, of asking helpers and of fusing
+        their messages.
+        """
+        ends = [self.a.ends[condition, self.seeds[0], episode] for episode in self.episodes]
+        rule = Success.of(ends, headline_of(self.a.run, self.b.run))
+        return replace(rule, clusters=self.clusters)
 
     @cached_property
     def pool(self) -> Pool | None:

@@ -23,11 +23,10 @@ from harness.report.compare.gate import Verdict
 from harness.report.compare.pair import Pair, Side, where
 from harness.report.findings import FIRST, Kind, findings, of_runs
 from harness.report.words import SHOWN_FROM, as_good_as, p_value
-from harness.runs.headline import IN_WORDS, SUCCESS, headline_metric, headline_of
+from harness.runs.headline import IN_WORDS, SUCCESS, headline_metric
 from harness.runs.metric_names import ADJUSTED, ONE_OPTIMAL
 from harness.runs.metrics import entry
 from harness.runs.records import role_word
-from harness.runs.success import Success
 
 BETTER, WORSE, HINT = "better", "worse", "hint"
 SIGNS = {BETTER: "✓", WORSE: "✗", HINT: "?", "": ""}
@@ -265,8 +264,7 @@ def _by_stopping_rule(pair: Pair) -> Iterator[str]:
     if rule is None:
         return
     for condition in pair.conditions:
-        ends = [pair.a.ends[condition, pair.seeds[0], episode] for episode in pair.episodes]
-        success = Success.of(ends, headline_of(pair.a.run, pair.b.run))
+        success = pair.success_rule(condition)
         a = pair.values(pair.a, SUCCESS, condition).T
         b = pair.values(pair.b, SUCCESS, condition).T
         change = interval_of(rule.difference(success, b, a), POINTS, "+")
