@@ -266,3 +266,15 @@ def test_a_run_that_states_finer_recordings_gains_nothing(tmp_path: Path) -> Non
         assert {each.p_value for each in of_success} == {None}
         both = lines(Runs((one, other), ("one", "other"), None))
         assert all(math.isnan(line.behind.change.low) for line in both if line.behind)
+
+
+def test_the_rows_of_an_episode_have_one_layout(tmp_path: Path) -> None:
+    for name, value in (("cluster", "street 1"), ("danger", "left"), ("layout_seed", 99)):
+        folder = made(tmp_path / name, 24, episodes=2).path
+        table = folder / "episodes.csv"
+        head, *rows = table.read_text().splitlines()
+        cells = rows[-1].split(",")
+        cells[head.split(",").index(name)] = str(value)
+        table.write_text("\n".join([head, *rows[:-1], ",".join(cells)]) + "\n")
+        with pytest.raises(UserError, match=rf"episode 1 has {name} .* in one row and {value} in"):
+            sound(folder)

@@ -50,6 +50,7 @@ T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
 # Arrow raises NotImplementedError for a column of another type.
 _BROKEN = (*BROKEN, NotImplementedError, csv.Error)
+OF_LAYOUT = ("layout_seed", "danger", "cluster")  # columns that are the same in all rows of one
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
@@ -261,6 +262,7 @@ class Run:
         world = self.manifest.world
         if len(numbers) != world.episodes:
             raise ValueError(f"it has {len(numbers)} episodes, and run.json says {world.episodes}")
+        _refuse_unlike(episodes)
         if isinstance(world, ClosedLoop):
             drawn = range(world.selection.get("of", world.episodes))
             for episode in episodes:
@@ -350,6 +352,20 @@ def _other_than_run(path: Path) -> str:
         "no finished run: it has no run.json; "
         "give a folder made by `harness eval` or `harness drive`"
     )
+
+
+def _refuse_unlike(episodes: Sequence[Episode]) -> None:
+    """Raise ValueError if two rows of one episode have another layout."""
+    firsts: dict[int, Episode] = {}
+    for episode in episodes:
+        first = firsts.setdefault(episode.episode, episode)
+        for name in OF_LAYOUT:
+            one, other = getattr(first, name), getattr(episode, name)
+            if one != other:
+                raise ValueError(
+                    f"episode {first.episode} has {name} {printable(one)} in one row and "
+                    f"{printable(other)} in another"
+                )
 
 
 def most_rows(episodes: Sequence[Episode]) -> int:
