@@ -28,6 +28,7 @@ from harness.core.statistics import (
 )
 from harness.report.caveats import clustered, few
 from harness.report.compare.difference import compare
+from harness.report.compare.gate import gate, judge
 from harness.report.compare.pair import pair
 from harness.report.matrix import lines
 from harness.report.panels import errors, reliability
@@ -254,6 +255,28 @@ def test_two_runs_are_compared_over_recordings(tmp_path: Path) -> None:
     assert whole.change.low < 0 < alone.change.low
     late = found[6]["latency_p95_ms"].change
     assert math.isnan(late.low)
+
+
+def test_a_gate_on_the_end_of_an_interval_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    """Of one recording nothing bounds a difference; of two, one that is alike in all is bounded."""
+    found = {}
+    for size in (12, 24):
+        a, b = made(tmp_path / f"a{size}", size, (0, 1)), made(tmp_path / f"b{size}", size)
+        found[size] = compare(pair(a.path, b.path))
+    for metric, size, is_bounded in (
+        ("success_rate", 24, False),
+        ("success_rate", 12, True),
+        ("latency_proxy_ms", 24, False),  # alike in all episodes
+        ("latency_proxy_ms", 12, True),
+        ("latency_p95_ms", 12, False),  # two recordings are too few to resample
+    ):
+        for end in ("", ".low", ".high"):
+            typed = gate(f"6g:{metric}{end} < -9999")
+            if is_bounded or not end:
+                assert judge(typed, found[size]).failed == ()
+            else:
+                with pytest.raises(UserError, match=r"6g has no interval in these runs; name a c"):
+                    judge(typed, found[size])
 
 
 def test_a_run_that_states_finer_recordings_gains_nothing(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from harness.core.errors import UserError, printable
 from harness.core.figures import amount, some_of
 from harness.core.multiplicity import holm, p_value
 from harness.core.statistics import LEVEL, Estimate, episode_interval, paired_difference
-from harness.report.compare.gate import Verdict
+from harness.report.compare.gate import Verdict, of_no_width
 
 Key = tuple[int | str, int]  # a sample's id, and its epoch
 
@@ -93,8 +93,15 @@ class SampleComparison:
 
     @cached_property
     def changes(self) -> Mapping[str, Estimate]:
-        """Return the difference B - A of each scorer that both logs have, by its name."""
-        return {each.scorer: each.change for each in self.differences}
+        """Return the difference B - A of each scorer that both logs have, by its name, for gates.
+
+        Its interval has no width where two or more samples all changed alike.
+        """
+        changes = {}
+        for each in self.differences:
+            is_alike = each.p_value is None and each.change.n > 1
+            changes[each.scorer] = of_no_width(each.change) if is_alike else each.change
+        return changes
 
     @cached_property
     def other_prompts(self) -> int:

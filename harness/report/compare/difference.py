@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import printable
 from harness.core.multiplicity import holm, p_of_bootstrap, p_value
-from harness.core.statistics import LEVEL, Estimate, known_mean
+from harness.core.statistics import LEVEL, Estimate, known_mean, too_few
 from harness.prompts.difference import PromptChange, change, of_swarm
 from harness.report.compare.pair import OPENED, Pair, Side
 from harness.runs import percentiles, reliability
@@ -70,6 +70,8 @@ class Difference:
     p_value: float | None = None  # of no difference, by that interval; None where there is none
     # by Holm's method (Holm 1979) for the primary metrics in all conditions; None where exploratory
     p_corrected: float | None = None
+    # whether `change` has no ends because its units, two or more, all changed by its value
+    is_alike: bool = False
 
     @property
     def primary(self) -> bool:
@@ -327,7 +329,8 @@ def _percentiles(pair: Pair, condition: str) -> Iterator[Difference]:
     differences = percentiles.differences(before, after, len(pair.episodes), pair.clusters)
     for percent, a, b, estimate in differences:
         p = p_of_bootstrap(estimate.value, estimate.low, estimate.high)
-        yield Difference(names[percent], a, b, estimate, p)
+        is_alike = p is None and estimate.n > 1 and not too_few(pair.clusters)
+        yield Difference(names[percent], a, b, estimate, p, is_alike=is_alike)
 
 
 def _pooled(pair: Pair, condition: str) -> Iterator[Difference]:
@@ -366,7 +369,19 @@ def _difference(pair: Pair, metric: str, condition: str) -> Difference:
         return difference(metric, [(b, a) for a, b in halves], level, pair.clusters)
 
     before, after = float(np.mean(means_a)), float(np.mean(means_b))
-    return Difference(metric, before, after, change(LEVEL), p_value(change))
+    p = p_value(change)
+    is_alike = p is None and _is_alike(pair, metric, halves)
+    return Difference(metric, before, after, change(LEVEL), p, is_alike=is_alike)
+
+
+def _is_alike(pair: Pair, metric: str, halves: Sequence[tuple[Floats, Floats]]) -> bool:
+    """Return whether two or more units changed by one value, which Student's interval lacks."""
+    if entry(metric).interval == "rate":
+        return False  # whose interval adds units that differ: it lacks ends for too few units alone
+    ((a, b),) = halves
+    changes = known_mean(b - a, 1)
+    units = np.arange(len(changes)) if pair.clusters is None else pair.clusters
+    return len(np.unique(units[~np.isnan(changes)])) > 1
 
 
 def _adjusted(pair: Pair, condition: str, a: Floats, b: Floats) -> Iterator[Difference]:

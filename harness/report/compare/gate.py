@@ -4,7 +4,7 @@ import math
 import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from harness.core.errors import UserError, printable, unknown
 from harness.core.statistics import Estimate
@@ -113,9 +113,17 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
     """
     changes: dict[str, Estimate | None] = {}
     for condition in comparison.conditions:
-        of_metric = [d.change for d in condition.differences if d.metric == gate.metric]
-        changes[condition.condition] = of_metric[0] if of_metric else None
+        changes[condition.condition] = None
+        for each in condition.differences:
+            if each.metric == gate.metric:
+                change = each.change
+                changes[condition.condition] = of_no_width(change) if each.is_alike else change
     return judge_changes(gate, changes)
+
+
+def of_no_width(change: Estimate) -> Estimate:
+    """Return a difference by which all units changed alike with its value for the missing ends."""
+    return replace(change, low=change.value, high=change.value)
 
 
 def judge_changes(gate: Gate, changes: Mapping[str, Estimate | None]) -> Verdict:
@@ -133,14 +141,15 @@ def judge_changes(gate: Gate, changes: Mapping[str, Estimate | None]) -> Verdict
     for name, change in changes.items():
         if gate.condition in (None, name):
             value = float(getattr(change, gate.end)) if change else math.nan
-            if math.isnan(value) and change and change.n > 1:
-                value = change.value  # all episodes changed alike, so that there is no interval
             if math.isnan(value):
                 # A gate that passes because nothing is known would guard nothing.
+                is_known = gate.end in ENDS and change is not None and not math.isnan(change.value)
+                lacks = "interval" if is_known else "such number"
+                more = ", of more recordings if of some," if is_known else ""
                 raise UserError(
-                    f"--fail-if {printable(gate.text)!r}: {printable(name)} has no "
-                    "such number in these runs; name a condition or a metric that has, or compare "
-                    "more episodes"
+                    f"--fail-if {printable(gate.text)!r}: {printable(name)} has no {lacks} in "
+                    "these runs; name a condition or a metric that has, or compare more episodes"
+                    f"{more}"
                 )
             # Means over seeds carry rounding errors, which decide no gate.
             if OPERATORS[gate.op](round(value, 9), gate.number):
