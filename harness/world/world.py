@@ -218,11 +218,11 @@ class World:
         state = self._now(agent, self.beacons)
         return seated(self.scenario, state, agent) if agent else state
 
-    def _now(self, agent: int = 0, known: tuple[Beacon, ...] = ()) -> WorldState:
+    def _now(self, agent: int = 0, messages: tuple[Beacon, ...] = ()) -> WorldState:
         name, states = self.scenario.name, tuple(map(self._state_of, self.vehicles))
         target_mps, buildings = float(self.vehicles[agent].target_speed), self.layout.buildings
         return WorldState(
-            name, self.seed, self.step, self.time_s, target_mps, states, buildings, known
+            name, self.seed, self.step, self.time_s, target_mps, states, buildings, messages
         )
 
     def _state_of(self, v: Any) -> VehicleState:

@@ -610,8 +610,8 @@ def _write_scene(writers: Mapping[str, pq.ParquetWriter], scene: Scene) -> Scene
     if scene.houses:
         outlines = [(house.id, house.outline) for house in scene.houses]
         writers[BUILDINGS].write_table(_table(_line_columns(scene.name, outlines), BUILDINGS))
-    stated: dict[str, Any] = _computed_facts(scene)
-    return SceneFacts(scene.name, scene.file, scene.sha256, lights=scene.lights, **stated)
+    facts: dict[str, Any] = _computed_facts(scene)
+    return SceneFacts(scene.name, scene.file, scene.sha256, lights=scene.lights, **facts)
 
 
 def _table(columns: Sequence[Any], file_name: str) -> pa.Table:
