@@ -16,6 +16,7 @@ from harness.core.files import digest
 from harness.core.resources import find, names
 from harness.core.statistics import Estimate
 from harness.dataset import load
+from harness.dataset.verify import read_manifest
 from harness.evaluate import resolve
 from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
@@ -150,9 +151,10 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
         An edition is a release of the benchmark, and an entry one model's results on it. `limit` is
         how many layouts (start situations) of each dataset they must be of; None for all. Raises
-        UserError unless each run has this edition's settings, each dataset has one run, and all are
-        of one agent: one model with one prompt, answer mode and so on.
+        UserError unless each run has this edition's settings, each dataset has one run, no two
+        are of one scenario, and all are of one agent: one model with one prompt and so on.
         """
+        self.refuse_two_of_a_family()
         by_dataset: dict[str, Run] = {}
         for run in runs:
             mistakes = self._mistakes(run.manifest, limit, by_dataset, _agent(runs[0].manifest))
@@ -167,6 +169,21 @@ class Edition(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
                 f"{printable(self.name)} has dataset {printable(missing[0])}; add a run of it"
             )
         return {name: by_dataset[name] for name in self.datasets}
+
+    def refuse_two_of_a_family(self) -> None:
+        """Raise UserError if two of the edition's datasets are of one scenario.
+
+        Means are over families, the scenes of one scenario each, and a family has one run.
+        """
+        dataset_of: dict[str, str] = {}
+        for name in self.datasets:
+            manifest, _ = read_manifest(load.find(name))
+            first = dataset_of.setdefault(manifest.scenario, name)
+            if first != name:
+                raise UserError(
+                    f"edition {printable(self.name)} has {printable(manifest.scenario)} twice, as "
+                    f"datasets {printable(first)} and {printable(name)}; give each family one"
+                )
 
     def _mistakes(
         self, m: Manifest, limit: int | None, others: Collection[str], agent: dict[str, Any]

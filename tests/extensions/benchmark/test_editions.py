@@ -494,6 +494,31 @@ def test_a_dataset_that_is_not_the_editions_is_refused(project: Harness) -> None
     assert "dataset small has digest" in err
 
 
+def test_an_edition_of_two_datasets_of_a_family_is_refused_at_every_door(
+    project: Harness, made: Path, small_path: Path
+) -> None:
+    """Of which a file of results would count the last alone."""
+    Path("datasets/twin").symlink_to(small_path)
+    file = Path("editions/mine-1.toml")
+    small = next(line for line in file.read_text().splitlines() if line.startswith("small ="))
+    file.write_text(file.read_text().replace(small, f"{small}\n{small.replace('small', 'twin')}"))
+
+    def of_two(files: dict[str, bytes]) -> None:
+        contents = json.loads(files[CONTENTS])
+        contents["digest"] = of_file(file).digest
+        files[CONTENTS] = json.dumps(contents).encode()
+
+    changed(made, of_two)
+    twice = "has occluded-intersection twice, as datasets small and twin; give each family one"
+    for typed, code in (
+        (("pack", "entry/small", "entry/small", "--edition", "mine-1"), 2),
+        (("verify", made), 2),
+        (("board", made), 2),
+    ):
+        said = project("benchmark", *typed)
+        assert (said[0], twice in said[2]) == (code, True), said
+
+
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_edition_is_as_it_was_released_and_of_what_is_released(name: str) -> None:
     edition = named(name)
