@@ -34,10 +34,17 @@ from harness.report.matrix import lines
 from harness.report.panels import errors, reliability
 from harness.report.plan import from_pilots
 from harness.report.runs import Runs
+from harness.runs import pinned
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run, read
 from harness.runs.metric_names import GAIN
-from harness.runs.success import Success, half_difference, mean_difference
+from harness.runs.success import (
+    Success,
+    clusters_of,
+    half_difference,
+    mean_difference,
+    of_families,
+)
 
 NONE = np.zeros(6, dtype=bool)
 
@@ -151,6 +158,40 @@ def test_families_have_no_cluster_in_common_and_halves_of_one_do() -> None:
     of_danger = half_difference([family], True)
     assert of_danger == paired_difference(halves[:1], clusters=of_halves[:1])
     assert Success(dangerous, clusters).plain.clusters is clusters
+
+
+@pytest.mark.parametrize(
+    ("names", "joined"),
+    [
+        ([["a", "a", "b"], ["b", "c", None]], [0, 0, 1, 1, 2, 3]),
+        ([["a", "b", "c"], ["c", "b", "a"]], [0, 1, 2, 2, 1, 0]),  # in one alone each is its own
+        ([["a", "b", "c"], ["d", "e", None]], None),
+        ([[], []], None),  # not known
+    ],
+)
+def test_families_share_what_they_name_alike(
+    names: list[list[str | None]], joined: list[int] | None
+) -> None:
+    """Two imports of one traffic are no two families' worth of it."""
+    of_first, of_second = (cluster_numbers(each) for each in names)
+    none = np.zeros(3, dtype=bool)
+    rules = [Success(none, of_first, names[0]), Success(none, of_second, names[1])]
+    values = np.array([[1.0, 1, 0]]), np.array([[0.0, 1, 1]])
+    pairs = [(rule, *values) for rule in rules]
+    clusters = clusters_of(rules)
+    if joined is None:
+        assert clusters is None
+        assert mean_difference(pairs) == paired_difference([values[0][0] - values[1][0]] * 2)
+        assert pinned.mean_difference(pairs) != mean_difference(pairs)
+    else:
+        assert clusters is not None
+        assert np.concatenate(clusters).tolist() == joined
+        assert mean_difference(pairs) == paired_difference(
+            [values[0][0] - values[1][0]] * 2, clusters=clusters
+        )
+        assert pinned.mean_difference(pairs) == mean_difference(pairs)
+    alone = [rule.estimate(values[0]) for rule in rules]
+    assert of_families(alone, rules) == mean_of(alone, together=joined is not None)
 
 
 def covered(

@@ -202,7 +202,12 @@ class Dataset:
 
         A cluster is what layouts are cut from, such as a recording of traffic.
         """
-        return cluster_numbers([self.scenario.cluster_of(seed) for seed in self.seeds])
+        return cluster_numbers(self.cluster_names)
+
+    @property
+    def cluster_names(self) -> list[str | None]:
+        """Return the name of each episode's cluster, (E,); None for one of its own."""
+        return [self.scenario.cluster_of(seed) for seed in self.seeds]
 
     @property
     def lost(self) -> int:

@@ -91,10 +91,10 @@ def lines(suite: SuiteRun, datasets: Mapping[str, Dataset] | None = None) -> lis
         drivers.append({name: scores[metric] for name, scores in references.items()})
         cells = _cells(run, suite.conditions, metric, p_values.get(family, {}))
         lines.append(Line(family, run, drivers[-1], cells))
-    means = {}
+    means, together = {}, suite.shares_cluster
     for name in drivers[0]:
         if all(name in of_family for of_family in drivers):
-            means[name] = mean([of_family[name] for of_family in drivers])
+            means[name] = mean([of_family[name] for of_family in drivers], together)
     cells = _cells(suite, suite.conditions, metric, p_values.get(MEAN, {}))
     return [*lines, Line(MEAN, None, means, cells)]
 

@@ -5,11 +5,12 @@ Taken together, the same differences have a narrower one: `success.mean_differen
 """
 
 from harness.core.statistics import Estimate, mean_of, rate_difference
+from harness.runs import success
 from harness.runs.folder import Run
 from harness.runs.headline import BALANCED
 from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.records import Score
-from harness.runs.success import Pairs, by_condition
+from harness.runs.success import Pairs
 
 KIND = "episodes"  # of its intervals
 
@@ -21,11 +22,14 @@ def mean_difference(pairs: Pairs) -> Estimate:
     the mean over families; a family is the scenes of one scenario. `pairs` has for each its rule of
     how success is averaged and the success a and b of its episodes, (S, E) each, by S seeds of the
     channel's random draws and E episodes. The interval of each half of a family, with a danger or
-    without, is computed apart, and these are combined.
+    without, is computed apart, and these are combined. Of clusters of episodes, which those rules
+    did not know, it is that by today's.
     """
+    if success.clusters_of([rule for rule, _, _ in pairs]) is not None:
+        return success.mean_difference(pairs)
     families = []
-    for success, a, b in pairs:
-        halves = [rate_difference(a[:, part].T, b[:, part].T) for part in success.parts]
+    for rule, a, b in pairs:
+        halves = [rate_difference(a[:, part].T, b[:, part].T) for part in rule.parts]
         families.append(mean_of(halves) if len(halves) > 1 else halves[0])
     return mean_of(families) if len(families) > 1 else families[0]
 
@@ -38,7 +42,7 @@ def gain(run: Run, score: Score) -> Score:
     condition and metric are taken; its value is not. A condition is a named set of settings of the
     radio, of asking helpers and of fusing their messages.
     """
-    success, values = by_condition(run.grid, run.episodes)
-    counted = success if score.metric == GAINS[BALANCED] else success.plain
+    rule, values = success.by_condition(run.grid, run.episodes)
+    counted = rule if score.metric == GAINS[BALANCED] else rule.plain
     estimate = mean_difference([(counted, values[score.condition], values[BASELINE])])
     return Score.of(score.condition, score.metric, estimate, KIND)

@@ -4,7 +4,7 @@ All that picks, orders or tests by success of single episodes does so here.
 """
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 from typing import Generic, TypeVar
 
@@ -17,6 +17,7 @@ from harness.core.statistics import (
     LEVEL,
     Estimate,
     cluster_numbers,
+    joined_clusters,
     known_mean,
     mean_of,
     paired_difference,
@@ -47,6 +48,9 @@ class Success:
     dangerous: Bools  # whether each episode has a danger, (E,); all false for a plain mean
     # number of the cluster of each episode, (E,); None if each is of its own
     clusters: Ints | None = None
+    # names of the clusters, (E,), by which families know those that they share; empty where only
+    # one family is looked at
+    names: Sequence[str | None] = ()
 
     @classmethod
     def of(cls, episodes: Sequence[Episode], headline_metric: str) -> "Success":
@@ -59,7 +63,8 @@ class Success:
         """
         balanced = headline_metric == BALANCED
         dangerous = np.array([balanced and episode.danger != "none" for episode in episodes])
-        return cls(dangerous, cluster_numbers([episode.cluster for episode in episodes]))
+        names = [episode.cluster for episode in episodes]
+        return cls(dangerous, cluster_numbers(names), names)
 
     @property
     def metric(self) -> str:
@@ -81,7 +86,7 @@ class Success:
 
         A danger is a vehicle that would meet an ego which keeps its speed.
         """
-        return Success(np.zeros_like(self.dangerous), self.clusters)
+        return replace(self, dangerous=np.zeros_like(self.dangerous))
 
     @property
     def ways(self) -> "tuple[Success, ...]":
@@ -271,29 +276,59 @@ def mean_difference(pairs: Pairs, level: float = LEVEL) -> Estimate:
     the success a and b of its episodes, (S, E) each, by S seeds of the channel's random draws and E
     episodes. The interval, of confidence `level`, treats all families' episodes together.
     """
-    parts, of_parts = [], []
-    clusters = _apart(pairs)
-    for (success, a, b), numbers in zip(pairs, clusters, strict=True):
+    parts, masks = [], []
+    for success, a, b in pairs:
         differences = known_mean(a - b, 0)
         parts += [differences[part] for part in success.parts]
-        of_parts += [numbers[part] for part in success.parts]
-    return paired_difference(parts, level, of_parts if _is_clustered(pairs) else None)
+        masks.append(success.parts)
+    return paired_difference(parts, level, _of_parts(pairs, masks))
 
 
-def _is_clustered(pairs: Pairs) -> bool:
-    return any(success.clusters is not None for success, _, _ in pairs)
+def _of_parts(pairs: Pairs, masks: Sequence[Sequence[Bools]]) -> list[Ints] | None:
+    """Return the clusters of each family's parts, of which `masks` has the episodes."""
+    clusters = clusters_of([success for success, _, _ in pairs])
+    if clusters is None:
+        return None
+    of_parts = []
+    for numbers, of_family in zip(clusters, masks, strict=True):
+        of_parts += [numbers[mask] for mask in of_family]
+    return of_parts
 
 
-def _apart(pairs: Pairs) -> list[Ints]:
-    """Return the number of each episode's cluster for each family, (E,); none is in two."""
-    clusters, first = [], 0
-    for success, _, _ in pairs:
-        numbers = success.clusters
-        if numbers is None:
-            numbers = np.arange(len(success.dangerous))
-        clusters.append(first + numbers)
-        first += len(numbers)
-    return clusters
+def of_families(estimates: Sequence[Estimate], rules: Sequence[Success]) -> Estimate:
+    """Return the mean over families of their estimates, with an interval.
+
+    A family is the scenes of one scenario. `rules` has for each how its success is averaged: those
+    that share a cluster, such as one recording of traffic, are not independent.
+    """
+    return mean_of(estimates, together=shares_cluster([rule.names for rule in rules]))
+
+
+def shares_cluster(families: Sequence[Sequence[str | None]]) -> bool:
+    """Return whether two families have a cluster in common, by the name of each episode's."""
+    names = [{*of_family} - {None} for of_family in families]
+    return len(set[str | None]().union(*names)) < sum(map(len, names))
+
+
+def clusters_of(rules: Sequence[Success]) -> list[Ints] | None:
+    """Return for each family the number of each episode's cluster, (E,); None if each is its own.
+
+    A family is the scenes of one scenario, and `rules` has for each how its success is averaged.
+    Two families have a cluster in common if they name it alike.
+    """
+    is_clustered = any(rule.clusters is not None for rule in rules)
+    if not is_clustered and not shares_cluster([rule.names for rule in rules]):
+        return None
+    of_one, names = list[str | None](), list[str | None]()
+    for family, rule in enumerate(rules):
+        episodes = len(rule.dangerous)
+        numbers = range(episodes) if rule.clusters is None else rule.clusters.tolist()
+        of_one += [f"{family} {number}" for number in numbers]
+        names += rule.names or [None] * episodes
+    clusters = joined_clusters([of_one, names])
+    assert clusters is not None
+    ends = np.cumsum([len(rule.dangerous) for rule in rules])
+    return np.split(clusters, ends[:-1])
 
 
 def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
@@ -304,13 +339,12 @@ def half_difference(pairs: Pairs, dangerous: bool) -> Estimate:
     episodes. `dangerous` chooses the episodes with a danger. A danger is a vehicle that would meet
     an ego which keeps its speed.
     """
-    parts, of_parts = [], []
-    clusters = _apart(pairs)
-    for (success, a, b), numbers in zip(pairs, clusters, strict=True):
+    parts, masks = [], []
+    for success, a, b in pairs:
         of_half = success.dangerous == dangerous
         parts.append(known_mean(a - b, 0)[of_half])
-        of_parts.append(numbers[of_half])
-    return paired_difference(parts, clusters=of_parts if _is_clustered(pairs) else None)
+        masks.append([of_half])
+    return paired_difference(parts, clusters=_of_parts(pairs, masks))
 
 
 def p_of_mean(pairs: Pairs) -> float | None:

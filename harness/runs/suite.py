@@ -21,7 +21,7 @@ from harness.runs.listing import own_name
 from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.records import Cost, Manifest, Score, Variant
 from harness.runs.settings import FrozenSettings, deciding
-from harness.runs.success import Plays, by_condition, is_gain
+from harness.runs.success import Plays, by_condition, is_gain, shares_cluster
 from harness.runs.writer import csv_text
 
 FORMAT = "swarmdrive-suite/1"
@@ -118,10 +118,19 @@ class SuiteRun:
         others_by_key = []
         for run in rest:
             others_by_key.append({s.key: s for s in run.scores})
+        together = self.shares_cluster
         for s in first.scores:
             if s.interval != "seed means" and all(s.key in scores for scores in others_by_key):
                 of_families = [s, *(scores[s.key] for scores in others_by_key)]
-                yield self._gain(s) if is_gain(s, self.conditions) else mean(of_families)
+                yield self._gain(s) if is_gain(s, self.conditions) else mean(of_families, together)
+
+    @cached_property
+    def shares_cluster(self) -> bool:
+        """Return whether layouts of two families are cut from one thing, such as a recording."""
+        names = []
+        for run in self.runs.values():
+            names.append([episode.cluster for episode in run.episodes])
+        return shares_cluster(names)
 
     @cached_property
     def _plays(self) -> Plays[str]:
@@ -155,15 +164,14 @@ def plays(runs: Iterable[Run], headline_metric: str) -> Plays[str]:
     return Plays([by_condition(run.grid, run.episodes, headline_metric) for run in runs])
 
 
-def mean(scores: Sequence[Score]) -> Score:
+def mean(scores: Sequence[Score], together: bool) -> Score:
     """Return the mean of one metric's scores over several families of scenes, with its interval.
 
-    A family is the scenes of one scenario; `scores` has one score of each.
+    A family is the scenes of one scenario; `scores` has one score of each. `together` is for
+    families that share a cluster, such as one recording: they are not independent.
     """
-    first = scores[0]
-    return Score.of(
-        first.condition, first.metric, mean_of([s.estimate for s in scores]), first.interval
-    )
+    first, estimates = scores[0], [score.estimate for score in scores]
+    return Score.of(first.condition, first.metric, mean_of(estimates, together), first.interval)
 
 
 def contents_of(path: Path) -> Contents:

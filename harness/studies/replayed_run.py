@@ -471,5 +471,8 @@ def counted(runs: Sequence[ReplayedRun]) -> dict[ReplayedRun, Success]:
     It is balanced, the mean over episodes with a danger (a vehicle that the ego would meet) and
     without, if it can be so for all of them, else plain.
     """
-    rules = alike([Success(run.dataset.dangerous, run.dataset.clusters) for run in runs])
-    return dict(zip(runs, rules, strict=True))
+    rules = []
+    for run in runs:
+        of_run = run.dataset
+        rules.append(Success(of_run.dangerous, of_run.clusters, of_run.cluster_names))
+    return dict(zip(runs, alike(rules), strict=True))

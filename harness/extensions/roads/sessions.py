@@ -104,7 +104,6 @@ class Sessions:
     traffic: Mapping[str, Traffic]  # by the name of the scene
     session: Mapping[str, str]  # of each scene: the least content of the scenes in it
     first: Mapping[str, str]  # of each scene: the first by name of those that are the same
-    title: Mapping[str, str]  # of each session: the first by name of its scenes
     contents: Mapping[str, int]  # of each session: how many scenes it has that are not the same
 
     @classmethod
@@ -117,8 +116,7 @@ class Sessions:
         session_of = dict(zip(contents, firsts, strict=True))
         session = {name: session_of[each.content] for name, each in traffic.items()}
         first = {name: by_content[each.content] for name, each in traffic.items()}
-        title = {session[name]: name for name in sorted(traffic, reverse=True)}
-        return cls(traffic, session, first, title, Counter(firsts))
+        return cls(traffic, session, first, Counter(firsts))
 
     @property
     def shared(self) -> int:

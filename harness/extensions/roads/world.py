@@ -26,6 +26,8 @@ from harness.world.scene_graph import SceneGraph
 from harness.world.simulator import LAMPS_MPS2
 from harness.world.state import Part
 
+LETTERS = 12  # of a digest, in the name of what a layout is cut from
+
 
 @dataclass(frozen=True)
 class Parameters(environments.Parameters):
@@ -192,9 +194,10 @@ class RecordedScenario(EnvironmentScenario):
 
 @dataclass(frozen=True)
 class Scenes:
-    """Return, when called with a layout seed, the scene from which its layout is cut.
+    """Return, when called with a layout seed, the traffic from which its layout is cut.
 
-    Of scenes that share traffic it is the first by name.
+    Scenes that share traffic have one name. It follows from what moves in them, so that another
+    recording of the same has it, too.
     """
 
     name: str  # the scenario's name
@@ -202,7 +205,8 @@ class Scenes:
     def __call__(self, seed: int) -> str:
         recording = recording_of(self.name)
         sessions = sessions_of(recording)
-        return sessions.title[sessions.session[nth(recording, seed).scene]]
+        session = sessions.session[nth(recording, seed).scene]
+        return f"traffic {session[:LETTERS]}"
 
 
 @lru_cache(maxsize=16)

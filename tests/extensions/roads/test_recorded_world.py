@@ -18,6 +18,7 @@ from harness.dataset.verify import check
 from harness.extensions.roads import family, held, tables
 from harness.extensions.roads.family import RECORDINGS, recording_of
 from harness.extensions.roads.fitness import is_mastered
+from harness.extensions.roads.held import sessions_of
 from harness.extensions.roads.network import ground, streets
 from harness.extensions.roads.replay import HARDEST_MPS2, Cast, Play
 from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track
@@ -226,7 +227,8 @@ def test_dangers_goals_and_seeds(scenario: Scenario) -> None:
     assert dangerous.layout.danger == hidden.spawn.approach
     assert dangerous.layout.danger in dangerous.scenario.road().sectors
     assert scenario.cluster is not None
-    assert scenario.cluster(0) == "s"
+    [session] = sessions_of(recording_of(scenario.name)).session.values()
+    assert scenario.cluster(0) == f"traffic {session[:12]}"
     with pytest.raises(
         UserError, match=r"hand has 2 moments to tune \(seeds 0 to 1\), and no more are to be had"
     ):

@@ -19,7 +19,7 @@ from harness.core.figures import POINTS, as_mapping, interval_of, within
 from harness.core.files import BROKEN, text_of
 from harness.core.progress import Progress
 from harness.core.seeds import seeds_text
-from harness.core.statistics import Estimate, mean_of
+from harness.core.statistics import Estimate
 from harness.core.versions import versions
 from harness.evaluate import latency as latencies
 from harness.evaluate.run import Opens, read_or_evaluate
@@ -33,7 +33,7 @@ from harness.runs.folder import Run
 from harness.runs.headline import BALANCED, SUCCESS
 from harness.runs.metric_values import by_episode
 from harness.runs.metrics import METRICS
-from harness.runs.success import Success, alike, mean_difference
+from harness.runs.success import Success, alike, mean_difference, of_families
 from harness.studies.study import Study, ends
 
 HISTORY = "history.json"  # beside a version's files: where it comes from; no part of its digest
@@ -199,8 +199,8 @@ def _certificate(
         row = {OLD: rule.estimate(before), NEW: rule.estimate(after), "difference": difference}
         rows.append(row)
     if len(rows) > 1:
-        old_mean = mean_of([row[OLD] for row in rows])
-        new_mean = mean_of([row[NEW] for row in rows])
+        old_mean = of_families([row[OLD] for row in rows], rules)
+        new_mean = of_families([row[NEW] for row in rows], rules)
         rows.append({OLD: old_mean, NEW: new_mean, "difference": mean_difference(pairs)})
     return rules[0], rows
 
