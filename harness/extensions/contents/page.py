@@ -458,16 +458,17 @@ def groups_table(results: Sequence[Result]) -> "pd.DataFrame":
     rows = []
     for result in results:
         for name, within in groups(result.model).items():
-            intent = result.at(result.base, INTENT).pooled(within)
+            outcome = result.at(result.base, INTENT)
+            intent, clusters = outcome.pooled(within), outcome.pooled_clusters(within)
             for content in result.model.contents:
                 success = result.at(result.base, content).pooled(within)
-                gain = difference(SUCCESS, [(success.T, intent.T)])
+                gain = difference(SUCCESS, [(success.T, intent.T)], clusters=clusters)
                 row = {
                     "model": result.model.name,
                     "condition": result.base.condition,
                     "group": name,
                     "content": content,
-                    **_success(over_episodes(SUCCESS, success), gain),
+                    **_success(over_episodes(SUCCESS, success, clusters), gain),
                 }
                 rows.append(row)
     return pd.DataFrame(rows)

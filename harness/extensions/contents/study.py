@@ -22,7 +22,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.core.formats import SUITE
 from harness.core.progress import Progress
-from harness.core.statistics import Estimate, mean_of
+from harness.core.statistics import Estimate
 from harness.evaluate.dry_run import lacking
 from harness.evaluate.walk import Decided
 from harness.report.suite import MEAN
@@ -31,7 +31,7 @@ from harness.runs.estimates import over_episodes
 from harness.runs.headline import BALANCED, IN_WORDS, SUCCESS
 from harness.runs.metric_names import LATENCY
 from harness.runs.metrics import entry
-from harness.runs.success import Success, mean_difference, p_of_mean
+from harness.runs.success import Success, clusters_of, mean_difference, of_families, p_of_mean
 from harness.runs.suite import contents_of
 from harness.studies.axes import Setting, axis_of, described, grid
 from harness.studies.play import by_episode, metric_columns
@@ -137,7 +137,7 @@ class Outcome:
                 estimates.append(rule.estimate(values[SUCCESS]))
             else:
                 estimates.append(over_episodes(metric, values[metric], rule.clusters))
-        return mean_of(estimates)
+        return of_families(estimates, [self.success_rules[name] for name in self._of(family)])
 
     def over(
         self, other: "Outcome", family: str = MEAN, level: float = 0.95, metric: str = ""
@@ -177,6 +177,19 @@ class Outcome:
         for family, values in self.families.items():
             parts.append(values[SUCCESS][:, groups[family]])
         return np.hstack(parts)
+
+    def pooled_clusters(self, groups: Mapping[str, Bools]) -> Ints | None:
+        """Return the number of each cluster of the n episodes of `pooled`, (n,), from 0.
+
+        None if each is its own; the episodes of scenarios that name a cluster alike are in one.
+        """
+        clusters = clusters_of([self.success_rules[family] for family in self.families])
+        if clusters is None:
+            return None
+        parts = []
+        for family, numbers in zip(self.families, clusters, strict=True):
+            parts.append(numbers[groups[family]])
+        return np.unique(np.concatenate(parts), return_inverse=True)[1]
 
     def _of(self, family: str) -> list[str]:
         return list(self.families) if family == MEAN else [family]

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -138,7 +139,16 @@ def test_a_mean_gives_families_the_same_weight_and_differences_are_paired_within
     gains = paired_difference([of_two[dangerous["two"]], of_two[~dangerous["two"]]])
     assert balanced.over(worse, "two") == gains
     assert balanced.over(worse, metric=SUCCESS) == better.over(worse)
-    assert better.pooled({"one": np.arange(30) < 2, "two": np.arange(90) < 3}).shape == (2, 5)
+    group = {"one": np.arange(30) < 2, "two": np.arange(90) < 3}
+    assert better.pooled(group).shape == (2, 5)
+    assert better.pooled_clusters(group) is None
+    rules = {
+        name: replace(rule, names=[f"street {place % 4}" for place in range(len(rule.dangerous))])
+        for name, rule in plain.items()
+    }
+    clustered = Outcome(better.families, rules)
+    assert clustered.pooled_clusters(group).tolist() == [0, 1, 0, 1, 2]
+    assert clustered.estimate(SUCCESS) == mean_of(each, together=True)
 
 
 def test_witnesses_are_the_helpers_that_list_the_danger(done: Path) -> None:
