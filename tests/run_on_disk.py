@@ -13,6 +13,7 @@ import pyarrow as pa
 from harness.coordination.named_points import POINTS
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.files import sha256_file
+from harness.core.statistics import cluster_numbers
 from harness.core.versions import FIGURES
 from harness.radio.profiles import CHANNELS
 from harness.runs import folder, formats, writer
@@ -190,10 +191,11 @@ def _write(
     grid = Grid(tuple(str(c["name"]) for c in manifest.conditions), manifest.seeds, numbers)
     episodes = counted(grid, decisions, _all(ends, Episode))
     world: World = "frozen" if isinstance(manifest.world, FrozenScenes) else "closed-loop"
-    summary = Figures.of(world, grid, decisions, episodes, answers).scores()
+    figures = Figures.of(world, grid, decisions, episodes, answers)
+    summary, clusters = figures.scores(), cluster_numbers(figures.cluster_names)
     manifest = msgspec.structs.replace(
         manifest,
-        answer_times=times(answers),
+        answer_times=times(answers, grid.episodes, clusters),
         **counts(answers),
     )
     writer.write(out, manifest, decisions, episodes, [writer.lines(answers)], summary)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from run_on_disk import Row, made_up
 
 from harness.core.arrays import Floats, Ints
@@ -35,6 +36,7 @@ from harness.report.panels import errors, reliability
 from harness.report.plan import from_pilots
 from harness.report.runs import Runs
 from harness.runs import pinned
+from harness.runs.answer_times import times
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run, read
 from harness.runs.metric_names import GAIN
@@ -342,3 +344,39 @@ def test_the_rows_of_an_episode_have_one_layout(tmp_path: Path) -> None:
         table.write_text("\n".join([head, *rows[:-1], ",".join(cells)]) + "\n")
         with pytest.raises(UserError, match=rf"episode 1 has {name} .* in one row and {value} in"):
             sound(folder)
+
+
+def test_times_of_answers_are_over_recordings(tmp_path: Path) -> None:
+    """Of a run's own page, and of what a device would take."""
+    from harness.extensions.devices import profiles
+    from harness.extensions.devices.fit import answers_of, fits, held
+
+    device, found = profiles.load("laptop-cpu"), {}
+    row = device.rows[0]
+    for size in (0, 2, 24):
+        whole = made(tmp_path / str(size), size)
+        timed = [replace(answer, **clock(answer.scene)) for answer in whole.answers]
+        whole.__dict__["answers"] = timed
+        ego = times(timed, whole.grid.episodes, whole.clusters)["ego"]
+        [seconds, *_] = held(device, row, whole)
+        [_, written] = fits(device, [row], answers_of(whole), 0.2)
+        found[size] = ego.median_ci_s, (seconds.measured.low, seconds.measured.high), written
+    (own, rates, alone), (dozen, _, of_dozen), (of_one, of_one_rate, single) = found.values()
+    assert own is not None
+    assert dozen is not None
+    assert dozen[1] - dozen[0] > own[1] - own[0]
+    assert rates == pytest.approx(own)
+    assert of_one is None
+    assert math.isnan(of_one_rate[0])
+    assert (single.joules.value, single.in_time.value) == (alone.joules.value, alone.in_time.value)
+    assert math.isnan(single.joules.low)
+    assert single.in_time.low < of_dozen.in_time.low < alone.in_time.low
+
+
+def clock(scene: str) -> dict[str, float]:
+    """Layouts of one recording take alike, twelve of them from 0.1 to 0.21 s."""
+    place = int(scene.partition("-")[0]) // 2
+    return {
+        "seconds": (10 + place) / 100, "first_token_s": 0.05, "token_s": 0.01,
+        "prompt_tokens": 100 + 10 * place, "completion_tokens": 20 + place // 6,
+    }  # fmt: skip

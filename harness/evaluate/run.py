@@ -30,6 +30,7 @@ from harness.core.progress import Progress
 from harness.core.seals import is_sealed, say_unsealed, write_seal
 from harness.core.seeds import LAST_EPISODE
 from harness.core.shards import Shard
+from harness.core.statistics import cluster_numbers
 from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.dataset.select import recorded
@@ -644,6 +645,9 @@ def _gather(
             summary = [*summary, *rule.scores(whole.grid, episodes)]
         if layouts:
             summary = [*summary, *adjusted_scores(whole.grid, episodes, layouts)]
+        times = answer_times.times(
+            answers, whole.grid.episodes, cluster_numbers(whole.cluster_names)
+        )
         cost = costs.total(settings, works)
         manifest = msgspec.convert(
             {
@@ -655,7 +659,7 @@ def _gather(
                 **settings,
                 "settings": typed,
                 "latency": msgspec.to_builtins(run_start.latency),
-                "answer_times": msgspec.to_builtins(answer_times.times(answers)),
+                "answer_times": msgspec.to_builtins(times),
                 "identity": run_start.identity,
                 **answer_counts.counts(answers),
                 "versions": run_start.versions,

@@ -31,7 +31,7 @@ def by_later_rules(run: Run, answers: Sequence[Answer]) -> Iterator[str]:
     These are times of answers, records that it lacks, and looks at what it had so far. A run by
     earlier rules may state them so. `answers` are the run's.
     """
-    if run.manifest.answer_times != times(answers):
+    if run.manifest.answer_times != times(answers, run.grid.episodes, run.clusters):
         yield "run.json has another answer_times than its answers took"
     for what, recorded, named in _records(run):
         for name in sorted(named - recorded.keys()):

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from harness.core.arrays import Floats, Ints
-from harness.core.statistics import Estimate, known_mean, resampled, too_few
+from harness.core.statistics import FEWEST, Estimate, known_mean, resampled, too_few
 
 PERCENTILES = (50, 95, 99)
 RESAMPLES, RESAMPLING_SEED = 999, 0
@@ -58,13 +58,17 @@ def differences(
         yield percent, float(x[0]), float(y[0]), estimate
 
 
-def intervals(values: Floats, episodes: Sequence[str]) -> dict[int, tuple[float, float]]:
+def intervals(
+    values: Floats, units: Sequence[str], is_clustered: bool = False
+) -> dict[int, tuple[float, float]]:
     """Return the 95 % bootstrap interval of each of `PERCENTILES` of n values, by the percent.
 
-    Whole episodes are resampled: `values` are (n,), and `episodes` names the episode of each. An
-    end is NaN if the data cannot bound it.
+    Whole units are resampled: `values` are (n,), and `units` names the episode of each, or its
+    cluster if `is_clustered`. An end is NaN if the data cannot bound it, or of too few clusters.
     """
-    names, index = np.unique(episodes, return_inverse=True)
+    names, index = np.unique(units, return_inverse=True)
+    if is_clustered and len(names) < FEWEST:
+        return dict.fromkeys(PERCENTILES, (math.nan, math.nan))
     weights = resampled(np.random.default_rng(RESAMPLING_SEED), len(names), RESAMPLES)
     resampled_percentiles = _percentiles((index, values), weights)
     return {

@@ -2,7 +2,7 @@
 and how near its rates are to a run's own times.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from harness.extensions.devices import profiles
 from harness.extensions.devices.profiles import Device, DeviceRow
 from harness.extensions.devices.timer import tokens
 from harness.runs import percentiles
+from harness.runs.answer_times import clusters_by_text, unit
 from harness.runs.folder import Run
 from harness.runs.records import Answer
 
@@ -61,14 +62,15 @@ class Answers:
     """Hold the token counts of n answers whose time and energy on a device are asked for.
 
     `prompt`, (n,), is the number of tokens read, and `output` that written, (n,) by kind of answer
-    (`readout`, one token, or in writing). `episodes`, (n,), has the number of each answer's
-    episode; None for one assumed answer. `who` is the model that wrote them.
+    (`readout`, one token, or in writing). `units`, (n,), has the number of what each answer is
+    counted under, its episode or the cluster of that; None for one assumed answer. `who` is the
+    model that wrote them.
     """
 
     prompt: Floats  # number of tokens read for each answer, (n,)
     output: dict[str, Floats]  # number of tokens written, by kind of answer, (n,) each
-    # number of each answer's episode, (n,); None for one assumed answer
-    episodes: Ints | None = None
+    # number of each answer's episode, or its cluster, (n,); None for one assumed answer
+    units: Ints | None = None
     who: str = ""  # the model that wrote them
 
 
@@ -92,8 +94,8 @@ def answers_of(run: Run) -> Answers:
     counts = np.array([tokens(answer) for answer in egos], dtype=float).reshape(-1, 2)
     if not len(counts):
         raise UserError(f"{printable(run.path)} has no answer of its ego; give another run")
-    episodes = [answer.scene.partition("-")[0] for answer in egos]
-    _, place = np.unique(episodes, return_inverse=True)
+    cluster_of = clusters_by_text(run.grid.episodes, run.clusters)
+    _, place = np.unique([unit(answer, cluster_of) for answer in egos], return_inverse=True)
     output = {READOUT: np.ones(len(counts)), run.manifest.answer: counts[:, 1]}
     return Answers(counts[:, 0], output, place, run.manifest.model["name"])
 
@@ -105,12 +107,12 @@ def _fit(device: Device, row: DeviceRow, kind: str, answers: Answers, window_s: 
     seconds = np.array([profiles.seconds(speed, *pair) for pair in pairs])
     joules = np.array([profiles.joules(speed, *pair) for pair in pairs])
     hits = np.where(np.isnan(seconds), np.nan, (seconds <= window_s).astype(float))
-    if answers.episodes is None:
+    if answers.units is None:
         in_time = Estimate(float(hits[0]), np.nan, np.nan, 1, 0)
         energy = Estimate(float(joules[0]), np.nan, np.nan, 1, 0)
     else:
-        in_time = rate_interval(hits, answers.episodes)
-        energy = episode_interval(joules, answers.episodes)
+        in_time = rate_interval(hits, answers.units)
+        energy = episode_interval(joules, answers.units)
     return Fit(
         row=row,
         answer=kind,
@@ -151,7 +153,10 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
         counted = answer.prompt_tokens is not None and answer.completion_tokens
         if timed and counted and not answer.first:
             alone.setdefault(answer.role, []).append(answer)
-    figures = [figure for answers in alone.values() for figure in _held(device, row, answers)]
+    cluster_of = clusters_by_text(run.grid.episodes, run.clusters)
+    figures = list[Comparison]()
+    for answers in alone.values():
+        figures += _held(device, row, answers, cluster_of)
     if not figures:
         raise UserError(
             f"{printable(run.path)} has no answer that was asked alone and timed; run it with "
@@ -160,10 +165,12 @@ def held(device: Device, row: DeviceRow, run: Run) -> list[Comparison]:
     return figures
 
 
-def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[Comparison]:
+def _held(
+    device: Device, row: DeviceRow, alone: Sequence[Answer], cluster_of: Mapping[str, str]
+) -> Iterator[Comparison]:
     speed, role = profiles.speed(device, row), alone[0].role
     seconds = [profiles.seconds(speed, *tokens(answer)) for answer in alone]
-    measured = _median([(answer.seconds, answer) for answer in alone])
+    measured = _median([(answer.seconds, answer) for answer in alone], cluster_of)
     yield Comparison("seconds", role, measured, float(np.median(seconds)))
     read, written = list[tuple[float, Answer]](), list[tuple[float, Answer]]()
     for answer in alone:
@@ -174,12 +181,16 @@ def _held(device: Device, row: DeviceRow, alone: Sequence[Answer]) -> Iterator[C
     for name, pairs in zip(profiles.RATES, (read, written), strict=True):
         if pairs:
             value = getattr(speed, name)
-            yield Comparison(name, role, _median(pairs), np.nan if value is None else value)
+            yield Comparison(
+                name, role, _median(pairs, cluster_of), np.nan if value is None else value
+            )
 
 
-def _median(pairs: Sequence[tuple[float | None, Answer]]) -> Estimate:
-    """Return the median of answers' values, with its interval over their episodes."""
+def _median(
+    pairs: Sequence[tuple[float | None, Answer]], cluster_of: Mapping[str, str]
+) -> Estimate:
+    """Return the median of answers' values, with its interval over their episodes or clusters."""
     values = np.array([value for value, _ in pairs], dtype=float)
-    episodes = [answer.scene.partition("-")[0] for _, answer in pairs]
-    low, high = percentiles.intervals(values, episodes)[50]
+    units = [unit(answer, cluster_of) for _, answer in pairs]
+    low, high = percentiles.intervals(values, units, is_clustered=bool(cluster_of))[50]
     return Estimate(float(np.median(values)), low, high, len(values), 0)
