@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
 from former import DRIVE
-from run_on_disk import configure
+from run_on_disk import Row, change, configure
 from typer.main import get_command
 
 from harness.cli import app
@@ -85,6 +86,16 @@ def test_a_driver_drives_as_its_frozen_scenes_say(runs: list[Path]) -> None:
     assert (found.table.difference == 0).all()
     assert (found.table.agreement == 1).all()
     assert disagreements(found.episodes).empty
+    for name, turned in (("one-further", 1), ("far-away", 7000)):  # files may state any seeds
+        shutil.copytree("eval-cruise", name)
+        change(Path(name), episode=partial(turn, by=turned))
+        pd.testing.assert_frame_equal(
+            fidelity([Path(name), Path("drive-cruise")]).table, found.table
+        )
+
+
+def turn(row: Row, by: int) -> None:
+    row["layout_seed"] = 100 + (row["episode"] + by) % 4 if by < 4 else row["layout_seed"] + by
 
 
 @pytest.mark.exhaustive

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from harness.core.errors import UserError, printable
-from harness.core.statistics import cluster_numbers
+from harness.core.statistics import joined_clusters
 from harness.core.versions import versions
 from harness.report.document import Table
 from harness.runs.alike import different, setup
@@ -137,13 +137,22 @@ def _refuse_unlike(frozen: Run, driven: Run) -> None:
 
 
 def _episodes(run: Run) -> "pd.DataFrame":
-    """Return the result of each of a run's episodes."""
+    """Return the result of each of a run's episodes, on the layouts of its dataset if it has one.
+
+    A file may state any seeds: those of a driven run are held to its first one as it is read.
+    """
     import pandas as pd
 
-    columns = ("condition", "seed", "layout_seed", "success", "failure", "cluster")
+    columns = ("condition", "seed", "layout_seed", "success", "failure", "cluster", "episode")
     rows = [attrgetter(*columns)(episode) for episode in run.episodes]
     table = pd.DataFrame(rows, columns=list(columns))
-    return table.assign(**asdict(run.manifest.variant))
+    if run.world == "frozen":
+        dataset = dataset_of(run)
+        seed_of = {number: dataset.manifest.seed + number for number in run.grid.episodes}
+        cluster_of = {n: dataset.scenario.cluster_of(seed) for n, seed in seed_of.items()}
+        table["layout_seed"] = [seed_of[number] for number in table.episode]
+        table["cluster"] = [cluster_of[number] for number in table.episode]
+    return table.drop(columns=["episode"]).assign(**asdict(run.manifest.variant))
 
 
 def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
@@ -155,8 +164,11 @@ def _rows(both: "pd.DataFrame") -> Iterator[dict[str, Any]]:
         frozen = wide["success_frozen"].to_numpy(dtype=float)
         closed = wide["success_closed"].to_numpy(dtype=float)
         row = dict(zip(columns, place, strict=True))
-        cluster_of = dict(zip(group.layout_seed, group.cluster_closed, strict=True))
-        clusters = cluster_numbers([cluster_of[layout] for layout in wide["success_frozen"]])
+        partitions = []
+        for world in ("frozen", "closed"):
+            cluster_of = dict(zip(group.layout_seed, group[f"cluster_{world}"], strict=True))
+            partitions.append([cluster_of[layout] for layout in wide["success_frozen"]])
+        clusters = joined_clusters(partitions)
         for name, estimate in compared(frozen, closed, clusters).items():
             row[name] = estimate.value
             row[f"{name}_low"] = estimate.low
