@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from harness.extensions.roads.tables import Moment, Recording, Scene
 
 MOST_FILES = 10_000
-MOST_OVERLAPS = 0.1  # share of road users that may appear where another is, and are left out
+MOST_LEFT_OUT = 0.1  # share of road users that are left out since they cannot be so
+IN_ANOTHER = "appears where another is"
+OTHER_MOVEMENT = "states another speed or heading than it moves with"
 SHOWN = 3  # reasons that the screen has
 KNOWN = (
     "CommonRoad's XML, SUMO's net, positions (FCD), routes and polygons, and tables of tracks, "
@@ -352,7 +354,7 @@ def _watched(scenes: Iterable["Scene"], taken: _Taken, progress: Progress) -> It
             taken.leave_out(scene, reason)
             first_without = first_without or scene
             continue
-        whole = without_overlaps(scene)
+        whole = without_few(scene)
         yield whole  # which writes it, and refuses it where it cannot be
         taken.add(whole)
     if first_without and not taken.kinds:
@@ -366,23 +368,28 @@ def _lack(scene: "Scene") -> str | None:
     return None if scene.lanes else "scene without lanes"
 
 
-def without_overlaps(scene: "Scene") -> "Scene":
-    """Return a scene without those who appear where another is, if they are few.
+def without_few(scene: "Scene") -> "Scene":
+    """Return a scene without those who cannot be so, each kind of them if they are few.
 
-    Many of them are a mistake of sizes or positions, which `checked` names.
+    Such appear where another is, or state another speed or heading than they move with. Many of
+    them are a mistake of sizes, positions or units, which `checked` names.
     """
     import numpy as np
 
-    from harness.extensions.roads.tables import overlaps
+    from harness.extensions.roads.tables import other_movement, overlaps
 
-    for track in scene.tracks.values():
-        if not len(track.time_s) or not np.isfinite([*track.time_s, *track.poses.flat]).all():
+    tracks = dict(scene.tracks)
+    for track in tracks.values():
+        is_finite = np.isfinite(track.time_s).all() and np.isfinite(track.poses).all()
+        if not len(track.time_s) or not is_finite or (np.diff(track.time_s) <= 0).any():
             return scene  # which is refused
-    late = {track.id for track, _ in overlaps(list(scene.tracks.values()))}
-    if not late or len(late) > MOST_OVERLAPS * len(scene.tracks):
-        return scene
-    tracks = {key: track for key, track in scene.tracks.items() if key not in late}
-    left_out = {**scene.left_out, "appears where another is": len(late)}
+    late = {track.id for track, _ in overlaps(list(tracks.values()))}
+    others = {track.id for track in tracks.values() if next(other_movement(track), None)}
+    left_out = dict(scene.left_out)
+    for reason, ids in ((IN_ANOTHER, late), (OTHER_MOVEMENT, others)):
+        if 0 < len(ids) <= MOST_LEFT_OUT * len(scene.tracks):
+            tracks = {key: track for key, track in tracks.items() if key not in ids}
+            left_out[reason] = len(ids)
     return replace(scene, tracks=tracks, left_out=left_out)
 
 

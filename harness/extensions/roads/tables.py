@@ -51,6 +51,10 @@ FASTEST_MPS = 120.0
 LANE_WIDTHS_M = (0.5, 50.0)
 LONGEST_ID = 200  # characters
 LONGEST_TEXT = 1000  # characters of a licence and a source
+# By how much the median of a track's speeds, m/s and of what it moves at, and of its headings, rad,
+# may differ from its movement: far more than sensors err, and less than other units do.
+SPEED_SLACK_MPS, SPEED_SLACK, HEADING_SLACK = 1.0, 0.25, np.pi / 3
+BASE_S, BASE_M = 1.0, 2.0  # time between positions that are compared, and least way for a course
 SLACK_M = 0.3  # by which road users may overlap: sensors err by so much
 EARLY_S = 1e-6  # sums of steps miss a time by rounding
 WORDS = re.compile(r"[a-z0-9][a-z0-9._-]{0,79}")  # of a recording's name, which scenarios have
@@ -756,8 +760,58 @@ def _problems_of_track(track: Track) -> Iterator[str]:
     if (np.diff(times) <= 0).any():
         back = int(np.flatnonzero(np.diff(times) <= 0)[0])
         yield f"{who}: time does not rise after {times[back]:g} s"
-    if (np.abs(poses[:, 3]) > FASTEST_MPS).any():
+    elif (np.abs(poses[:, 3]) > FASTEST_MPS).any():
         yield f"{who}: a speed is above {FASTEST_MPS:g} m/s"
+    else:
+        yield from other_movement(track)
+
+
+def other_movement(track: Track) -> Iterator[str]:
+    """Yield which speeds and headings of a track are not those of its movement.
+
+    Each position is compared with that a second later. Poses are finite, and times rise.
+    """
+    if len(track.time_s) < 2:
+        return
+    who, times, poses = f"track {printable(track.id)}", track.time_s, track.poses
+    beyond = np.abs(poses[:, 2]) > 2 * np.pi + EARLY_S
+    if beyond.any():
+        yield (
+            f"{who}: heading_rad {poses[beyond, 2][0]:g}; allowed: -2 pi to 2 pi; degrees are "
+            "COLUMN*0.0174533"
+        )
+    rows = round(BASE_S * (len(times) - 1) / (times[-1] - times[0]))
+    rows = min(max(rows, 1), len(times) - 1)
+    length_s = times[rows:] - times[:-rows]
+    way = poses[rows:, :2] - poses[:-rows, :2]
+    way_m = np.hypot(way[:, 0], way[:, 1])
+    speeds = np.abs(poses[:, 3])
+    driven_m = np.zeros(len(times))
+    np.cumsum(np.diff(times) * (speeds[1:] + speeds[:-1]) / 2, out=driven_m[1:])
+    stated_mps = (driven_m[rows:] - driven_m[:-rows]) / length_s
+    moved_mps = way_m / length_s
+    moved = _middle(moved_mps)
+    off_mps = _middle(np.abs(stated_mps - moved_mps))
+    if off_mps > SPEED_SLACK_MPS + SPEED_SLACK * moved:
+        yield (
+            f"{who}: speed_mps {_middle(stated_mps):.3g} where its positions move at "
+            f"{moved:.3g} m/s; units are likely others: km/h are COLUMN/3.6"
+        )
+    middle, is_course = poses[rows // 2 :][: len(way)], way_m > BASE_M
+    if is_course.any():
+        along = np.arctan2(way[:, 1], way[:, 0]) + np.pi * (middle[:, 3] < 0)
+        turn = (along - middle[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        off_rad = _middle(np.abs(turn[is_course]))
+        if off_rad > HEADING_SLACK:
+            yield (
+                f"{who}: heading_rad is {off_rad:.3g} rad off the course of its positions; units "
+                "are likely others: degrees are COLUMN*0.0174533, counter-clockwise from +x"
+            )
+
+
+def _middle(values: Floats) -> float:
+    """Return the median of values, of two middle ones the greater; NumPy's is far slower."""
+    return float(np.sort(values)[len(values) // 2])
 
 
 def _problems_of_lane(lane: Lane, lanes: Mapping[str, Lane]) -> Iterator[str]:

@@ -176,11 +176,14 @@ def test_a_few_that_appear_where_others_are_are_left_out() -> None:
     scene = scene_of(10, 3)
     first = replace(scene.tracks["00"], id="again")
     doubled = replace(scene, tracks={**scene.tracks, "again": first})
-    whole = importing.without_overlaps(doubled)
+    whole = importing.without_few(doubled)
     assert len(whole.tracks) == 10
     assert whole.left_out == {"appears where another is": 1}
     tables.checked(whole)
-    crowd = importing.without_overlaps(scene_of(10, 1))
+    fast = replace(first, id="again", time_s=np.arange(2.0), poses=np.array([[9, 99, 0, 36.0]] * 2))
+    whole = importing.without_few(replace(scene, tracks={**scene.tracks, "again": fast}))
+    assert whole.left_out == {"states another speed or heading than it moves with": 1}
+    crowd = importing.without_few(scene_of(10, 1))
     with pytest.raises(UserError, match="01 appears at 0 s where 00 is already"):
         tables.checked(crowd)
 

@@ -94,7 +94,8 @@ def drawn(draw: Callable[..., Any]) -> Scene:
     for place, key in enumerate(draw(st.lists(NAMES, min_size=1, max_size=4, unique=True))):
         n = draw(st.integers(1, 5))
         poses = np.array(draw(st.lists(NUMBERS, min_size=4 * n, max_size=4 * n))).reshape(n, 4)
-        poses[:, 0], poses[:, 3] = place * 100.0, poses[:, 3] / 1e5
+        poses[:, :2] = place * 100.0, poses[0, 1]
+        poses[:, 2:] *= np.pi / 1e6, 1e-6
         kind = draw(st.sampled_from(tables.KINDS))
         begin_s = draw(st.floats(-1e3, 1e3))
         tracks[key] = Track(key, kind, 4.0, 2.0, begin_s + np.arange(n) / 10, poses)
@@ -123,11 +124,43 @@ def poses(**changed: float) -> dict[str, Track]:
     return {"a": track}
 
 
+def moves(at_mps: float = 10.0, **columns: float) -> Track:
+    """Return a car that drives to the east, with other values in some columns of all its poses."""
+    track = straight("a", 0.0, at_mps)
+    for name, value in columns.items():
+        track.poses[:, tables.POSES.index(name)] = value
+    return track
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {"speed_mps": 13.4},
+        {"speed_mps": 6.6},
+        {"heading_rad": 1.0},
+        {"heading_rad": 2 * np.pi - 1},
+        {"heading_rad": np.pi, "speed_mps": -10},
+    ],
+)
+def test_what_sensors_err_by_is_taken(columns: dict[str, float]) -> None:
+    tables.checked(road(tracks={"a": moves(**columns)}))
+
+
 LINE = np.array([[0.0, 0.0], [9.0, 0.0]])
 WRONG: dict[str, dict[str, Any]] = {
     "a time or pose is no number": {"tracks": poses(x_m=np.nan)},
     "is more than 1e+08 m from": {"tracks": poses(y_m=1e9)},
     "a speed is above 120 m/s": {"tracks": poses(speed_mps=500)},
+    "track a: speed_mps 36 where its positions move at 10 m/s; units": {
+        "tracks": {"a": moves(speed_mps=36)}
+    },
+    "speed_mps 0 where its positions move at 10": {"tracks": {"a": moves(speed_mps=0)}},
+    "speed_mps 5 where its positions move at 0": {"tracks": {"a": moves(0, speed_mps=5)}},
+    "heading_rad 90; allowed: -2 pi to 2 pi; degrees are": {"tracks": {"a": moves(heading_rad=90)}},
+    "heading_rad is 2 rad off the course": {"tracks": {"a": moves(heading_rad=-2)}},
+    "heading_rad is 3.14 rad off the course": {
+        "tracks": {"a": moves(heading_rad=0, speed_mps=-10)}
+    },
     "time does not rise after 0 s": {"tracks": {"a": straight("a", 0, 1, time_s=np.zeros(4))}},
     "kind 'tram'; allowed: car, van": {"tracks": {"a": straight("a", 0, 1, kind="tram")}},
     "length_m 0; allowed: 0.1 to 60": {"tracks": {"a": straight("a", 0, 1, length_m=0.0)}},
@@ -149,7 +182,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "track \\x1b: its id has characters that nothing can show": {
         "tracks": {"\x1b": straight("\x1b", 0, 1)}
     },
-    "a step of 1e-06 s": {"tracks": {"a": straight("a", 0, 1, time_s=np.arange(4) / 1e6)}},
+    "a step of 20 s": {"tracks": {"a": straight("a", 0, 1, time_s=20 * np.arange(4.0))}},
     "its times are from 0 to 1000000000 s; allowed: 1e+06 s": {
         "tracks": {"a": straight("a", 0, 1, time_s=np.array([0.0, 1, 2, 1e9]))}
     },
