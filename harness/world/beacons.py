@@ -264,17 +264,22 @@ def _sent(
         crosses = uniforms[:, number] >= loss(frame - first_frame)[links]
         return tuple(r for r, there in zip(receivers, crosses.tolist(), strict=True) if there)
 
-    checks = list[tuple[int, int]]()  # number and frame, the last first
-    number = math.ceil((first_frame + len(poses) + shift) / every - phase)
-    while number >= 0 and (frame := math.floor((number + phase) * every) - shift) >= first_frame:
-        if frame < first_frame + len(poses):
-            checks.append((number, frame))
-        number -= 1
+    def checks() -> Iterator[tuple[int, int]]:
+        """Yield number and frame of each beacon that may be sent, the last first."""
+        number = math.ceil((first_frame + len(poses) + shift) / every - phase)
+        while (
+            number >= 0 and (frame := math.floor((number + phase) * every) - shift) >= first_frame
+        ):
+            if frame < first_frame + len(poses):
+                yield number, frame
+            number -= 1
+
     if p.beacon_rule == "fixed":
-        yield from (sent(number, frame, hear(number, frame)) for number, frame in checks)
+        for number, frame in checks():
+            yield sent(number, frame, hear(number, frame))
         return
     last, due = before[-1] if before else None, list[tuple[int, int, Beacon]]()
-    for number, frame in reversed(checks):
+    for number, frame in reversed(list(checks())):
         if cam := _cam(sent(number, frame), poses[frame - first_frame].tolist(), last):
             due.append((number, frame, cam))
             last = cam

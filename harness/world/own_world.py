@@ -41,6 +41,9 @@ class OwnWorld(World):
         world.step = state.step
         return world
 
+    def truth(self, agent: int = 0) -> WorldState:
+        return self.state(agent)  # which may be a class's own
+
     @abstractmethod
     def snapshot(self) -> ActionsTaken:
         """Return what leads from the seed to the present state again: the actions so far.

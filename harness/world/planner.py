@@ -276,9 +276,8 @@ def travelled_m(
             nearest = np.round((speed - levels[0]) / spacing).clip(0, len(levels) - 1).astype(int)
             level = np.clip(nearest + move, 0, len(levels) - 1)
             target = np.where(move == 0, target, levels[level])
-        change = ((target - speed) / RESPONSE_S).clip(
-            -parameters.braking_mps2, parameters.acceleration_mps2
-        )
+        change = np.maximum((target - speed) / RESPONSE_S, -parameters.braking_mps2)
+        change = np.minimum(change, parameters.acceleration_mps2)
         distance = distance + speed * STEP_S
         speed = np.maximum(speed + change * STEP_S, 0.0)
         travelled[k] = distance

@@ -58,8 +58,10 @@ def _graphs(
     sensing, truthful = dict[Place, WorldState](), dict[Place, WorldState]()
     for n, agent in places:
         if drivers[n] not in (*BLIND, *scenario.actions):
-            states = truthful if drivers[n] == PRIVILEGED else sensing
-            states[n, agent] = worlds[n].state(agent)
+            if drivers[n] == PRIVILEGED:
+                truthful[n, agent] = worlds[n].truth(agent)
+            else:
+                sensing[n, agent] = worlds[n].state(agent)
     looks = [(state, state.ego.id) for state in sensing.values()]
     graphs = dict(zip(sensing, scene_graphs(scenario, looks), strict=True))
     truth = truth_graphs(scenario, list(truthful.values()))

@@ -218,6 +218,11 @@ class World:
         state = self._now(agent, self.beacons)
         return seated(self.scenario, state, agent) if agent else state
 
+    def truth(self, agent: int = 0) -> WorldState:
+        """Return `state` without beacons, which who sees everything does not read."""
+        state = self._now(agent)
+        return seated(self.scenario, state, agent) if agent else state
+
     def _now(self, agent: int = 0, messages: tuple[Beacon, ...] = ()) -> WorldState:
         name, states = self.scenario.name, tuple(map(self._state_of, self.vehicles))
         target_mps, buildings = float(self.vehicles[agent].target_speed), self.layout.buildings
