@@ -28,7 +28,7 @@ from harness.core import ray_tasks  # noqa: E402
 
 pytestmark = pytest.mark.exhaustive
 Typed = Callable[..., tuple[int, str, str]]
-DRIVE = ("drive", "--model", "cruise", "--episodes", "33", "--seeds", "0", "--quiet")
+DRIVE = ("drive", "--model", "cruise", "--episodes", "65", "--seeds", "0", "--quiet")
 NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 
 

@@ -83,7 +83,8 @@ if TYPE_CHECKING:  # only driving loads the simulator
 
 Opens = Callable[..., Backend]  # as `open_backend` is called
 NOTHING: Mapping[str, Answer] = MappingProxyType({})
-EPISODES_AT_ONCE = 16  # fewest episodes of a closed-loop chunk
+# fewest episodes of a closed-loop chunk: arrays of few are slow, few chunks leave workers idle
+EPISODES_AT_ONCE = 32
 TREES_AT_ONCE = 256  # decision trees of a chunk of frozen scenes
 # most walks, by layout, seed and condition, that frozen scenes hold in memory
 WALKS_AT_ONCE = 1 << 14
@@ -235,6 +236,17 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
             ) from None
 
 
+def _walk_whole(
+    spec: Spec, chunk: Sequence[int], asker_of: Callable[[int, Mapping[str, Answer]], Asker]
+) -> dict[str, bytes]:
+    """Walk a chunk as `_walk` does; garbage is collected meanwhile where a language model answers.
+
+    A chunk fits into memory; what a language model's engine leaves behind in cycles might not.
+    """
+    with uncollected() if _reproducible(spec) else nullcontext():
+        return _walk(spec, chunk, asker_of)
+
+
 def _walk(
     spec: Spec, chunk: Sequence[int], asker_of: Callable[[int, Mapping[str, Answer]], Asker]
 ) -> dict[str, bytes]:
@@ -310,10 +322,7 @@ def _walk_here(
                 there = {**given, **so_far}
                 return Asker(spec, lambda: backend, latency, kept, there, progress, more, earlier)
 
-            # A chunk fits into memory; what a language model's engine leaves behind in cycles might
-            # not.
-            with uncollected() if _reproducible(spec) else nullcontext():
-                return _walk(spec, chunk, asker_of)
+            return _walk_whole(spec, chunk, asker_of)
 
         def report_kept(chunk: Sequence[int]) -> None:
             n_answers = run_parts.answers_in(place / _folder_name(chunk))
@@ -586,7 +595,7 @@ def _walk_chunk(
     def asker_of(n: int, so_far: Mapping[str, Answer]) -> Asker:
         return Asker(spec, backend, run_start.latency, kept, so_far)
 
-    return _walk(spec, chunk, asker_of)
+    return _walk_whole(spec, chunk, asker_of)
 
 
 def _world_of(spec: Spec, chunk: Sequence[int], seeds: Sequence[int]) -> "FrozenWorld | LiveWorld":
