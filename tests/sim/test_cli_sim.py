@@ -148,7 +148,7 @@ def test_a_dataset_of_other_actions_is_refused(harness, small_folder, tmp_path):
     (other / "manifest.json").write_text(json.dumps(manifest))
     code, out, err = harness("dataset", "rank", other)
     assert (code, out) == (2, "")
-    assert "00000/tree.json: a reference driver's action is not one of the manifest's" in err
+    assert "[actions] is STOP, IDLE, FASTER; those of its scenario are SLOWER, IDLE, FASTER" in err
 
 
 @pytest.mark.parametrize(
