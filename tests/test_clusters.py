@@ -348,9 +348,8 @@ def test_the_rows_of_an_episode_have_one_layout(tmp_path: Path) -> None:
 
 def test_times_of_answers_are_over_recordings(tmp_path: Path) -> None:
     """Of a run's own page, and of what a device would take."""
-    from harness.extensions.devices import profiles
-    from harness.extensions.devices.fit import answers_of, fits, held
-
+    profiles = pytest.importorskip("harness.extensions.devices.profiles")
+    fit = pytest.importorskip("harness.extensions.devices.fit")
     device, found = profiles.load("laptop-cpu"), {}
     row = device.rows[0]
     for size in (0, 2, 24):
@@ -358,8 +357,8 @@ def test_times_of_answers_are_over_recordings(tmp_path: Path) -> None:
         timed = [replace(answer, **clock(answer.scene)) for answer in whole.answers]
         whole.__dict__["answers"] = timed
         ego = times(timed, whole.grid.episodes, whole.clusters)["ego"]
-        [seconds, *_] = held(device, row, whole)
-        [_, written] = fits(device, [row], answers_of(whole), 0.2)
+        [seconds, *_] = fit.held(device, row, whole)
+        [_, written] = fit.fits(device, [row], fit.answers_of(whole), 0.2)
         found[size] = ego.median_ci_s, (seconds.measured.low, seconds.measured.high), written
     (own, rates, alone), (dozen, _, of_dozen), (of_one, of_one_rate, single) = found.values()
     assert own is not None
