@@ -71,6 +71,8 @@ def differences(dataset: Dataset) -> Iterator[str]:
     """
     if find_spec("highway_env") is None:
         return
+    if dataset.scenario.world:
+        yield from dataset.scenario.world.problems(dataset.scenario)
     numbers = _other_starts(dataset, drawn(dataset, BEGUN))
     numbers = numbers or _other_trees(dataset, drawn(dataset, REBUILT))
     if numbers:

@@ -1,7 +1,7 @@
 """Define a world that something beside the harness's simulator plays."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from harness.world.scenario import Scenario
@@ -75,6 +75,14 @@ class OwnWorld(World):
         of scenario names finds them in the dataset's folder (`Family.kept_in`). Empty for nothing.
         """
         return {}
+
+    @classmethod
+    def problems(cls, scenario: Scenario) -> Iterator[str]:
+        """Yield what a scenario's files state that they do not give, and only a search can tell.
+
+        Such is which of a recording's moments were chosen. Mostly nothing.
+        """
+        yield from ()
 
     @classmethod
     def drivers(cls) -> Mapping[str, Callable[[Scenario, SceneGraph], str]]:

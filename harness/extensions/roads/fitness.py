@@ -1,36 +1,42 @@
 """Choose moments of a recording at which its own driver succeeds, among others who react."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
+from functools import lru_cache
 
 from msgspec import structs
 
-from harness.core.errors import UserError
+from harness.core.errors import UserError, printable
 from harness.core.files import canonical_json, sha256_bytes
 from harness.core.progress import Progress
 from harness.core.seeds import FIRST
 from harness.extensions.roads.driver import NAME
 from harness.extensions.roads.family import in_memory
+from harness.extensions.roads.held import horizon_s
 from harness.extensions.roads.moments import NOT_REACHED, Choice, Chooser, Key, key_of
-from harness.extensions.roads.tables import Moment, Recording, Scene
+from harness.extensions.roads.tables import FACTS, Moment, Recording, Scene
 from harness.extensions.roads.world import scenario
 from harness.world.reference import drive
 
 
 def choose_fit(
-    recording: Recording, scenes: Iterable[Scene], horizon_s: float, progress: Progress
+    recording: Recording,
+    scenes: Iterable[Scene],
+    until_s: float,
+    progress: Progress,
+    mastered_keys: Set[Key] = frozenset(),
 ) -> Choice:
     """Return the moments of a recording that are chosen and its recorded driver masters.
 
     Of those chosen, each is driven; without those at which the driver fails, it is chosen again,
-    until it fails at none. `scenes` are the recording's, read once, and `horizon_s` is the time
+    until it fails at none. `scenes` are the recording's, read once, and `until_s` is the time
     that an episode needs. The recording has the window, the target speeds and the period.
-    `progress` is told of each moment that is driven.
+    `progress` is told of each moment that is driven; those of `mastered_keys` are not.
     """
-    chooser = Chooser(recording.window_m, horizon_s)
+    chooser = Chooser(recording.window_m, until_s)
     for scene in scenes:
         chooser.look(scene)
-    passed: set[Key] = set()
+    passed = set(mastered_keys)
     choice = chooser.choice()
     while rest := [moment for moment in choice.moments if key_of(moment) not in passed]:
         progress.more(len(rest))
@@ -41,6 +47,35 @@ def choose_fit(
         chooser.drop(failed, NOT_REACHED)
         choice = chooser.choice()
     return choice
+
+
+@lru_cache(maxsize=16)
+def other_choice(recording: Recording) -> str | None:
+    """Return what a recording states of its moments that its rule does not give; None if nothing.
+
+    The rule chooses again. Drivers of stated moments are taken to reach the goal, and those of
+    others that it would choose are driven: a second for some ten.
+    """
+    stated_keys = {key_of(moment) for moment in recording.moments}
+    until_s = horizon_s(recording.facts)
+    choice = choose_fit(recording, recording.scenes(), until_s, Progress(), stated_keys)
+    keys = {key_of(moment) for moment in choice.moments}
+    words = f"recording {printable(recording.folder / FACTS)} states "
+    for key in sorted(keys - stated_keys):
+        return f"{words}no moment of {_text(key)}, which its rule chooses"
+    for key in sorted(stated_keys - keys):
+        return f"{words}a moment of {_text(key)}, which its rule does not choose"
+    if recording.moments != choice.moments:
+        return f"{words}its moments in another order than that of its rule"
+    for name, value in choice.record.items():
+        if recording.choice.get(name) != value:
+            return f"{words}another {name} of its choice than its moments have"
+    return None
+
+
+def _text(key: Key) -> str:
+    scene, vehicle, time_s = key
+    return f"{printable(scene, 60)}, {printable(vehicle, 60)} at {time_s:g} s"
 
 
 @dataclass(frozen=True, eq=False)

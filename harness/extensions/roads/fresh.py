@@ -4,7 +4,7 @@ The ego's target speeds and changes of lane are commands to its vehicle in SUMO.
 makes another run from the layout's seed, which is the same up to that time, so branches are exact.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any, cast
@@ -305,6 +305,10 @@ class FreshWorld(RecordedWorld):
             "lane_change_mode": simulation.LANE_CHANGE_MODE,
             "sha256": inputs.digest,
         }
+
+    @classmethod
+    def problems(cls, scenario: Scenario) -> Iterator[str]:
+        yield from ()  # a layout's moment follows from its seed
 
     @classmethod
     def files(cls, scenario: Scenario) -> Mapping[str, bytes]:

@@ -2,7 +2,8 @@
 
 A scene is what moves in it, whatever file it is from: `Traffic.content` is its digest. Scenes that
 share traffic, such as cuts of one session that overlap, are one session. What a session is for
-follows from digests alone, so that no further file moves it.
+follows from digests alone, so that no further file moves it: but up to `FEW` are cut by time, and
+one more deals all of them anew.
 """
 
 import hashlib

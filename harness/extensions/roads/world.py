@@ -1,12 +1,13 @@
 """Simulate an episode at a moment of a recording; make a scenario of a recording."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, ClassVar, cast
 
 import numpy as np
 
+from harness.core.errors import UserError
 from harness.core.files import bytes_of
 from harness.extensions.environments import place as environments
 from harness.extensions.environments.place import LIMIT
@@ -72,6 +73,20 @@ class RecordedWorld(EnvironmentWorld):
     def files(cls, scenario: Scenario) -> Mapping[str, bytes]:
         folder = recording_of(scenario.name).folder
         return {name: bytes_of(folder / name, "rows") for name in (FACTS, *SCHEMAS)}
+
+    @classmethod
+    def problems(cls, scenario: Scenario) -> Iterator[str]:
+        from harness.extensions.roads.fitness import other_choice
+
+        problem = other_choice(recording_of(scenario.name))
+        if problem is not None:
+            yield problem
+
+    @classmethod
+    def examine(cls, scenario: Scenario, seed: int) -> None:
+        for problem in cls.problems(scenario):
+            raise UserError(f"{problem}; make the recording again: `harness dataset import`")
+        super().examine(scenario, seed)
 
     @classmethod
     def drivers(cls) -> Mapping[str, Callable[[Scenario, SceneGraph], str]]:

@@ -1,18 +1,21 @@
 """Recorded traffic: replayed to the centimetre, or reacting to an ego that drives otherwise."""
 
 import filecmp
+import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from studied import trials
 
 from harness.backends import driver as driver_backend
 from harness.backends.base import Request
 from harness.core.errors import UserError
 from harness.core.seeds import FIRST
-from harness.dataset.build import build
 from harness.dataset.load import load
 from harness.dataset.verify import check
 from harness.extensions.roads import family, held, tables
@@ -328,15 +331,15 @@ def test_what_is_beside_a_dataset_goes_before_what_a_variable_names(
 
 @pytest.mark.slow
 def test_a_dataset_is_sound_and_has_its_recording(
-    scenario: Scenario,
+    once: Callable[..., Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     harness: Callable[..., tuple[int, str, str]],
 ) -> None:
-    build(scenario, tmp_path / "set", 2, 0, 1, lambda done: None)
-    monkeypatch.setenv(family.FOLDERS, "")  # from here on it has its own
-    assert not check(tmp_path / "set")
-    dataset = load(tmp_path / "set")
+    monkeypatch.setenv(family.FOLDERS, "")  # it has its own
+    trials()["reaction"].lays(tmp_path, once)
+    assert not check(tmp_path / "with")
+    dataset = load(tmp_path / "with")
     assert dataset.manifest.source == "made by hand"
     success = dataset.reference_success()
     assert success["recorded"].tolist() == [1, 1]
@@ -344,13 +347,56 @@ def test_a_dataset_is_sound_and_has_its_recording(
     assert {name: bool(success[name][0]) for name in closed} == {
         name: outcome.success for name, outcome in closed.items()
     }
-    card = (tmp_path / "set/README.md").read_text()
+    card = (tmp_path / "with/README.md").read_text()
     command = card.split("Built by `harness ")[1].split("`")[0]
-    assert command.startswith("dataset build --recording set --episodes 2 --seed 0")
+    assert command.startswith("dataset build --recording with --episodes 2 --seed 0")
     assert harness(*command.split())[0] == 0
-    written = [path.name for path in (tmp_path / "set").iterdir()]
-    same, *others = filecmp.cmpfiles(tmp_path / "set", tmp_path / "again/set", written, False)
+    written = [path.name for path in (tmp_path / "with").iterdir()]
+    same, *others = filecmp.cmpfiles(tmp_path / "with", tmp_path / "again/with", written, False)
     assert (sorted(same), others) == (sorted(written), [[], []])
+
+
+def without_the_first(facts: dict[str, Any]) -> None:
+    facts["moments"] = facts["moments"][1:]
+
+
+def with_another(facts: dict[str, Any]) -> None:
+    facts["moments"].append({**facts["moments"][0], "vehicle": "e0", "time_s": 2.0})
+
+
+CHOICES: dict[str, Callable[[dict[str, Any]], object]] = {
+    "": lambda facts: None,
+    "no moment of s, e1 at 2 s, which its rule chooses": without_the_first,
+    "a moment of s, e0 at 2 s, which its rule does not choose": with_another,
+    "its moments in another order": lambda facts: facts["moments"].reverse(),
+    "another rule of its choice": lambda facts: facts["choice"].update(rule="All were taken."),
+    "another candidates of its": lambda facts: facts["choice"].update(candidates=4),
+    "another left_out of its": lambda facts: facts["choice"]["left_out"].popitem(),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", CHOICES)
+def test_moments_are_those_that_the_rule_chooses(
+    words: str, once: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(family.FOLDERS, "")
+    folder = tmp_path / "mine"
+    trials()["reaction"].lays(tmp_path, once)
+    folder.mkdir()
+    for name in ("recording.json", *tables.SCHEMAS):
+        shutil.copy(tmp_path / "with" / name, folder / name)
+    facts = json.loads((folder / "recording.json").read_text())
+    CHOICES[words](facts)
+    (folder / "recording.json").write_text(json.dumps(facts))
+    scenario = scenarios.get(RECORDINGS.named({"recording": str(folder)}))
+    if not words:
+        RecordedWorld.examine(scenario, 0)
+        return
+    with pytest.raises(UserError) as refusal:
+        RecordedWorld.examine(scenario, 0)
+    assert f"recording.json states {words}" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.slow

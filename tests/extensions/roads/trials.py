@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from studied import Once, Trial
 
+from harness.core.progress import Progress
 from harness.dataset.build import build
 from harness.extensions.roads import family, tables
-from harness.extensions.roads.tables import Lane, Moment, Scene, Track
+from harness.extensions.roads.fitness import choose_fit
+from harness.extensions.roads.held import horizon_s
+from harness.extensions.roads.tables import Lane, Scene, Track
 from harness.world import scenarios
 
 TIMES = np.arange(0.0, 16.01, 0.1)
@@ -32,16 +35,22 @@ def column() -> Scene:
     return Scene("s", "s.xml", "0" * 64, False, tracks, lanes, ())
 
 
+def choose(folder: Path) -> None:
+    """Give a recording the moments that its rule chooses."""
+    recording = tables.read(folder)
+    until_s = horizon_s(recording.facts)
+    choice = choose_fit(recording, recording.scenes(), until_s, Progress())
+    facts = {**choice.record, "horizon_s": until_s}
+    tables.chosen(recording, recording.speeds_mps, choice.moments, facts)
+
+
 def recorded(out: Path) -> None:
     """Make datasets of a recording in which others react, and do not, of two layouts and one."""
-    moments = [Moment("s", "e1", time_s, None, None, "tune") for time_s in (1.0, 2.0)]
     out.mkdir()
     (out / "column").mkdir()
-    texts, facts = (
-        ("column", "made by hand", "CC0-1.0"),
-        {"rule": "", "candidates": 2, "left_out": {}},
-    )
-    tables.write(out / "column", *texts, 80.0, [column()], moments, facts)
+    texts = ("column", "made by hand", "CC0-1.0")
+    tables.write(out / "column", *texts, 80.0, [column()], (), {})
+    choose(out / "column")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(family.FOLDERS, "")
         name = family.RECORDINGS.named({"recording": str(out / "column")})
