@@ -60,6 +60,8 @@ class Site:
     names: Texts | None = None
     # what the clock of that source shows, s, `(...)`; None without names
     time_s: Floats | None = None
+    # whether that source has several scenes, so that a name without its scene may be of each
+    several_scenes: bool = False
 
     @property
     def distance_m(self) -> Floats:
@@ -88,6 +90,7 @@ class Site:
             antennas,
             None if self.names is None else self.names[at],
             None if self.time_s is None else self.time_s[at],
+            self.several_scenes,
         )
 
     def select(self, links: slice) -> "Site":
@@ -99,7 +102,15 @@ class Site:
         corner_m, names = self.corner_m[..., links, :], self.names
         if names is not None:
             names = np.concatenate([names[..., :1], names[..., 1:][..., links]], axis=-1)
-        return Site(xy_m, sight, blocker_m, corner_m, self.first_m, names=names, time_s=self.time_s)
+        return replace(
+            self,
+            xy_m=xy_m,
+            sight=sight,
+            blocker_m=blocker_m,
+            corner_m=corner_m,
+            antennas={},
+            names=names,
+        )
 
     def of_helpers(self, places: Ints) -> "Site":
         """Return the site with other helpers: in each of n decisions those that `places` names.
@@ -116,6 +127,7 @@ class Site:
             {antenna: site.of_helpers(with_ego) for antenna, site in self.antennas.items()},
             None if self.names is None else np.take_along_axis(self.names, with_ego, axis=-1),
             self.time_s,
+            self.several_scenes,
         )
 
 

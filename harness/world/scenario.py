@@ -116,6 +116,7 @@ class Names(NamedTuple):
     begin_s: float  # what that clock shows at the start of the episode, s
     # `SCENE/NAME` of each vehicle there, by its id here, such as `v2`; a scene has one clock
     by_id: Mapping[str, str]
+    several_scenes: bool = False  # whether the source has others, where names may be the same
 
 
 @dataclass(frozen=True)

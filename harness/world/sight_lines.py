@@ -59,13 +59,15 @@ def _named(
     names: Sequence[Names | None],
 ) -> Site:
     """Return the site with the vehicles' names, and the time, in the source of their traffic."""
-    called, times_s = [], []
+    called, times_s, several = [], [], False
     for (state, ids), names_here in zip(points, names, strict=True):
-        begin_s, by_id = names_here or NO_NAMES
+        begin_s, by_id, several_here = names_here or NO_NAMES
+        several |= several_here
         absent = 1 + among.sight.shape[-1] - len(ids)
         called.append([*(by_id.get(id_, "") for id_ in ids), *[""] * absent])
         times_s.append(begin_s + state.time_s)
-    return replace(among, names=np.array(called, dtype=str), time_s=np.array(times_s))
+    texts = np.array(called, dtype=str)
+    return replace(among, names=texts, time_s=np.array(times_s), several_scenes=several)
 
 
 def _site(

@@ -343,7 +343,7 @@ class Layouts:
         layout = setting(inputs_named(self.name), seed, p.warm_up_s, p.time_limit_s)
         scene = layout.scene.name
         by_id = {f"v{n}": f"{scene}/{track.id}" for n, track in enumerate(layout.cast.tracks, 1)}
-        return replace(scenario(self.name), names=Names(layout.moment.time_s, by_id))
+        return replace(scenario(self.name), names=Names(layout.moment.time_s, by_id, True))
 
 
 class FreshScenario(RecordedScenario):

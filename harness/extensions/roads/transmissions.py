@@ -145,6 +145,11 @@ class Transmissions:
         rows, columns = np.full(site.sight.shape, UNKNOWN), self.table.transmitted
         if site.names is None or site.time_s is None or not columns.pairs:
             return rows
+        if site.several_scenes and not columns.has_scenes:
+            raise UserError(
+                f"{printable(self.table.file)}: has no column {SCENE}, and the traffic has several "
+                f"scenes, where others may have these names; add {SCENE}"
+            )
         for at in np.ndindex(*rows.shape):
             names = str(site.names[(*at[:-1], 0)]), str(site.names[(*at[:-1], at[-1] + 1)])
             ends = names if columns.has_scenes else (_alone(names[0]), _alone(names[1]))

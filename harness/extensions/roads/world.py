@@ -188,7 +188,8 @@ class Moments:
             f"v{number}": f"{moment.scene}/{track.id}"
             for number, track in enumerate(cast.tracks, 1)
         }
-        return replace(scenario(self.name), names=Names(moment.time_s, by_id))
+        several = len(recording.scenes_stated) > 1
+        return replace(scenario(self.name), names=Names(moment.time_s, by_id, several))
 
 
 class RecordedScenario(EnvironmentScenario):

@@ -76,6 +76,19 @@ def test_names_may_be_of_a_scene_each(tmp_path):
         assert channel.latencies_s(site, draws(0.5, 1), REQUEST) == pytest.approx(delay_s)
 
 
+def test_names_of_several_scenes_need_the_scene(tmp_path):
+    site = replace(links([10.0], ["a", "b"], 5.0).where, several_scenes=True)
+    with pytest.raises(UserError, match=r"log\.csv: has no column scene, and the traffic has"):
+        load(tmp_path, NAMED).latencies_s(site, draws(0.5, 1), REQUEST)
+    lines = NAMED.splitlines()
+    text = "\n".join([lines[0] + ",scene", *[f"{line},s" for line in lines[1:]]]) + "\n"
+    channel = load(tmp_path, text)
+    assert channel.latencies_s(site, draws(0.5, 1), REQUEST) == pytest.approx(0.002)
+    here = site.take(None)
+    for part in (here, here.select(slice(1)), here.of_helpers(np.zeros((1, 1), int))):
+        assert part.several_scenes
+
+
 def test_others_draw_among_those_whose_distance_fits(tmp_path):
     channel = load(tmp_path, FAR)
     received = channel.reception(np.array([0, 35, 60, 99.0, 200]))
