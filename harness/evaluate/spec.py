@@ -30,6 +30,7 @@ from harness.evaluate.latency import NAMES, declared
 from harness.prompts.versions import ROLES, Prompt, unfit
 from harness.radio.profiles import CHANNELS
 from harness.runs import formats, role_agents
+from harness.runs.answerers import answerers_of
 from harness.runs.folder import read
 from harness.runs.metric import World
 from harness.runs.records import MEASURED, ClosedLoop, FrozenScenes, Manifest
@@ -341,8 +342,10 @@ class Spec:
         """Raise UserError if a condition cannot be used with the models that were opened.
 
         `identity` tells them apart, as a run's manifest states it: the ego's, and those of helpers.
+        Of answers that are replayed it is that of the models that gave them.
         """
-        identities = [identity, *(identity.get("helpers") or ())]
+        ego = answerers_of(identity, identity, (), 0.0).identity
+        identities = [ego, *(ego.get("helpers") or ())]
         for point in self.points:
             for part in point.more:
                 if obstacle := parts_of_packages.obstacle_of_models(part, identities):

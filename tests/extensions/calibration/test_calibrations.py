@@ -14,10 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from run_on_disk import configure, damage
 
+from harness.backends.replay import Replay
+from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.core.resources import MARKER
 from harness.dataset.build import build
-from harness.dataset.load import load
+from harness.dataset.load import Dataset, load
 from harness.extensions.calibration.calibrations import (
     OF_QUESTION,
     Calibration,
@@ -203,7 +205,7 @@ def test_nothing_is_fitted_on_an_intent_that_no_text_states(
 
 @pytest.mark.slow
 def test_a_calibration_is_of_the_weights_that_it_was_fitted_on(
-    proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path
+    proxy_run: Path, small: Dataset, small_path: Path, harness: Typed, tmp_path: Path
 ) -> None:
     (tmp_path / MARKER).touch()
     tuned = Path(shutil.copytree(proxy_run, tmp_path / "tuned"))
@@ -216,6 +218,18 @@ def test_a_calibration_is_of_the_weights_that_it_was_fitted_on(
     assert [*fitted.weights] == ["file_sha256", "states"]
     assert fitted.obstacle_of_models([identity, identity]) is None
     other = {**identity, "file_sha256": "b" * 64}
+    spec = spec_of(small, "proxy", points=(named_point("6g:calibration=mine"),))
+    for asked in (identity, other):  # as they are, replayed, as `run check` does, and again
+        replayed = Replay(read(tuned)).identity()
+        replayed["of"]["identity"] = asked
+        twice = {**replayed, "of": {**replayed["of"], "model": {"engine": "replay"}}}
+        twice["of"]["identity"] = replayed
+        for of_models in (asked, replayed, twice):
+            if asked is identity:
+                spec.check_models(of_models)
+            else:
+                with pytest.raises(UserError, match="mine was fitted on other weights"):
+                    spec.check_models(of_models)
     said = str(fitted.obstacle_of_models([identity, other]))
     assert said.startswith("was fitted on other weights (file_sha256 aaaaaaaa")
     code, _, error = evaluated(
