@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from harness.evaluate.spec import Spec
 
 
+TURN = 16  # tokens that a chat's template puts around a message, at the most
+PIXELS = 32  # of a picture that a token has at the least, where makers' price lists say it
+
+
 @dataclass(frozen=True)
 class Budget:
     """Hold the most money that a command may spend on answers, by the prices in model cards.
@@ -55,31 +59,64 @@ class Budget:
 class Limited:
     """Wrap a backend, the code that runs a model, and add the price of its answers to a budget.
 
-    `complete` raises Unanswered, before it asks, if the budget is spent, or if the last answers
-    came without their numbers of tokens, by which a price goes. All else is as in the backend.
+    `complete` raises Unanswered, before it asks, if the budget is spent, or if all of the last
+    answers came without their numbers of tokens, by which a price goes. Of one among others that
+    has none, the most that it can be is spent, and a line on stderr says so. All else is as in the
+    backend.
     """
 
     def __init__(self, backend: Backend, model: str, price: Price, budget: Budget) -> None:
         self._backend, self._model, self._price, self._budget = backend, model, price, budget
         self._unsaid = False  # whether all of the last answers are without their tokens
+        self._has_said = False  # that some are
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
-        self._budget.check()
         if self._unsaid:
             raise Unanswered(
                 f"{printable(self._model)} does not say how many tokens its answers take, so "
                 "--max-cost cannot hold; all answers are kept, and the same command without it "
                 "goes on"
             )
+        self._budget.check()
         completions = self._backend.complete(requests)
-        counts = Asked.of(self._model, completions)
-        is_said = counts.uncounted < counts.asked
-        self._unsaid = not is_said and any(each.error is None for each in completions)
-        self._budget.spend(self._price.of(counts.read, counts.written))
+        pairs = zip(requests, completions, strict=True)
+        self._budget.spend(math.fsum(self._price.of(*most_tokens(*pair)) for pair in pairs))
+        answers = [each for each in completions if each.error is None]
+        counts = Asked.of(self._model, answers)
+        self._unsaid = counts.asked == counts.uncounted > 0
+        if 0 < counts.uncounted < counts.asked and not self._has_said:
+            self._has_said = True
+            print(
+                f"harness: --max-cost {self._budget.most:g}: {printable(self._model)} does not say "
+                "how many tokens some of its answers take; these count as the most they can be",
+                file=sys.stderr,
+            )
         return completions
+
+
+def most_tokens(request: Request, completion: Completion) -> tuple[int, int]:
+    """Return the numbers of tokens of a prompt and its answer, or the most that they can be.
+
+    What is stated is taken. Else a token has one byte of its text at least, or `PIXELS`, and
+    thoughts are in no text. A question that failed takes none.
+    """
+    read, written = completion.prompt_tokens, completion.completion_tokens
+    if completion.error is not None:
+        return read or 0, written or 0
+    if read is None:
+        chats = (request.messages, *request.orders, *request.flips)
+        messages = [message for chat in chats for message in chat]
+        read = sum(TURN + len(message["content"].encode()) for message in messages)
+        if request.image:
+            height, width, _ = request.image.pixels.shape
+            read += len(chats) * -(-height * width // PIXELS)
+    if written is None:
+        of_text = TURN + len(completion.text.encode())
+        written = request.max_tokens if request.thinking else min(of_text, request.max_tokens)
+    return read, written
 
 
 @contextmanager

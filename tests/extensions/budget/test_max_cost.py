@@ -1,14 +1,24 @@
 """A limit on what answers cost stops a command before it asks more."""
 
+import itertools
 import json
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from misbehaving import Asked, Server, completion
 from priced import EACH, cost_of, priced, typed_eval
 
+from harness.backends.base import Completion, Request
+from harness.core.image import Image
+from harness.extensions.budget.limit import TURN, most_tokens
+
+CHAT = ({"role": "user", "content": "Glä"},)
+PICTURE = np.zeros((3, 11, 3), dtype=np.uint8)  # 33 pixels
 Typed = Callable[..., tuple[int, str, str]]
 
 
@@ -65,6 +75,48 @@ def test_a_limit_that_no_tokens_could_reach_stops_the_run(
         assert len(server.asked) > first
     cost = cost_of("run")["mine"]
     assert cost["asked"] == cost["uncounted"] == len(server.asked), "no question was asked twice"
+
+
+@pytest.mark.slow
+def test_an_answer_without_its_tokens_counts_as_the_most_that_it_can_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_path: Path, harness: Typed
+) -> None:
+    """A server that states its usage in one answer of sixteen would be asked for little."""
+    count = itertools.count()
+
+    def seldom(asked: Asked) -> None:
+        reply = completion()
+        if next(count) % 16:
+            del reply["usage"]
+        asked.reply(reply)
+
+    with priced(tmp_path, monkeypatch, seldom) as server:
+        code, _, said = harness(*typed_eval(small_path, "--no-cache"), "--max-cost", f"{80 * EACH}")
+    assert code == 3
+    assert "mine does not say how many tokens some of its answers take; these count as the" in said
+    assert re.search(r"[\d.]+ EUR of --max-cost 4.16 are spent", said)
+    assert len(server.asked) <= 3 * 64
+
+
+@pytest.mark.parametrize(
+    ("stated", "options", "most"),
+    [
+        ((12, 20), {}, (12, 20)),
+        ((None, 20), {}, (TURN + 4, 20)),  # of which each token has a byte
+        ((12, None), {}, (12, TURN + 3)),
+        ((None, None), {"thinking": True}, (TURN + 4, 512)),
+        ((None, None), {"max_tokens": 2}, (TURN + 4, 2)),
+        ((None, 1), {"orders": (CHAT, CHAT), "image": Image(PICTURE)}, (3 * (TURN + 4 + 2), 1)),
+    ],
+)
+def test_what_a_token_can_be_at_the_most(
+    stated: tuple[int | None, int | None], options: dict[str, Any], most: tuple[int, int]
+) -> None:
+    request = Request("s/v1", "ego", CHAT, ("IDLE",), **{"max_tokens": 512, **options})
+    answer = Completion("s/v1", "abc", *stated, "stop", None, 1)
+    assert most_tokens(request, answer) == most
+    failed = replace(answer, text="", error="no answer")
+    assert most_tokens(request, failed) == tuple(tokens or 0 for tokens in stated)
 
 
 @pytest.mark.slow
