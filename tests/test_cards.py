@@ -18,6 +18,9 @@ from harness.backends.servers import Server
 from harness.core import resources
 from harness.core.config import convert
 from harness.core.errors import UserError
+from harness.evaluate.resolve import agents
+from harness.runs.settings import Settings
+from harness.world import scenarios
 
 SERVED = """\
 engine = "openai"
@@ -302,6 +305,20 @@ def test_a_card_names_the_prompts_that_its_model_was_seen_to_answer(shelf: Path)
     write_card(shelf, TWO_ENGINES + SEEN.replace("read = 24", "read = 25"))
     with pytest.raises(UserError, match="read 25 of 24 asked; give as many at most"):
         cards.load("mine")
+
+
+@pytest.mark.parametrize("version", ["nosuch", "../../../etc/passwd", ""])
+def test_an_unknown_prompt_of_a_card_is_one_line_that_names_the_card(
+    shelf: Path, version: str
+) -> None:
+    write_card(shelf, TWO_ENGINES + SEEN.replace("v10", version).replace("v2", "other"))
+    with pytest.raises(UserError) as caught:
+        agents(Settings(model="mine"), scenarios.get("occluded-intersection"))
+    said = str(caught.value)
+    assert said.startswith(f"card mine, [[prompts]]: unknown prompt {version!r}")
+    assert said.endswith("; correct the card, or give --prompt")
+    with pytest.raises(UserError, match=r"^unknown prompt 'nosuch'"):
+        agents(Settings(model="mine", prompt="nosuch"), scenarios.get("occluded-intersection"))
 
 
 TWO_ENGINES = """\

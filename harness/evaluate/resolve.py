@@ -23,6 +23,7 @@ from harness.evaluate.agent import Agent
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.spec import Source, Spec, replayed
 from harness.prompts import versions
+from harness.prompts.versions import Prompt
 from harness.runs import role_agents
 from harness.runs.settings import DriveSettings, FrozenSettings, Settings, parse_seeds
 from harness.runs.stopping import STOPPING_RULES
@@ -121,7 +122,7 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
     not exist or do not fit.
     """
     card = _card(settings)
-    prompt = versions.load(settings.prompt or prompt_for(scenario.prompt, card.prompts))
+    prompt = versions.load(settings.prompt) if settings.prompt else _prompt_of(card, scenario)
     # Agent checks the modes.
     how = (
         settings.answer,
@@ -139,6 +140,19 @@ def agents(settings: Settings, scenario: Scenario) -> tuple[Agent, tuple[Agent, 
             "leave it out, or give --answer readout"
         )
     return ego, helpers
+
+
+def _prompt_of(card: Card, scenario: Scenario) -> Prompt:
+    """Return the prompt of a scenario where none is typed, or that which a model's card names."""
+    version = prompt_for(scenario.prompt, card.prompts)
+    try:
+        return versions.load(version)
+    except UserError as error:
+        if version == scenario.prompt:
+            raise
+        raise UserError(
+            f"card {printable(card.name)}, [[prompts]]: {error}; correct the card, or give --prompt"
+        ) from None
 
 
 def _card(settings: Settings) -> Card:
