@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from harness.backends.base import Completion, Request, failed
+from harness.cli.init import command as init
 from harness.core import resources
 from harness.core.errors import UserError, unknown
 from harness.core.files import making, write_whole
@@ -18,6 +19,7 @@ from harness.runs import settings
 from harness.runs.folder import read
 from harness.runs.listing import runs
 from harness.runs.settings import FrozenSettings
+from harness.studies.study import refuse_taken
 
 Typed = Callable[..., tuple[int, str, str]]
 ROOT = Path(__file__).parents[1]
@@ -48,7 +50,19 @@ def test_a_name_that_nothing_can_show_is_refused_where_it_is_read_and_where_it_i
             refused()
         assert name not in str(error.value)
     assert name not in str(unknown("model", "a", [name, f"{name}b"]))
+    above = tmp_path / f"{name} above" / "runs"  # folders that would be made on the way
+    for refused in (
+        lambda: start_of(above / "x", WorkStart),
+        lambda: refuse_taken(above / "x", "sweep"),
+        lambda: write_whole(above / "x.html", ""),
+        lambda: making(above / "x.d").__enter__(),
+        lambda: init(above / "x"),
+    ):
+        with pytest.raises(UserError, match=REFUSED) as error:
+            refused()
+        assert name not in str(error.value)
     assert {path.name for path in tmp_path.iterdir()} == {"swarmdrive.toml", "models", name}
+    write_whole(tmp_path / name / "x.html", "")  # a folder that is there, such as one's own
 
 
 def test_a_name_that_looks_like_several_is_refused(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from harness.core.errors import UserError, printable, sayable
+from harness.core.errors import UserError, printable, sayable_path
 
 PROMPT = "v3"  # what one's own prompt begins as
 
@@ -25,7 +25,7 @@ def command(
     from harness.core import resources
 
     starter = Path(__file__).parent / "starter"
-    sayable("folder", folder.name)
+    sayable_path("folder", folder)
     place = folder.resolve()  # `absent/../mine` is there once `absent` is made
     try:
         if place.exists() and (

@@ -105,7 +105,6 @@ def write(image: "Image", file: Path) -> str:
     Raises UserError if it cannot be written.
     """
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
         write_whole(file, image.png())
     except OSError as error:
         raise UserError(

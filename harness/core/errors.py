@@ -5,8 +5,10 @@ Four kinds of failure are kept apart. A bad completion is data (a parse status).
 exit code 3. Anything else is a bug and crashes with a traceback.
 """
 
+import os
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
 from typing import ClassVar
 
 # What a command ends with; no other code is used.
@@ -86,6 +88,17 @@ def sayable(what: str, name: str, repair: str = "rename it") -> str:
             f"{what} `{name}` has `{BETWEEN_NAMES}`, which stands between names; {repair}"
         )
     return name
+
+
+def sayable_path(what: str, path: Path, repair: str = "give another name") -> None:
+    """Raise UserError as `sayable` does for the name of what is to be made at `path`.
+
+    So for each folder above it that is not there and would be made, too.
+    """
+    sayable(what, path.name, repair)
+    for folder in path.parents:
+        if not folder.name.isprintable() and not os.path.lexists(folder):
+            sayable(what, str(path), repair)
 
 
 def one_line(error: Exception) -> str:

@@ -20,7 +20,7 @@ from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar
 
-from harness.core.errors import UserError, printable, sayable
+from harness.core.errors import UserError, printable, sayable_path
 
 if TYPE_CHECKING:
     from zipfile import ZipFile
@@ -268,7 +268,7 @@ def replacing(path: Path) -> Iterator[Path]:
     On an error it is deleted, and `path` stays as it was. Temporary files of killed processes are
     deleted as well. Raises OSError if `path` cannot be written, but never FileNotFoundError.
     """
-    sayable("file", path.name, "give another name")
+    sayable_path("file", path)
     if path.is_dir():  # fail now, and not only after all is written
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():  # a device or a pipe, whose place the file would take
@@ -308,7 +308,7 @@ def making(folder: Path) -> Iterator[Path]:
     On an error it is deleted. Temporary folders of killed processes are deleted as well. Raises
     OSError if it cannot be made.
     """
-    sayable("folder", folder.name, "give another name")
+    sayable_path("folder", folder)
     whole = folder.absolute()
     forget_halves(whole.parent, escape(whole.name))
     part = whole.with_name(f".{whole.name}.{os.getpid()}.part")

@@ -20,7 +20,7 @@ from harness.core.errors import (
     UserError,
     one_line,
     printable,
-    sayable,
+    sayable_path,
 )
 from harness.core.files import alone, forget_halves, text_of, write_whole
 from harness.core.formats import CONFIG, QUESTIONS, WORK
@@ -61,7 +61,7 @@ def start_of(out: Path, kind: type[Kind]) -> Kind | None:
     `kind` is the type of the record to read, a `WorkStart`. Raises UserError if the file is
     damaged, or the folder holds something else.
     """
-    sayable("--out", out.name, "give another name")
+    sayable_path("--out", out)
     folder, file = printable(out), out / WORK / CONFIG
     try:
         if file.is_file() and not idle(out):

@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from harness.core import extras
-from harness.core.errors import UserError, printable, sayable
+from harness.core.errors import UserError, printable, sayable_path
 from harness.core.extensions import studies
 from harness.core.figures import PERCENT
 from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
@@ -188,7 +188,7 @@ def refuse_taken(out: Path, kind: str) -> None:
     `kind` is the kind of study that is to be written to `out`, such as `sweep`. A name that no
     terminal can show is refused, too.
     """
-    sayable("--out", out.name)
+    sayable_path("--out", out)
     for name in ("run", "suite", *studies()):
         if name != kind and (out / f"{name}.json").exists():
             raise UserError(
