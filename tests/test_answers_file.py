@@ -24,6 +24,7 @@ from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions
 from harness.runs import folder
+from harness.studies.replayed_run import ReplayedRun
 
 Harness = Callable[..., tuple[int, str, str]]
 NOBODY = "a" * 64  # the id of no question
@@ -113,6 +114,8 @@ def test_what_a_dry_run_asks_is_typed_answered_and_scored(
     assert "came from a file that another program wrote" in page
     code, said, _ = harness("run", "check", "r")
     assert (code, "equal" in said) == (0, True)
+    [whose] = ReplayedRun(Path("r")).caveats
+    assert "came from a file that another program wrote: no model was asked here" in whose
     again = harness("eval", "r", "--out", "again")
     assert again[2] == (
         "harness: settings r/run.toml: a.jsonl is a file of answers, and a file opens no other by "

@@ -41,6 +41,7 @@ from harness.evaluate.requests import EGO, wanted_in
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import Fuses
+from harness.report.caveats import from_file
 from harness.runs.contradictions import sound
 from harness.runs.records import Answer
 from harness.runs.run_dataset import dataset_of
@@ -276,14 +277,16 @@ class ReplayedRun:
 
     @property
     def caveats(self) -> tuple[str, ...]:
-        """Return warnings on the results: requests without an answer, episodes left out."""
+        """Return warnings on the results: whose answers they are of, if another program wrote them,
+        requests without an answer, and episodes left out.
+        """
         counts, name, n = self._asker.tally.counts(), printable(self.name), len(self.left_out)
         lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
         left_out = (
             f"{name}: left out episodes that reach one of {n} decision points without a stored "
             "answer; without --no-model the model is asked there"
         )
-        return tuple(filter(None, (lost, left_out if n else "")))
+        return tuple(filter(None, (*from_file(self.run), lost, left_out if n else "")))
 
     def settle(self) -> None:
         """Raise Unanswered if results are invalid, as too many requests made here got no answer."""
