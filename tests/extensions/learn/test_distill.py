@@ -423,6 +423,7 @@ def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_pat
         (["--prompt", "v99"], "unknown prompt 'v99'"),
         (["--prompt", "v2", "do-not-pass"], "--prompt v2: none is for do-not-pass; give v4"),
         (["no-such-road"], "unknown scenario 'no-such-road'"),
+        (["occluded-intersection:witnesses=1"], "occluded-intersection is given twice, with other"),
         (
             ["--first-seed", "100"],
             "layout seeds 100 to 339 (tune); a model learns from train seeds alone",

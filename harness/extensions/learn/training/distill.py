@@ -45,6 +45,12 @@ class Curriculum:
     base: Path | Card | None = None
 
     def __post_init__(self) -> None:
+        names = [scenario.name for scenario in self.prompts]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            # whose layouts have the same seeds and names, and so one place for their lessons
+            raise UserError(
+                f"scenario {printable(twice)} is given twice, with other settings; give it once"
+            )
         if not isinstance(self.base, Card):
             return
         name = printable(self.base.name)
