@@ -17,7 +17,7 @@ from harness.world.road import STEP_M, Ground, Lane, Path, PathKey, Road, crossi
 LANE_WIDTH_M = 4.0
 JUNCTION_M = 11.0  # from the centre to where approach lanes end
 ARM_M = 100.0  # length of an approach or exit lane
-LEFT_TURN_RADIUS_M = 13.0
+LEFT_TURN_RADIUS_M, RIGHT_TURN_RADIUS_M = 13.0, 9.0
 # stretch of the approach lane, from the conflict point, that is looked at
 SECTOR_REACH_M = (8.0, 50.0)
 
@@ -131,16 +131,49 @@ def _approach(path: Path) -> Floats:
 
 @cache
 def network() -> Any:
-    """Return the road network of highway-env's `IntersectionEnv`, always the same object.
+    """Build the road network of highway-env's `IntersectionEnv`, always the same object.
 
-    It is a `highway_env.road.road.RoadNetwork`.
+    It is a `highway_env.road.road.RoadNetwork`, to the last bit that of the environment, which need
+    not be loaded for it.
     """
-    from highway_env.envs.intersection_env import IntersectionEnv
+    from harness.world.highway import CircularLane, LineType, RoadNetwork, StraightLane
 
-    env = IntersectionEnv.__new__(IntersectionEnv)
-    env.config = IntersectionEnv.default_config()
-    env._make_road()
-    return env.road.network
+    none, edge, middle = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
+    half, far = LANE_WIDTH_M / 2, ARM_M + JUNCTION_M
+    streets = RoadNetwork()
+    for arm in range(4):
+        turn = np.radians(90 * arm)
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+        def at(x: float, y: float, rotation: Floats = rotation) -> Floats:
+            place: Floats = rotation @ np.array([x, y])
+            return place
+
+        right, across, left = ((arm + turns) % 4 for turns in (-1, 2, 1))
+        way_in = StraightLane(at(half, far), at(half, JUNCTION_M), line_types=(middle, edge))
+        to_right = CircularLane(
+            at(JUNCTION_M, JUNCTION_M),
+            RIGHT_TURN_RADIUS_M,
+            turn + np.radians(180),
+            turn + np.radians(270),
+            line_types=(none, edge),
+        )
+        to_left = CircularLane(
+            at(half - LEFT_TURN_RADIUS_M, LEFT_TURN_RADIUS_M - half),
+            LEFT_TURN_RADIUS_M,
+            turn + np.radians(0),
+            turn + np.radians(-90),
+            clockwise=False,
+            line_types=(none, none),
+        )
+        over = StraightLane(at(half, JUNCTION_M), at(half, -JUNCTION_M), line_types=(middle, none))
+        way_out = StraightLane(at(JUNCTION_M, half), at(far, half), line_types=(none, edge))
+        streets.add_lane(f"o{arm}", f"ir{arm}", way_in)
+        streets.add_lane(f"ir{arm}", f"il{right}", to_right)
+        streets.add_lane(f"ir{arm}", f"il{left}", to_left)
+        streets.add_lane(f"ir{arm}", f"il{across}", over)
+        streets.add_lane(f"il{right}", f"o{right}", way_out)
+    return streets
 
 
 def ground(far_m: float) -> Ground:

@@ -17,12 +17,11 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from highway_env.road.lane import AbstractLane, CircularLane, StraightLane
-from highway_env.vehicle.controller import ControlledVehicle
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.world.conflict_measures import observe
 from harness.world.gaps import least_gaps_m
+from harness.world.highway import AbstractLane, CircularLane, ControlledVehicle, StraightLane
 from harness.world.perception.rays import turned
 from harness.world.road import Lane, Road, lanes_of
 from harness.world.seats import seats_of

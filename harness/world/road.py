@@ -438,8 +438,7 @@ def straights(width_m: float, *lanes: tuple[str, str, float, float, float, tuple
     and its two line types (`highway_env.road.lane.LineType`), left and right. All are `width_m`
     wide.
     """
-    from highway_env.road.lane import StraightLane
-    from highway_env.road.road import RoadNetwork
+    from harness.world.highway import RoadNetwork, StraightLane
 
     net = RoadNetwork()
     for start, end, begin_m, end_m, y_m, lines in lanes:
@@ -458,7 +457,7 @@ def to_the_left(
     head east, and `end` lies farther north. Unlike highway-env's `SineLane`, an arc's longitudinal
     coordinate is its true length.
     """
-    from highway_env.road.lane import CircularLane, LineType
+    from harness.world.highway import CircularLane, LineType
 
     along, across = end[0] - begin[0], begin[1] - end[1]
     turn, quarter = 2 * math.atan(across / along), math.pi / 2

@@ -58,8 +58,7 @@ class Roundabout:
     @cache  # noqa: B019 there are few, and they are never freed
     def network(self) -> Any:
         """Build the ring and its arms, without gaps: a `highway_env.road.road.RoadNetwork`."""
-        from highway_env.road.lane import CircularLane, LineType, StraightLane
-        from highway_env.road.road import RoadNetwork
+        from harness.world.highway import CircularLane, LineType, RoadNetwork, StraightLane
 
         none, edge = LineType.NONE, LineType.CONTINUOUS
         beside, entry, arc_y, touch = self.beside_m, self.entry_m, self.arc_y_m, self.touch_rad

@@ -124,7 +124,7 @@ def _road(door: _RoadDoor) -> Road:
     @cache
     def network() -> Any:
         # Without it a scenario here fails in the same way: that is no fault of the package.
-        import highway_env  # noqa: F401
+        import harness.world.highway  # noqa: F401
 
         with worded(door.what):
             lanes = road.network()

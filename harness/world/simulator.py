@@ -12,10 +12,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from highway_env.road.road import Road
-from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
-from highway_env.vehicle.kinematics import Vehicle
 
+from harness.world.highway import ControlledVehicle, MDPVehicle, Road, Vehicle
 from harness.world.road import Lane
 from harness.world.scenario import Layout, Scenario, Spawn
 from harness.world.state import SIZES_M, WITH_LAMPS, VehicleState

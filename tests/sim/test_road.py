@@ -1,6 +1,8 @@
 """Paths and conflict points, against highway-env's own road network and by hand."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from highway_env.envs.intersection_env import IntersectionEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness.world import scenarios
+from harness.world import crossroads, scenarios
 from harness.world.crossroads import APPROACHES, ARM_M, ROUTES, paths, road
 
 KEYS = [(approach, route) for approach in APPROACHES for route in ROUTES]
@@ -25,6 +27,40 @@ def lanes(network, approach, route):
     end = (start + {"straight": 2, "left": 1}[route]) % 4
     nodes = [(f"o{start}", f"ir{start}"), (f"ir{start}", f"il{end}"), (f"il{end}", f"o{end}")]
     return [network.get_lane((a, b, 0)) for a, b in nodes]
+
+
+def test_the_network_is_highway_envs_to_the_last_bit(network):
+    ours = crossroads.network()
+    assert [*ours.graph] == [*network.graph]
+    for begin, lanes_to in network.graph.items():
+        assert [*ours.graph[begin]] == [*lanes_to]
+        for end, [theirs] in lanes_to.items():
+            [lane] = ours.graph[begin][end]
+            assert type(lane) is type(theirs)
+            for name, value in vars(theirs).items():
+                if name not in ("priority", "speed_limit"):  # which nobody reads here
+                    assert np.array_equal(getattr(lane, name), value), (begin, end, name)
+
+
+@pytest.mark.slow
+def test_a_world_loads_no_environment_and_who_asks_for_one_gets_it():
+    program = """
+import sys
+from harness.world import highway, scenarios
+from harness.world.world import World
+for name in scenarios.names():
+    World.start(scenarios.get(name), 5).advance(3)
+assert not {"highway_env", "pandas", "matplotlib", "pygame"} & set(sys.modules)
+import highway_env.road.lane
+import gymnasium
+assert highway_env.road.lane.StraightLane is highway.StraightLane
+assert highway_env.vehicle.controller.MDPVehicle is highway.MDPVehicle
+assert highway_env.__version__ and "highway-v0" in gymnasium.registry
+environment = gymnasium.make("highway-v0")
+environment.reset(seed=1)
+assert isinstance(environment.unwrapped.vehicle, highway.MDPVehicle)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 @pytest.mark.parametrize(("approach", "route"), KEYS)

@@ -93,7 +93,7 @@ def network() -> Any:
     It is a shorter version of that of highway-env's `MergeEnv`. The ramp's last lane ends in the
     right lane of the main road.
     """
-    from highway_env.road.lane import LineType
+    from harness.world.highway import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
     net = straights(

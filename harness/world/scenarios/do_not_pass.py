@@ -120,7 +120,7 @@ def network() -> Any:
 
     The left lane is in it twice, once in each direction, so that the ego may use it to pass.
     """
-    from highway_env.road.lane import LineType
+    from harness.world.highway import LineType
 
     striped, edge, none = LineType.STRIPED, LineType.CONTINUOUS_LINE, LineType.NONE
     return straights(

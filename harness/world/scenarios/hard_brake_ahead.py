@@ -120,7 +120,7 @@ def network() -> Any:
 
     It is a `highway_env.road.road.RoadNetwork`.
     """
-    from highway_env.road.road import RoadNetwork
+    from harness.world.highway import RoadNetwork
 
     return RoadNetwork.straight_road_network(2, start=BEGIN_M, length=END_M - BEGIN_M)
 

@@ -94,8 +94,7 @@ def network() -> Any:
     It has three lanes in a row for each direction, the middle one in the passage, and the side
     road.
     """
-    from highway_env.road.lane import LineType, StraightLane
-    from highway_env.road.road import RoadNetwork
+    from harness.world.highway import LineType, RoadNetwork, StraightLane
 
     net, lines = RoadNetwork(), (LineType.NONE, LineType.NONE)
     apart_m = APART * (END_M - PASSAGE_M)

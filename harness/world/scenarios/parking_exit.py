@@ -91,7 +91,7 @@ def network() -> Any:
 
     It has a lane in each direction, the parking rows, and the pull-out.
     """
-    from highway_env.road.lane import LineType
+    from harness.world.highway import LineType
 
     none, edge, dashed = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
     begins = OUT_M - PULL_OUT_M
