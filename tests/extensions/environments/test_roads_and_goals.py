@@ -337,7 +337,7 @@ def test_a_goal_that_no_course_reaches_is_a_line_before_the_dataset_is_there(har
     assert (code, "2 layouts" in wrote) == (0, True)
     card = (tmp_path / "set/README.md").read_text()
     assert "| the best policy | 0.0 |" in card
-    assert "--seed 0 --unreachable`" in card
+    assert "--seed 0 --out again/set --unreachable`" in card
     assert harness(*built, *shards, "part")[0] == 0
     assert harness("run", "merge", "part", "--out", "merged")[0] == 2
     assert harness("run", "merge", "part", "--out", "merged", "--unreachable")[0] == 0
