@@ -27,6 +27,7 @@ from harness.core.statistics import (
     units_of,
     wilson,
 )
+from harness.extensions.studies.repeats.study import Repeats
 from harness.report.caveats import clustered, few
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
@@ -325,6 +326,10 @@ def test_a_gate_on_the_end_of_an_interval_that_is_not_there_is_refused(tmp_path:
 def test_a_run_that_states_finer_recordings_gains_nothing(tmp_path: Path) -> None:
     whole = made(tmp_path / "whole", 24, (0, 1))
     fine, best = made(tmp_path / "fine", 1, (0, 1)), made(tmp_path / "best", 24)
+    for runs in ((whole, fine), (fine, whole)):
+        clusters = Repeats(tmp_path, runs).clusters
+        assert clusters is not None
+        assert set(clusters.tolist()) == {0}
     for one, other in ((whole, best), (fine, best), (best, fine), (best, whole)):
         comparison = compare(pair(one.path, other.path))
         changes = [change for each in comparison.conditions for change in each.differences]

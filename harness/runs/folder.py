@@ -116,7 +116,12 @@ class Run:
         A cluster is what layouts are cut from, such as a recording of traffic; episodes are in the
         order of the grid.
         """
-        return cluster_numbers([e.cluster for e in self.episodes[: len(self.grid.episodes)]])
+        return cluster_numbers(self.cluster_names)
+
+    @property
+    def cluster_names(self) -> list[str | None]:
+        """Return the name of each episode's cluster, (E,); None for one of its own."""
+        return [episode.cluster for episode in self.episodes[: len(self.grid.episodes)]]
 
     @cached_property
     def _placed(self) -> tuple[Grid, tuple[Episode, ...]]:

@@ -127,10 +127,7 @@ class SuiteRun:
     @cached_property
     def shares_cluster(self) -> bool:
         """Return whether layouts of two families are cut from one thing, such as a recording."""
-        names = []
-        for run in self.runs.values():
-            names.append([episode.cluster for episode in run.episodes])
-        return shares_cluster(names)
+        return shares_cluster([run.cluster_names for run in self.runs.values()])
 
     @cached_property
     def _plays(self) -> Plays[str]:

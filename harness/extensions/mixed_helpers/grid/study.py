@@ -23,7 +23,7 @@ from harness.core.figures import PLAIN, crossed, interval_of
 from harness.core.files import folder_in
 from harness.core.multiplicity import LEVEL
 from harness.core.progress import Progress
-from harness.core.statistics import Estimate, resampled_estimate
+from harness.core.statistics import Estimate, joined_clusters, resampled_estimate
 from harness.core.versions import versions
 from harness.evaluate.agent import Agent
 from harness.evaluate.run import read_or_evaluate
@@ -235,7 +235,9 @@ def run_cells(
                 answers.setdefault((answer.role, of_agent), {})[answer.id] = answer
         cells.append(Cell(ego, helper, run))
     episodes = runs[0].episodes[: len(runs[0].grid.episodes)]
-    return Grid(tuple(cells), len(egos), len(helpers), Success.of(episodes, headline_of(*runs)))
+    clusters = joined_clusters([run.cluster_names for run in runs])
+    rule = replace(Success.of(episodes, headline_of(*runs)), clusters=clusters)
+    return Grid(tuple(cells), len(egos), len(helpers), rule)
 
 
 @dataclass(frozen=True)

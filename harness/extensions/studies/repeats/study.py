@@ -25,6 +25,7 @@ from harness.core.progress import Progress
 from harness.core.statistics import (
     Estimate,
     episode_interval,
+    joined_clusters,
     known_mean,
     rate_interval,
     resampled,
@@ -132,6 +133,11 @@ class Repeats:
         return self.runs[0].conditions
 
     @cached_property
+    def clusters(self) -> Ints | None:
+        """Return the number of each episode's cluster, (E,): two are in one if any run says so."""
+        return joined_clusters([run.cluster_names for run in self.runs])
+
+    @cached_property
     def scores(self) -> tuple[Score, ...]:
         """Return all metrics of the repeats together, with intervals over episodes.
 
@@ -158,7 +164,7 @@ class Repeats:
     def _of_condition(self, place: int) -> Iterator[tuple[str, Estimate]]:
         """Yield the figures of the condition at a place, each with its metric."""
         _, counts, places = self._actions
-        clusters = self.runs[0].clusters
+        clusters = self.clusters
         units = places if clusters is None else clusters[places]
         reached = counts[place].sum(axis=(-2, -1)) > 0
         for metric, share in ((FLIPS, flips), (STABLE, stable)):
@@ -252,7 +258,7 @@ class Repeats:
                 entropies[n] = _doubt(np.array(of_scene))
         stated_nats, sampled_nats = entropies.T
         numbers = np.array([int(scene.partition("-")[0]) for scene in intents])
-        episodes = units_of(numbers, self.runs[0].grid.episodes, self.runs[0].clusters)
+        episodes = units_of(numbers, self.runs[0].grid.episodes, self.clusters)
         for name, values in ((STATED, stated_nats), (SAMPLED, sampled_nats)):
             yield name, in_range(name, episode_interval(values, episodes))
         yield DOUBT, episode_interval(stated_nats - sampled_nats, episodes)
