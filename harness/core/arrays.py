@@ -36,6 +36,8 @@ def taken(values: Any, at: Any) -> Any:
     It is `values[at]`, in a tenth of the time where rows are short.
     """
     places = np.asarray(at)
+    if not places.ndim:
+        return values[at]
     return values.take(np.flatnonzero(places) if places.dtype == np.bool_ else places, axis=0)
 
 
