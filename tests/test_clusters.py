@@ -36,7 +36,7 @@ from harness.report.matrix import lines
 from harness.report.panels import errors, reliability
 from harness.report.plan import from_pilots
 from harness.report.runs import Runs
-from harness.runs import pinned
+from harness.runs import listing, pinned
 from harness.runs.answer_times import times
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run, read
@@ -48,6 +48,7 @@ from harness.runs.success import (
     mean_difference,
     of_families,
 )
+from harness.runs.suite import SuiteRun, write
 
 NONE = np.zeros(6, dtype=bool)
 
@@ -349,6 +350,26 @@ def test_the_rows_of_an_episode_have_one_layout(tmp_path: Path) -> None:
         table.write_text("\n".join([head, *rows[:-1], ",".join(cells)]) + "\n")
         with pytest.raises(UserError, match=rf"episode 1 has {name} .* in one row and {value} in"):
             sound(folder)
+
+
+def test_a_suite_and_its_line_in_a_list_know_families_of_one_recording(tmp_path: Path) -> None:
+    is_as_wide = []
+    for name, size in (("alike", 12), ("apart", 0)):
+        folder = tmp_path / name
+        runs = {each: made(folder / each, size, (0, 13)) for each in ("first", "second")}
+        suite = SuiteRun(folder, name, "two families", runs)
+        write(suite)
+        score = suite.score("6g", "success_rate")
+        assert score
+        assert suite.shares_cluster == bool(size)
+        [listed] = [each for each in listing.runs(tmp_path) if each.name == name]
+        best = suite.score(listed.condition or "", listed.metric or "")
+        assert best
+        assert (listed.low, listed.high) == pytest.approx((best.low, best.high))
+        alone = runs["first"].score("6g", "success_rate")
+        assert alone
+        is_as_wide.append(alone.low == pytest.approx(score.low))
+    assert is_as_wide == [True, False]  # the same layouts twice say no more than once
 
 
 def test_times_of_answers_are_over_recordings(tmp_path: Path) -> None:

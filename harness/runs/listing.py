@@ -193,7 +193,9 @@ def _suite_entry(path: str, root: str, has_summary: bool, written: datetime) -> 
             return listed
         folders = [os.path.join(path, name) for name in names]
         runs = [(_json(folder, "run.json"), _rows(folder)) for folder in folders]
-        return _with_success(listed, _means([rows for _, rows in runs]), runs)
+        clusters = [_clusters(folder) for folder in folders]
+        together = len(set[str]().union(*clusters)) < sum(map(len, clusters))
+        return _with_success(listed, _means([rows for _, rows in runs], together), runs)
     except _BROKEN:
         return listed
 
@@ -219,8 +221,22 @@ def _rows(path: str) -> Rows:
     return list(csv.DictReader(lines))
 
 
-def _means(summaries: Sequence[Rows]) -> Rows:
-    """Return the means over families of the rows that each summary has."""
+def _clusters(path: str) -> set[str]:
+    """Return the names of what a run's layouts are cut from; a table without any is not read."""
+    with (
+        opened(os.path.join(path, "episodes.csv"), "rows") as data,
+        TextIOWrapper(data, "utf-8-sig") as file,
+    ):
+        table = csv.DictReader(file)
+        rows = table if "cluster" in (table.fieldnames or ()) else ()
+        return {row["cluster"] for row in rows if row["cluster"]}
+
+
+def _means(summaries: Sequence[Rows], together: bool) -> Rows:
+    """Return the means over families of the rows that each summary has.
+
+    `together` says that families share a cluster, such as a recording.
+    """
     from harness.core.statistics import Estimate, mean_of  # imported here because it is slow
 
     keys, ends = ("condition", "metric", "interval"), ("value", "ci_low", "ci_high")
@@ -237,7 +253,7 @@ def _means(summaries: Sequence[Rows]) -> Rows:
         for rows in by_key:
             value, low, high = (float(rows[key][end] or "nan") for end in ends)
             of_families.append(Estimate(value, low, high, 0, 0))
-        mean = mean_of(of_families)
+        mean = mean_of(of_families, together)
         row = dict(zip(keys, key, strict=True))
         row |= {"value": repr(mean.value), "ci_low": repr(mean.low), "ci_high": repr(mean.high)}
         means.append(row)
