@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 from run_on_disk import Row, made_up
 
 from harness.core.arrays import Floats, Ints
@@ -27,7 +26,6 @@ from harness.core.statistics import (
     units_of,
     wilson,
 )
-from harness.extensions.studies.repeats.study import Repeats
 from harness.report.caveats import clustered, few
 from harness.report.compare.difference import compare
 from harness.report.compare.gate import gate, judge
@@ -37,7 +35,6 @@ from harness.report.panels import errors, reliability
 from harness.report.plan import from_pilots
 from harness.report.runs import Runs
 from harness.runs import listing, pinned
-from harness.runs.answer_times import times
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run, read
 from harness.runs.metric_names import GAIN
@@ -327,10 +324,6 @@ def test_a_gate_on_the_end_of_an_interval_that_is_not_there_is_refused(tmp_path:
 def test_a_run_that_states_finer_recordings_gains_nothing(tmp_path: Path) -> None:
     whole = made(tmp_path / "whole", 24, (0, 1))
     fine, best = made(tmp_path / "fine", 1, (0, 1)), made(tmp_path / "best", 24)
-    for runs in ((whole, fine), (fine, whole)):
-        clusters = Repeats(tmp_path, runs).clusters
-        assert clusters is not None
-        assert set(clusters.tolist()) == {0}
     for one, other in ((whole, best), (fine, best), (best, fine), (best, whole)):
         comparison = compare(pair(one.path, other.path))
         changes = [change for each in comparison.conditions for change in each.differences]
@@ -370,38 +363,3 @@ def test_a_suite_and_its_line_in_a_list_know_families_of_one_recording(tmp_path:
         assert alone
         is_as_wide.append(alone.low == pytest.approx(score.low))
     assert is_as_wide == [True, False]  # the same layouts twice say no more than once
-
-
-def test_times_of_answers_are_over_recordings(tmp_path: Path) -> None:
-    """Of a run's own page, and of what a device would take."""
-    profiles = pytest.importorskip("harness.extensions.devices.profiles")
-    fit = pytest.importorskip("harness.extensions.devices.fit")
-    device, found = profiles.load("laptop-cpu"), {}
-    row = device.rows[0]
-    for size in (0, 2, 24):
-        whole = made(tmp_path / str(size), size)
-        timed = [replace(answer, **clock(answer.scene)) for answer in whole.answers]
-        whole.__dict__["answers"] = timed
-        ego = times(timed, whole.grid.episodes, whole.clusters)["ego"]
-        [seconds, *_] = fit.held(device, row, whole)
-        [_, written] = fit.fits(device, [row], fit.answers_of(whole), 0.2)
-        found[size] = ego.median_ci_s, (seconds.measured.low, seconds.measured.high), written
-    (own, rates, alone), (dozen, _, of_dozen), (of_one, of_one_rate, single) = found.values()
-    assert own is not None
-    assert dozen is not None
-    assert dozen[1] - dozen[0] > own[1] - own[0]
-    assert rates == pytest.approx(own)
-    assert of_one is None
-    assert math.isnan(of_one_rate[0])
-    assert (single.joules.value, single.in_time.value) == (alone.joules.value, alone.in_time.value)
-    assert math.isnan(single.joules.low)
-    assert single.in_time.low < of_dozen.in_time.low < alone.in_time.low
-
-
-def clock(scene: str) -> dict[str, float]:
-    """Layouts of one recording take alike, twelve of them from 0.1 to 0.21 s."""
-    place = int(scene.partition("-")[0]) // 2
-    return {
-        "seconds": (10 + place) / 100, "first_token_s": 0.05, "token_s": 0.01,
-        "prompt_tokens": 100 + 10 * place, "completion_tokens": 20 + place // 6,
-    }  # fmt: skip

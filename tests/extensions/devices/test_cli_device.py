@@ -3,13 +3,16 @@ a profile beside times.
 """
 
 import json
+import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from evaluating import course, run, spec_of
 from msgspec.structs import replace
+from run_on_disk import Row, made_up
 
 from harness.coordination.named_points import POINTS
 from harness.core.errors import UserError
@@ -17,6 +20,7 @@ from harness.dataset.load import Dataset
 from harness.extensions.devices import profiles
 from harness.extensions.devices.fit import answers_of, declared, fits, held
 from harness.runs import folder
+from harness.runs.answer_times import times
 
 Said = tuple[int, str, str]
 
@@ -178,3 +182,42 @@ def test_declared_tokens_are_read_out_or_written() -> None:
         "readout": [1.0],
         "written": [40.0],
     }
+
+
+def test_times_of_answers_are_over_recordings(tmp_path: Path) -> None:
+    """Of a run's own page, and of what a device would take."""
+    device, found = profiles.load("laptop-cpu"), {}
+    row = device.rows[0]
+    for size in (0, 2, 24):
+        made = made_up(tmp_path / str(size), episode=partial(cut, size=size), episodes=24)
+        whole = folder.read(made)
+        timed = [replace(answer, **clock(answer.scene)) for answer in whole.answers]
+        whole.__dict__["answers"] = timed
+        ego = times(timed, whole.grid.episodes, whole.clusters)["ego"]
+        [seconds, *_] = held(device, row, whole)
+        [_, written] = fits(device, [row], answers_of(whole), 0.2)
+        found[size] = ego.median_ci_s, (seconds.measured.low, seconds.measured.high), written
+    (own, rates, alone), (dozen, _, of_dozen), (of_one, of_one_rate, single) = found.values()
+    assert own is not None
+    assert dozen is not None
+    assert dozen[1] - dozen[0] > own[1] - own[0]
+    assert rates == pytest.approx(own)
+    assert of_one is None
+    assert math.isnan(of_one_rate[0])
+    assert (single.joules.value, single.in_time.value) == (alone.joules.value, alone.in_time.value)
+    assert math.isnan(single.joules.low)
+    assert single.in_time.low < of_dozen.in_time.low < alone.in_time.low
+
+
+def cut(row: Row, size: int) -> None:
+    if size:
+        row["cluster"] = f"street {row['episode'] // size}"
+
+
+def clock(scene: str) -> dict[str, float]:
+    """Layouts of one recording take alike, twelve of them from 0.1 to 0.21 s."""
+    place = int(scene.partition("-")[0]) // 2
+    return {
+        "seconds": (10 + place) / 100, "first_token_s": 0.05, "token_s": 0.01,
+        "prompt_tokens": 100 + 10 * place, "completion_tokens": 20 + place // 6,
+    }  # fmt: skip

@@ -15,7 +15,7 @@ from evaluating import Scripted, Watched, course, same_files, spec_of, sure
 from hypothesis import given
 from hypothesis import strategies as st
 from priced import priced, typed_eval
-from run_on_disk import digested
+from run_on_disk import Row, digested, made_up
 
 from harness.backends.base import Completion, Request
 from harness.coordination.named_points import POINTS
@@ -40,6 +40,7 @@ from harness.extensions.studies.repeats.study import (
     run_repeats,
     stable,
 )
+from harness.runs.folder import read
 from harness.runs.headline import SUCCESS
 from harness.runs.listing import runs
 from harness.runs.metric_names import ALL
@@ -322,3 +323,16 @@ def test_no_suite_is_repeated(harness: Callable[..., Said]) -> None:
         in err
     )
     assert not Path("reports").exists()
+
+
+def test_episodes_are_in_one_cluster_if_any_repeat_says_so(tmp_path: Path) -> None:
+    def of_four(row: Row) -> None:
+        row["cluster"] = f"street {row['episode']}"
+
+    runs = []
+    for name, cut in (("one", lambda row: row.update(cluster="street")), ("four", of_four)):
+        runs.append(read(made_up(tmp_path / name, episode=cut)))
+    for order in (runs, runs[::-1]):
+        clusters = Repeats(tmp_path, tuple(order)).clusters
+        assert clusters is not None
+        assert clusters.tolist() == [0, 0, 0, 0]
