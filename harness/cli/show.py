@@ -46,7 +46,8 @@ def finish(
         echo_answer(study)
     elif not quiet:
         show(study, verbose)
-        typer.echo(f"wrote {printable(page)}")
+        more = "" if pictures or study.figures is dict else "; --pictures draws its figures, too"
+        typer.echo(f"wrote {printable(page)}{more}")
 
 
 def echo_answer(study: "Study") -> None:

@@ -96,6 +96,9 @@ def percent(row: Any, value: str, low: str, high: str) -> str:
     return PERCENT.interval(row[value], row[low], row[high])
 
 
+UNDRAWN = "The same command with --pictures draws figures into this page."
+
+
 def write_study(study: Study, out: Path, draws: bool = True) -> Path:
     """Write a study's figures, tables, page and manifest into a folder; return the page's path.
 
@@ -107,10 +110,11 @@ def write_study(study: Study, out: Path, draws: bool = True) -> Path:
     pictures = _pictures(study, out) if draws and undrawn(study) is None else {}
     for stem, table in study.data.items():
         write_table(table, out / stem)
+    has_none = not draws and study.figures is not dict
     section = Section(
         study.title,
         [*study.headline, *study.verdicts],
-        study.about,
+        [*study.about, UNDRAWN] if has_none else study.about,
         study.tables,
         caveats=study.caveats,
         pictures=pictures,
