@@ -287,7 +287,9 @@ def test_every_study_that_is_made_is_listed_and_refuses_the_folder_of_another(
         with pytest.raises(UserError, match=rf"holds something else, as its {kind}\.json says"):
             refuse_taken(tmp_path / kind, other)
     for name in ("a\x1b", "a\u202e"):
-        with pytest.raises(UserError, match="has characters that nothing can show; give another name"):
+        with pytest.raises(
+            UserError, match="has characters that nothing can show; give another name"
+        ):
             refuse_taken(tmp_path / name, "sweep")
     listed = {one.name: one for one in runs(tmp_path)}
     assert listed.keys() == known.keys()
