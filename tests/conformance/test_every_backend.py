@@ -19,7 +19,16 @@ from harness.backends.answers_file import AnswersFile, Question
 from harness.backends.base import AnswerMode, Backend, Completion, Request
 from harness.backends.gguf_export import export
 from harness.backends.openai.constraint import broken
-from harness.backends.registry import BUILT_IN, capabilities, missing, open_backend
+from harness.backends.registry import (
+    BUILT_IN,
+    capabilities,
+    missing,
+    missing_package,
+    open_backend,
+)
+from harness.backends.registry import (
+    ENGINES as REGISTERED,
+)
 from harness.core.files import digest
 from harness.dataset.load import load
 from harness.evaluate.requests import requests
@@ -50,10 +59,21 @@ def model_free() -> list[str]:
 
 
 WITH_WEIGHTS = [engine for engine in BUILT_IN if capabilities(engine).has_weights]
+ADDED = [
+    engine for engine in REGISTERED if engine not in BUILT_IN and capabilities(engine).has_weights
+]
 ENGINES = [
     *((name, "json") for name in (*model_free(), "replay", "answers-file")),
     *((engine, answer) for engine in ("openai", *WITH_WEIGHTS) for answer in get_args(AnswerMode)),
     *((engine, "decision") for engine in ("systemone", "decisions", "sparrow")),
+]
+CASES = [
+    *(pytest.param(case, id="-".join(case)) for case in ENGINES),
+    *(
+        pytest.param((engine, answer), id=f"{engine}-{answer}", marks=pytest.mark.exhaustive)
+        for engine in ADDED  # those of extensions, of which CI installs none
+        for answer in get_args(AnswerMode)
+    ),
 ]
 
 
@@ -63,9 +83,10 @@ def tiny_weights(folder: Path) -> None:
 
     tiny_qwen3.build(folder / "tiny", context_tokens=2048)
     export(folder / "tiny", folder / "tiny.gguf", "F32")
+    export(folder / "tiny", folder / "tiny-f16.gguf", "F16")  # which engines of packages read, too
 
 
-@pytest.fixture(scope="module", params=ENGINES, ids="-".join)
+@pytest.fixture(scope="module", params=CASES)
 def case(
     request: pytest.FixtureRequest,
     small_path: Path,
@@ -78,7 +99,10 @@ def case(
     if model == "replay":
         run(spec_of(data, seeds=(0,)), folder / "run")
         model = f"replay:{folder / 'run'}"
-    if model in WITH_WEIGHTS:
+    if model in ADDED and (package := missing_package(model)):
+        pytest.skip(f"needs {package}")
+    engine = model
+    if model in (*WITH_WEIGHTS, *ADDED):
         if find_spec("torch") is None or find_spec("transformers") is None:
             pytest.skip("needs the transformers extra")
         tiny = once("every-backend", tiny_weights)
@@ -101,6 +125,8 @@ def case(
         if find_spec("llama_cpp") is None:
             pytest.skip("needs the llama-cpp extra")
         model = str(tiny / "tiny.gguf")
+    if model in ADDED:
+        model = str(tiny / "tiny-f16.gguf")
     if model == "answers-file":
         yield of_a_file(list(requests(spec_of(data), scenes_of(data)[:5]))[:5], folder / "a.jsonl")
         return
@@ -108,8 +134,11 @@ def case(
     asked = list(requests(spec, data.scenes(data.forest.ids[:1])))  # where every walk begins
     if answer == "json":  # the others take what they take
         asked = [replace(r, max_tokens=min(r.max_tokens, 4)) for r in asked]
-    device = "cpu" if spec.ego.card.engine in WITH_WEIGHTS else None
-    yield Case(open_backend(spec.ego.card, device=device, batch_size=3), tuple(asked[:5]))
+    card = spec.ego.card
+    device = "cpu" if card.engine in WITH_WEIGHTS else None
+    if engine in ADDED:
+        card = replace(card, engine=engine, dtype="float32")
+    yield Case(open_backend(card, device=device, batch_size=3), tuple(asked[:5]))
 
 
 def of_a_file(asked: list[Request], file: Path) -> Case:
@@ -243,6 +272,6 @@ def test_asking_again_alone_or_in_other_company_gives_the_same_text(case: Case) 
 def test_its_identity_is_json_and_stays_the_same(case: Case) -> None:
     identity = case.backend.identity()
     assert json.loads(json.dumps(identity, allow_nan=False)) == identity
-    assert identity["engine"] in BUILT_IN
+    assert identity["engine"] in REGISTERED
     case.backend.complete(case.asked[:1])
     assert case.backend.identity() == identity
