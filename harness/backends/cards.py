@@ -324,7 +324,7 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
             "which no engine opens here; serve it by llama-server, and copy "
             "models/systemone-example.toml"
         )
-    engine = "transformers" if engine == "transformers" else "llama-cpp"
+    engine = engine if engine and _reads_gguf(engine) else "llama-cpp"
     projector = file.with_name(f"{PROJECTOR}{file.name}")
     vision = _vision(text, file.parent) if engine == "llama-cpp" and projector.is_file() else None
     return _new_card(
@@ -339,6 +339,13 @@ def _gguf_card(text: str, file: Path, engine: str | None) -> Card:
         vision=vision,
         projector=projector.name if vision else None,
     )
+
+
+def _reads_gguf(engine: str) -> bool:
+    """Return whether an engine opens GGUF files: it finds its weights as llama-cpp does, or is
+    transformers, which unpacks them.
+    """
+    return engine == "transformers" or registration(engine).finds == registration("llama-cpp").finds
 
 
 def _path(text: str) -> Path | None:

@@ -29,6 +29,14 @@ def card_of(weights: Path) -> Card:
     return replace(card, engine="openvino", weights=str(weights), revision=None, sha256=None)
 
 
+def test_a_gguf_file_is_opened_by_the_engine_that_is_typed(tmp_path: Path) -> None:
+    (tmp_path / "mine.gguf").touch()
+    engines = [
+        cards.resolve(str(tmp_path / "mine.gguf"), name).engine for name in (None, "openvino")
+    ]
+    assert engines == ["llama-cpp", "openvino"]
+
+
 def test_without_the_package_one_line_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, harness: Callable[..., tuple[int, str, str]]
 ) -> None:
