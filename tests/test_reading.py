@@ -235,6 +235,7 @@ EXCEPT = {
     "backends/counters.py": "counters of the kernel, below /sys",
     "backends/packages.py": "an archive that the reader has opened",
     "extensions/learn/training/model.py": "safetensors maps weights that training has just written",
+    "extensions/openvino/exact.py": "gguf maps weights whose digest the reader has computed",
     "report/library.py": "the charting library of an installed package",
     "cli/init.py": "the project that ships",
     "core/process.py": "the null device",

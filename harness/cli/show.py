@@ -46,8 +46,9 @@ def finish(
         echo_answer(study)
     elif not quiet:
         show(study, verbose)
-        more = "" if pictures or study.figures is dict else "; --pictures draws its figures, too"
-        typer.echo(f"wrote {printable(page)}{more}")
+        if not pictures and study.figures is not dict:
+            typer.echo("figures: the same command with --pictures")
+        typer.echo(f"wrote {printable(page)}")
 
 
 def echo_answer(study: "Study") -> None:

@@ -366,7 +366,7 @@ def moved_system(run: Run) -> Iterator[str]:
         )
 
 
-def from_file(run: Run) -> Iterator[str]:
+def stated_elsewhere(run: Run) -> Iterator[str]:
     """Yield a sentence on a run whose answers came from a file that another program wrote."""
     model = run.manifest.model
     if is_from_file(run.manifest.answerers):

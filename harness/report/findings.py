@@ -71,7 +71,7 @@ def _merged(source: Source[Run], runs: Runs) -> list[str]:
 OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
     Kind.VOID: [each(caveats.unanswered), each(caveats.unread)],
     Kind.CAVEAT: [
-        each(caveats.from_file),
+        each(caveats.stated_elsewhere),
         each(caveats.of_extensions),
         caveats.of_one_name,
         each(caveats.moved_system),

@@ -41,7 +41,7 @@ from harness.evaluate.requests import EGO, wanted_in
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import Fuses
-from harness.report.caveats import from_file
+from harness.report.caveats import stated_elsewhere
 from harness.runs.contradictions import sound
 from harness.runs.records import Answer
 from harness.runs.run_dataset import dataset_of
@@ -286,7 +286,7 @@ class ReplayedRun:
             f"{name}: left out episodes that reach one of {n} decision points without a stored "
             "answer; without --no-model the model is asked there"
         )
-        return tuple(filter(None, (*from_file(self.run), lost, left_out if n else "")))
+        return tuple(filter(None, (*stated_elsewhere(self.run), lost, left_out if n else "")))
 
     def settle(self) -> None:
         """Raise Unanswered if results are invalid, as too many requests made here got no answer."""

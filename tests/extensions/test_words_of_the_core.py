@@ -63,7 +63,6 @@ ORDINARY = {
     "messages": "what vehicles send each other, and what a model is sent",
     "notes": "what is kept beside a scene, and Python's of an exception",
     "objects": "what sensors report, a kind of what messages hold, and JSON's",
-    "optimize": "SciPy's module",
     "only": "an adverb",
     "oracle": "a bound on schedules",
     "pack": "what is sent to another process",

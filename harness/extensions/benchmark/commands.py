@@ -209,6 +209,8 @@ def _mapping(file: Path, done: "Rescored") -> dict[str, Any]:
 
 
 def _show(file: Path, done: "Rescored") -> None:
+    from harness.extensions.benchmark.rescore import DIGITS
+
     by = f", made by {printable(done.contents.made_by)}" if done.contents.made_by else ""
     typer.echo(f"{printable(file)}: {printable(done.suite.variant)}{by}")
     typer.echo(f"{printable(done.edition.name)}, digest {done.edition.digest}, as it is here")
@@ -217,7 +219,7 @@ def _show(file: Path, done: "Rescored") -> None:
         echo_text(f"{name}: {len(figures)} differ: {', '.join(figures)}")
     layouts = sum(len(run.grid.episodes) for run in done.suite.runs.values())
     of = f"{done.compared} figures of {layouts} layouts in {len(done.suite.runs)} families"
-    typer.echo(f"{'not ' * bool(wrong)}equal to the last digit: {of}")
+    typer.echo(f"{'not ' * bool(wrong)}equal to {DIGITS} digits: {of}")
 
 
 def seeds(

@@ -2,12 +2,15 @@
 and say which figures differ.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from msgspec.structs import astuple
 
 from harness.core.errors import Unanswered, UserError, printable, sayable, unknown
 from harness.core.figures import amount
@@ -19,8 +22,11 @@ from harness.extensions.benchmark.edition import Edition
 from harness.extensions.benchmark.results import Contents, contents_of, unpack
 from harness.runs import digests
 from harness.runs.folder import Run, read
-from harness.runs.records import Episode
+from harness.runs.records import Episode, Score
 from harness.runs.suite import SuiteRun
+
+DIGITS = 12  # in which figures are equal, and the tables of episodes in all
+TOLERANCE = 10.0**-DIGITS
 
 
 @dataclass(frozen=True)
@@ -152,19 +158,33 @@ def _about(file: Path, folder: Path) -> Iterator[None]:
         raise UserError(f"{printable(file)}: {str(error).replace(f'{folder}/', '')}") from None
 
 
+def _is_equal(one: Score | None, other: Score | None) -> bool:
+    """Return whether two figures are equal, but for what another library of quantiles rounds."""
+    if one is None or other is None:
+        return False
+    pairs = zip(astuple(one), astuple(other), strict=True)
+    for a, b in pairs:
+        if isinstance(a, float) and isinstance(b, float):
+            if not math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=TOLERANCE):
+                return False
+        elif a != b:
+            return False
+    return True
+
+
 def differing(stated_run: Run, computed_run: Run, edition: Edition) -> Iterator[str]:
     """Yield in words what differs between a run as a file states it and as it is computed here.
 
     First come the condition (settings of radio, asking and fusion) and name of each of the
     edition's figures that differs; an edition is a release of the benchmark. Then comes each column
-    of the table of episodes, with the number of episodes that differ. Numbers are compared to the
-    last digit. A column that is empty in the stated run is not compared, since a release that wrote
-    the run may not have had it.
+    of the table of episodes, with the number of episodes that differ. Figures are compared to
+    `DIGITS`, rows to the last digit. A column that is empty in the stated run is not compared,
+    since a release that wrote the run may not have had it.
     """
     stated_scores = {score.key: score for score in edition.figures(stated_run)}
     computed_scores = {score.key: score for score in edition.figures(computed_run)}
     for key in stated_scores | computed_scores:
-        if stated_scores.get(key) != computed_scores.get(key):
+        if not _is_equal(stated_scores.get(key), computed_scores.get(key)):
             yield " ".join(key)
     for name in Episode.__struct_fields__:
         stated_values = [getattr(episode, name) for episode in stated_run.episodes]

@@ -148,7 +148,7 @@ def test_a_file_of_results_has_the_answers_and_the_editions_figures_and_is_compu
     assert out.splitlines() == [
         f"{made}: proxy-faulty · v2 · json, made by A. N. Author",
         f"mine-1, digest {named('mine-1').digest}, as it is here",
-        "equal to the last digit: 7 figures of 4 layouts in 1 families",
+        "equal to 12 digits: 7 figures of 4 layouts in 1 families",
     ]
 
 
@@ -170,7 +170,7 @@ def test_a_stated_figure_that_the_answers_do_not_give_is_named(
     code, out, _ = project("benchmark", "verify", made)
     assert code == 1
     assert "small: 1 differ: 6g success_rate episodes" in out
-    assert "not equal to the last digit" in out
+    assert "not equal to 12 digits" in out
 
 
 def test_what_a_file_says_its_answers_mean_is_not_believed(project: Harness, made: Path) -> None:
