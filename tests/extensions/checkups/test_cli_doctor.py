@@ -75,11 +75,8 @@ def test_what_is_not_installed_is_named_with_the_command_that_installs_it() -> N
         "pip install 'swarmdrive-harness[llama-cpp]'",
     )
     assert lacks["proxy"] == (None, None)
-    assert {engine for engine, lack in told["engines"].items() if lack} == {
-        "transformers",
-        "llama-cpp",
-        "sparrow",
-    }
+    lacking = {engine for engine, lack in told["engines"].items() if lack}
+    assert lacking - {"openvino"} == {"transformers", "llama-cpp", "sparrow"}
 
 
 @pytest.mark.exhaustive
