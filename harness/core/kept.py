@@ -3,14 +3,17 @@ what is missing is made again.
 """
 
 import os
+import shutil
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from harness import __version__
-from harness.core.files import bytes_of, digest, sha256_file, write_whole
+from harness.core.files import alone, bytes_of, digest, sha256_file, write_whole
 
 _PACKAGE = Path(__file__).parent.parent
+PATIENCE_S = 3600.0  # for another process that makes the same
 
 
 def folder() -> Path:
@@ -39,6 +42,25 @@ def keep(name: str, data: bytes) -> None:
     """
     with suppress(OSError):
         write_whole(folder() / name, data)
+
+
+def made(to: Path, make: Callable[[Path], None]) -> None:
+    """Make a folder in the cache folder, unless it is there: all of it or nothing.
+
+    `make` is called with the path at which to make it; other processes wait meanwhile. Raises
+    OSError if it cannot be written.
+    """
+    to.parent.mkdir(parents=True, exist_ok=True)
+    with alone(to.with_name(f".{to.name}.lock"), PATIENCE_S):
+        if to.is_dir():
+            return
+        part = to.with_name(f".{to.name}.part")
+        shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
+        try:
+            make(part)
+            os.replace(part, to)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
 
 
 @cache

@@ -6,8 +6,6 @@ which splits text as llama.cpp does.
 
 import io
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -21,9 +19,8 @@ from harness.backends.tokens import tokenizer
 from harness.backends.weights import sha256_weights
 from harness.core import kept
 from harness.core.errors import UserError, one_line, printable
-from harness.core.files import alone, digest, write_whole
+from harness.core.files import digest, write_whole
 
-_PATIENCE_S = 3600.0  # for another process that unpacks the same file
 _SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 
 
@@ -39,16 +36,7 @@ def unpack_checkpoint(card: Card, file: Path) -> Path:
     to = kept.folder() / "checkpoints" / digest([sha256_weights(file), *made_by])[:16]
     subject = f"{card.shown} in {printable(file)}"
     try:
-        to.parent.mkdir(parents=True, exist_ok=True)
-        with alone(to.with_name(f".{to.name}.lock"), _PATIENCE_S):
-            if not to.is_dir():
-                part = to.with_name(f".{to.name}.part")
-                shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
-                try:
-                    _unpack(file, part, subject)
-                    os.replace(part, to)
-                finally:
-                    shutil.rmtree(part, ignore_errors=True)
+        kept.made(to, lambda part: _unpack(file, part, subject))
     except OSError as error:
         raise UserError(
             f"{subject}: its checkpoint cannot be written: {printable(error)}; it takes 4 bytes a "

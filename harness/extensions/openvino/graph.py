@@ -4,8 +4,6 @@ openvino-genai reads the file while it opens a pipeline of its own, and writes t
 It does so in another process: a damaged file may end that, and its pipeline's memory is freed.
 """
 
-import os
-import shutil
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from importlib.metadata import version
@@ -16,12 +14,11 @@ from harness.backends.card import Card
 from harness.backends.weights import check_digest, find_gguf, gguf_files, sha256_weights
 from harness.core import kept
 from harness.core.errors import UserError, one_line, printable
-from harness.core.files import alone, digest
+from harness.core.files import digest
 from harness.extensions.openvino.registered import REGISTRATION
 
 GRAPH = "exact.xml"  # with its weights beside it
 _WRITTEN = "openvino_model.xml"  # by openvino-genai
-_PATIENCE_S = 3600.0  # for another process that reads the same file
 
 
 def graph_of_card(card: Card) -> Path:
@@ -38,17 +35,7 @@ def graph_of_card(card: Card) -> Path:
     key = digest([sha256_weights(file), *made_by])
     to = kept.folder() / "openvino" / key[:16]
     try:
-        to.parent.mkdir(parents=True, exist_ok=True)
-        with alone(to.with_name(f".{to.name}.lock"), _PATIENCE_S):
-            if not to.is_dir():
-                part = to.with_name(f".{to.name}.part")
-                shutil.rmtree(part, ignore_errors=True)  # of a process that was killed
-                try:
-                    part.mkdir()
-                    _make(file, part, subject)
-                    os.replace(part, to)
-                finally:
-                    shutil.rmtree(part, ignore_errors=True)
+        kept.made(to, lambda part: _make(file, part, subject))
     except OSError as error:
         raise UserError(
             f"{subject}: its graph cannot be written: {printable(error)}; it is as large as the "
@@ -58,6 +45,7 @@ def graph_of_card(card: Card) -> Path:
 
 
 def _make(file: Path, folder: Path, subject: str) -> None:
+    folder.mkdir()
     link = folder / "model.gguf"
     link.symlink_to(file.resolve())
     try:
