@@ -26,6 +26,7 @@ _NUMBERS = {
     11: "q",
     12: "d",
 }
+SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 _TEXT, _ARRAY = 8, 9
 
 
@@ -90,6 +91,20 @@ def read_metadata(file: Path, arrays: bool = False) -> Mapping[str, Any]:
         if value is not None:
             values[key] = value
     return values
+
+
+def special_tokens(values: Mapping[str, Any]) -> dict[str, str]:
+    """Return the texts of a tokenizer's special tokens by their name, such as `bos_token`.
+
+    `values` is the file's metadata, with arrays.
+    """
+    texts = values["tokenizer.ggml.tokens"]
+    text_of: dict[str, str] = {}
+    for name, key in SPECIALS.items():
+        number = values.get(f"tokenizer.ggml.{key}_token_id")
+        if number is not None:
+            text_of[f"{name}_token"] = texts[number]
+    return text_of
 
 
 def _value(head: bytes, at: int, kind: int, arrays: bool) -> tuple[Any, int]:

@@ -6,22 +6,18 @@ which splits text as llama.cpp does.
 
 import io
 import json
-from collections.abc import Mapping
 from contextlib import redirect_stderr
 from pathlib import Path
-from typing import Any
 from warnings import catch_warnings, simplefilter
 
 from harness.backends.card import Card
-from harness.backends.gguf import read_metadata
+from harness.backends.gguf import read_metadata, special_tokens
 from harness.backends.registry import BUILT_IN
 from harness.backends.tokens import tokenizer
 from harness.backends.weights import sha256_weights
 from harness.core import kept
 from harness.core.errors import UserError, one_line, printable
 from harness.core.files import digest, write_whole
-
-_SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 
 
 def unpack_checkpoint(card: Card, file: Path) -> Path:
@@ -91,12 +87,6 @@ def _unpack(file: Path, to: Path, subject: str) -> None:
         "tokenizer_class": "PreTrainedTokenizerFast",
         "clean_up_tokenization_spaces": False,
         "chat_template": values["tokenizer.chat_template"],
-        **_specials(values),
+        **special_tokens(values),
     }
     write_whole(to / "tokenizer_config.json", json.dumps(settings, indent=1))
-
-
-def _specials(values: Mapping[str, Any]) -> dict[str, str]:
-    ids = {name: values.get(f"tokenizer.ggml.{key}_token_id") for name, key in _SPECIALS.items()}
-    tokens = values["tokenizer.ggml.tokens"]
-    return {f"{name}_token": tokens[number] for name, number in ids.items() if number is not None}

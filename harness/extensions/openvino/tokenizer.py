@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.backends.gguf import read_metadata
+from harness.backends.gguf import read_metadata, special_tokens
 from harness.backends.tokens import token_ids, tokenizer
 from harness.core.errors import UserError
 
-_SPECIALS = {"bos": "bos", "eos": "eos", "unk": "unknown", "pad": "padding"}
 _ENDS = ("eos", "eot", "eom")  # tokens that end an answer, as the file names them
 _LONGEST = 8  # characters of a letter's longest token: `<0x41>`, or a letter with blanks
 
@@ -36,13 +35,7 @@ class GgufTokenizer:
         self.context_tokens = int(values[f"{values['general.architecture']}.context_length"])
         self._loaded = tokenizer(file)
         self.vocabulary: int = self._loaded.get_vocab_size()
-        texts = values["tokenizer.ggml.tokens"]
-        special_texts: dict[str, str] = {}
-        for name, key in _SPECIALS.items():
-            number = _id(values, key)
-            if number is not None:
-                special_texts[f"{name}_token"] = texts[number]
-        self.specials: Mapping[str, str] = special_texts
+        self.specials: Mapping[str, str] = special_tokens(values)
         self.bos = _id(values, "bos")
         numbers = [_id(values, name) for name in _ENDS]
         self.ends = [number for number in numbers if number is not None]
