@@ -85,7 +85,7 @@ def hostile(folder, dataset, n, conditions=PAYLOADS[:1]):
     made_up(
         folder,
         decision=lambda row: _decision(row, dangers.setdefault(row["scene"], said())),
-        episode=lambda row: row.update(danger=said()),
+        episode=lambda row: row.update(danger=dangers.setdefault(row["episode"], said())),
         answer=lambda row: _answer(row, said, n),
         points=[POINTS["6g"].changed(name=name) for name in conditions],
         seeds=(0,),
