@@ -43,6 +43,7 @@ from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.runs.folder import read
 from harness.runs.records import Answer, FrozenScenes
 from harness.runs.settings import words
 from harness.world.drivers import DRIVERS
@@ -267,6 +268,19 @@ def test_a_replay_of_something_else_is_refused(
     else:
         (tmp_path / "broken" / file).write_text(content)
     assert said in refused(spec_of(small, f"replay:{tmp_path / 'broken'}"), tmp_path / "out")
+
+
+def test_a_broken_table_of_a_run_with_answers_is_named_with_its_remedy_once(
+    proxy_run: Path, tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(proxy_run, broken)
+    (broken / "episodes.csv").write_text("condition\n")
+    with pytest.raises(UserError) as caught:
+        len(read(broken).decisions)
+    remedy = f"--model replay:{broken} asks its model nothing"
+    assert str(caught.value).startswith(f"{broken}/episodes.csv is broken (")
+    assert str(caught.value).count(remedy) == 1
 
 
 def test_a_drivers_run_is_not_replayed_but_run_again(small: Dataset, tmp_path: Path) -> None:

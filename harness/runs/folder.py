@@ -306,11 +306,13 @@ class Run:
         try:
             return whole(self.path / name, reader)
         except UserError as error:
+            remedy = f": --model replay:{printable(self.path)} asks its model nothing"
+            # What reads one file may need another of the run, whose error says it already.
+            if str(error).endswith(remedy):
+                raise
             if name == "answers.jsonl" or self.world != "frozen" or not self._has_answers:
                 raise
-            raise UserError(
-                f"{error}: --model replay:{printable(self.path)} asks its model nothing"
-            ) from None
+            raise UserError(f"{error}{remedy}") from None
 
     @property
     def _has_answers(self) -> bool:
