@@ -10,7 +10,7 @@ the same moment, so nothing is extrapolated.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, degrees, hypot, radians, sin
 from typing import NamedTuple
 
@@ -71,6 +71,18 @@ class Report:
         return float(np.trace(self.place_m2))
 
 
+class Told(NamedTuple):
+    """Hold what the ego sees by itself, and what senders report to it.
+
+    A report is of one object, and in the frame of the road.
+    """
+
+    state: WorldState  # the state in which the ego is
+    own: SceneGraph  # the ego's scene graph: what it knows of the state by itself
+    senders: Sequence[Sequence[Report]]  # what each sender reports, of itself and of others
+    sectors: Sequence[Sequence[Sector]]  # how much of each direction of danger each sender sees
+
+
 def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
     """Return the ego's scene graph of each case, with the objects that helpers' messages report.
 
@@ -78,6 +90,25 @@ def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
     ego's own and those of the helpers heard. Reports of several senders are taken for one object if
     positions and speeds agree (chi-squared test), and the most precise of them is kept. Of each
     direction of danger as much counts as seen as whoever sees most of it does.
+    """
+    told: list[Told] = []
+    for case in cases:
+        senders: list[list[Report]] = []
+        for graph in case.helpers:
+            sender = state_in_message(scenario.parameters, case.source or case.state, graph.viewer)
+            of_sender = [itself(scenario.parameters, sender)]
+            of_sender += [_reported(scenario.parameters, sender, node) for node in graph.sensed]
+            senders.append(of_sender)
+        sectors = [graph.sectors for graph in case.helpers]
+        told.append(Told(case.state, case.own, senders, sectors))
+    return with_reports(scenario, told)
+
+
+def with_reports(scenario: Scenario, cases: Sequence[Told]) -> list[SceneGraph]:
+    """Return the ego's scene graph of each case, with the objects that senders report.
+
+    It is for what senders report in the road's frame, and at times of their own; `merged` is for
+    what helpers see now. Reports are joined as there.
     """
     own_ids: list[list[str]] = []  # whose report in the ego's own graph stands
     added: list[list[Detection]] = []  # what messages report
@@ -102,16 +133,12 @@ def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
     return merged_graphs
 
 
-def _reports(p: Parameters, case: Heard) -> list[Report]:
+def _reports(p: Parameters, case: Told) -> list[Report]:
     """Return one report of each object but the ego, the most precise."""
     ego = case.state.ego
     ego_reports = [_reported(p, ego, node, exact=True) for node in case.own.nodes]
-    accepted = [_itself(p, ego, exact=True)]
-    senders = [ego_reports]
-    for graph in case.helpers:
-        sender = state_in_message(p, case.source or case.state, graph.viewer)
-        senders.append([_itself(p, sender), *(_reported(p, sender, node) for node in graph.sensed)])
-    for reports in senders:
+    accepted = [itself(p, ego, exact=True)]
+    for reports in (ego_reports, *case.senders):
         accepted = _joined(accepted, reports)
     return accepted[1:]
 
@@ -218,8 +245,11 @@ def _columns(reports: Sequence[Report]) -> tuple[Floats, Floats, Floats, Floats]
     return places_m.reshape(n, 2), speeds_mps, places_m2.reshape(n, 2, 2), speeds_m2ps2
 
 
-def _itself(p: Parameters, v: VehicleState, exact: bool = False) -> Report:
-    """Return what a vehicle's message says of the vehicle itself."""
+def itself(p: Parameters, v: VehicleState, exact: bool = False) -> Report:
+    """Return what a vehicle's message says of the vehicle itself.
+
+    With `exact` it is what the vehicle knows of itself. `p` has the sizes of a beacon's errors.
+    """
     detection = Detection(
         v.id,
         (f"v2v:{v.id}",),
@@ -245,7 +275,7 @@ def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = Fal
     dx, dy = node.forward_m * c + node.left_m * s, node.forward_m * s - node.left_m * c
     detection = Detection(
         node.id,
-        (f"v2v:{sender.id}",),
+        node.sensors,
         None if node.type == "vehicle" else node.type,
         node.indicator,
         sender.x_m + dx,
@@ -255,13 +285,24 @@ def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = Fal
         None,
         None if node.braking is UNSET else node.braking,
     )
+    sent = report(p, sender, detection, exact)
+    return replace(sent, node=node) if exact else sent
+
+
+def report(p: Parameters, sender: VehicleState, seen: Detection, exact: bool = False) -> Report:
+    """Return what a sender's message reports of an object that its sensors have `seen`.
+
+    It has the covariance of the sensors' errors and of the sender's own pose, whose errors are a
+    beacon's, as `p` has them. With `exact` the sender knows its pose: it is the ego itself.
+    """
+    dx, dy = seen.x_m - sender.x_m, seen.y_m - sender.y_m
     away_m = max(hypot(dx, dy), 0.1)
     # Standard deviations along the line of sight, across it, and of the speed.
     along_m, across_m = RADAR_NOISE_M, BEARING_NOISE_RAD * away_m
-    speed_mps = SPEED_NOISE_MPS["radar" in node.sensors]
-    if "lidar" in node.sensors:
+    speed_mps = SPEED_NOISE_MPS["radar" in seen.sensors]
+    if "lidar" in seen.sensors:
         along_m = across_m = LIDAR_NOISE_M
-    if node.sensors == BY_BEACON:
+    if seen.sensors == BY_BEACON:
         along_m = across_m = p.beacon_noise_m
         speed_mps = p.beacon_noise_mps
     sender_m, sender_rad = p.beacon_noise_m, p.beacon_noise_rad
@@ -271,16 +312,17 @@ def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = Fal
     across_m = hypot(across_m, ROUNDED_M, sender_m, sender_rad * away_m)
     turn = np.array([[dx, -dy], [dy, dx]]) / away_m
     place_m2 = turn @ np.diag([along_m**2, across_m**2]) @ turn.T
-    return Report(detection, node if exact else None, place_m2, speed_mps**2)
+    detection = structs.replace(seen, sensors=(f"v2v:{sender.id}",), range_rate_mps=None)
+    return Report(detection, None, place_m2, speed_mps**2)
 
 
-def _seen_together(case: Heard) -> tuple[Sector, ...]:
+def _seen_together(case: Told) -> tuple[Sector, ...]:
     """Return each sector as the viewer with the most of it in sight sees it,
     a lower bound of the union.
     """
     sectors = {sector.sector: sector for sector in case.own.sectors}
-    for graph in case.helpers:
-        for sector in graph.sectors:
+    for of_sender in case.sectors:
+        for sector in of_sender:
             if sector.seen_share > sectors[sector.sector].seen_share:
                 sectors[sector.sector] = sector
     return tuple(sectors.values())
