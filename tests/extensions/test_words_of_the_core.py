@@ -81,6 +81,7 @@ ORDINARY = {
     "schedules": "a kind of plug-ins, and the folder of their files",
     "seeds": "of layouts, channels and sampling",
     "serve": "what a server does with a model",
+    "streams": "of text that programs write",
     "sumo": "an extra, of packages",
     "tells": "a verb",
     "text": "what is read and written",

@@ -1,0 +1,7 @@
+"""Have stations send what they see unasked, as standards say: what, how often, and how much the
+channel lets them.
+"""
+
+from harness.core.extensions import Extension
+
+EXTENSION = Extension(name="streams")
