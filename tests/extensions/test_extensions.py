@@ -509,6 +509,12 @@ def test_whatever_is_typed_of_an_extension_that_is_gone_says_what_it_was_part_of
     for (command, place), line in zip(ENTRIES[known.COMMANDS].items(), said, strict=True):
         groups_too = re.match("(benchmark|model device|radio|study schedule)(?= )", command)
         typed = f"`harness {groups_too[0] if groups_too else command}`"
+        if groups_too:  # of the extension that opens the group, whoever has the command
+            place = next(
+                each
+                for name, each in ENTRIES[known.COMMANDS].items()
+                if name.startswith(f"{groups_too[0]} ")
+            )
         if " --" in command:  # an option that has become a command
             typed = command.split()[1]
         part = f"is part of the extension {place.rpartition('.')[2]}, which is not installed in "

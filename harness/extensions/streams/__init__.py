@@ -4,4 +4,6 @@ channel lets them.
 
 from harness.core.extensions import Extension
 
-EXTENSION = Extension(name="streams")
+_HERE = "harness.extensions.streams"
+
+EXTENSION = Extension(name="streams", commands={"radio congestion": f"{_HERE}.command:command"})
