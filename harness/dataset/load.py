@@ -5,7 +5,7 @@ import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,16 @@ TREES_AT_ONCE = 256  # how many trees become arrays at a time, in a pass over al
 
 
 @dataclass(frozen=True)
+class Earlier:
+    """Have the decision point before another, in memory: calling it returns `scene`."""
+
+    scene: "Scene | None"  # the decision point before another; None at the first
+
+    def __call__(self) -> "Scene | None":
+        return self.scene
+
+
+@dataclass(frozen=True)
 class Scene:
     """Hold one decision point of a dataset or of a drive: its state and its scene graphs.
 
@@ -62,6 +72,9 @@ class Scene:
     seat: Scenario | None = None
     agent: int = 0  # index of who decides among the vehicles that can be asked; the ego has 0
     several: bool = False  # whether vehicles beside the ego can decide in this scenario
+    # returns the decision point before this one, or None at the first of a course and where it is
+    # not known
+    before: Callable[[], "Scene | None"] = field(default=Earlier(None), repr=False, compare=False)
 
     @property
     def id(self) -> str:
@@ -105,7 +118,7 @@ class Scene:
 
     def changed(self, **fields: Any) -> "Scene":
         record = structs.replace(self.record, **fields)
-        return Scene(record, seat=self.seat, agent=self.agent, several=self.several)
+        return replace(self, record=record, notes={})
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
@@ -273,11 +286,22 @@ class Dataset:
                 for (number, step), places in missing.items():
                     seat = self._seat(number)
                     for record in self._records(file, self.trees.read(number), step, places):
-                        self._scenes[record.scene] = Scene(record, seat=seat)
+                        before = partial(self._before, record.scene)
+                        self._scenes[record.scene] = Scene(record, seat=seat, before=before)
         scenes = [self._scenes[name] for name in ids]
         for name in list(islice(self._scenes, max(0, len(self._scenes) - SCENES_KEPT))):
             del self._scenes[name]
         return scenes
+
+    def _before(self, name: str) -> Scene | None:
+        """Return the decision point that leads to the one of this id; None at the first."""
+        number, step, place = self._place(name)
+        if not step:
+            return None
+        for point in self.trees.read(number).levels[step - 1]:
+            if any(edge.to == place for edge in point.edges):
+                return self.scenes([point.scene])[0]
+        return None
 
     def _seat(self, number: int) -> Scenario | None:
         """Return the scenario as an episode's layout has it.

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 
 from harness.coordination.operating_point import OperatingPoint
+from harness.dataset.load import Scene
 from harness.world import lockstep
 from harness.world.world import Target, World
 
@@ -71,6 +72,8 @@ class Trajectory:
     number: int  # number of the layout's episode in the run
     world: World  # the simulated world
     courses: list[Course]  # the episode under each condition and seed that shares the world
+    # by agent its latest decision point; an agent is a vehicle that decides for itself
+    scenes: dict[int, Scene] = field(default_factory=dict)
 
     @property
     def under_way(self) -> list[int]:
@@ -134,8 +137,11 @@ class Trajectory:
             for agent, before, after in zip(agents, now, targets, strict=True):
                 if after != before:
                     branched.take(taken[targets][agent], agent)
-            parts.append(Trajectory(self.number, branched, courses[targets]))
-        return [Trajectory(self.number, world, courses[now]), *parts] if courses[now] else parts
+            parts.append(self._part(branched, courses[targets]))
+        return [self._part(world, courses[now]), *parts] if courses[now] else parts
+
+    def _part(self, world: World, courses: list[Course]) -> "Trajectory":
+        return Trajectory(self.number, world, courses, dict(self.scenes))
 
 
 def advance(trajectories: Sequence[Trajectory], until_frame: int) -> list[Trajectory]:

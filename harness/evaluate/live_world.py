@@ -22,7 +22,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.plans import STANDING_MPS, Plans
 from harness.core.arrays import Ints
 from harness.dataset.freeze import records_of
-from harness.dataset.load import Scene
+from harness.dataset.load import Earlier, Scene
 from harness.dataset.select import Choice
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
@@ -163,7 +163,10 @@ class LiveWorld(SceneWorld):
                             self._deciding.append((trajectory, agent))
             if self._deciding:
                 points = [(t.world, agent, t.number) for t, agent in self._deciding]
-                self.scenes = looks(points, self._step, self._ego_alone)
+                before = [t.scenes.get(agent) for t, agent in self._deciding]
+                self.scenes = looks(points, self._step, self._ego_alone, before)
+                for (t, agent), scene in zip(self._deciding, self.scenes, strict=True):
+                    t.scenes[agent] = scene
                 return self.scenes
             self._advance()
         return ()
@@ -321,12 +324,17 @@ def look(world: World, agent: int, number: int, step: int, ego_alone: bool) -> S
     return scene
 
 
-def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) -> list[Scene]:
+def looks(
+    points: Sequence[tuple[World, int, int]],
+    step: int,
+    ego_alone: bool,
+    before: Sequence[Scene | None] | None = None,
+) -> list[Scene]:
     """Return the scene in which each agent decides now, given its world, index and episode.
 
     `points` has for each the simulated world, the index of the agent among its vehicles (0 the ego)
     and the number of the episode; `step` is the number of the decision. With `ego_alone` scenes
-    lack what helpers know, their scene graphs.
+    lack what helpers know, their scene graphs. `before` has each agent's decision point before.
     """
     states = [structs.replace(world.state(agent), step=step) for world, agent, _ in points]
     scenes = dict[int, Scene]()
@@ -345,7 +353,11 @@ def looks(points: Sequence[tuple[World, int, int]], step: int, ego_alone: bool) 
             place = world.answering.index(agent) if agent else 0
             seat = scenario if agent or scenario.has_own_world else None
             scenes[n] = Scene(
-                record, seat=seat, agent=place, several=agent_share(world.scenario) > 0
+                record,
+                seat=seat,
+                agent=place,
+                several=agent_share(world.scenario) > 0,
+                before=Earlier(before[n] if before else None),
             )
     return [scenes[n] for n in range(len(points))]
 
