@@ -43,7 +43,8 @@ def test_the_commands_of_its_readme_work_as_typed(harness: Harness, project: Pat
         if "--episodes" in args:
             args[args.index("--episodes") + 1] = "1"
         code, _, err = harness(*args, *(["--limit", "1"] if "eval" in args else []))
-        assert (program, code, err) == ("harness", 0, "")
+        assert (program, code) == ("harness", 0)
+        assert "harness: " not in err  # a slow machine is told of progress
     report = project / "reports/swarm-tiny-mine-occluded-intersection-v3"
     assert json.loads((report / "run.json").read_text())["prompt"]["version"] == "mine"
     code, out, err = harness(
