@@ -192,5 +192,7 @@ def show_counted(spec: "Spec", counted: dict[str, Any], times: int = 1) -> None:
         f"reference drivers' courses; would score {len(spec.points)} conditions × "
         f"{len(spec.seeds)} channel seeds; no model was called"
     )
+    for name, count in counted.get("streamed", {}).items():
+        typer.echo(f"of these with what helpers send unasked under {printable(name)}: {count}")
     echo_prompt_tokens(counted["prompt_tokens"])
     echo_cost(counted.get("cost", {}), times)

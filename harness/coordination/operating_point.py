@@ -51,6 +51,7 @@ from harness.coordination.rules import EGO_PROMPT, RULES, names, reads
 from harness.coordination.schedules import SCHEDULES
 from harness.coordination.scheduling import NEVER, PAPER
 from harness.coordination.sent import Honest, SentIntents, Speaker
+from harness.coordination.streams import Stream
 from harness.core.arrays import Floats
 from harness.core.config import changed
 from harness.core.errors import UserError, printable, unknown
@@ -503,6 +504,12 @@ class OperatingPoint:
             if question != PLAIN:
                 return question
         return PLAIN
+
+    @cached_property
+    def stream(self) -> Stream | None:
+        """Return the messages that helpers send unasked under these settings; None for none."""
+        streams = [part.unasked(self) for part in self._shipped]
+        return next((stream for stream in streams if stream is not None), None)
 
     @cached_property
     def elsewhere(self) -> Part | None:

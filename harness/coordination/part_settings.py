@@ -26,7 +26,7 @@ from harness.core.errors import UserError, printable
 from harness.core.extensions import OfExtension, part_of, setting_of_extension
 
 if TYPE_CHECKING:
-    pass
+    from harness.coordination.streams import Stream
 
 OVERRIDES = ("loss", "latency_s", "density_coupled")  # settings that replace a field of the channel
 RECORDED = {"further": "radio"}  # settings that records call otherwise: `radio` is the further ones
@@ -110,6 +110,18 @@ def change_of(text: str) -> Change:
         if (change := change_by(kind, text)) is not None:
             return change
     raise UserError(f"no part that is installed changes messages by {printable(text)!r}")
+
+
+def stream_of(text: str) -> "Stream":
+    """Return the messages sent unasked of which a text says what an ego heard.
+
+    The text stands in the key of an answer, and is one that some part's stream gave. Raises
+    UserError if no installed part knows it.
+    """
+    for kind in more_parts().values():
+        if (stream := kind.unasked_of(text)) is not None:
+            return stream
+    raise UserError(f"no part that is installed sends messages unasked as {printable(text)!r}")
 
 
 @cache

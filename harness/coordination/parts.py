@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from harness.coordination.intents import Intents
     from harness.coordination.operating_point import OperatingPoint
     from harness.coordination.sent import SentIntents, Speaker
+    from harness.coordination.streams import Stream
     from harness.core.arrays import Bools, Floats, Ints
     from harness.world.scene_graph import SceneGraph
 
@@ -313,6 +314,21 @@ class Part(Struct, frozen=True, kw_only=True):
         It is a control, to test whether what messages say matters; `sources` says of which scenes.
         """
         return False
+
+    def unasked(self, point: "OperatingPoint") -> "Stream | None":
+        """Return the messages that helpers send unasked under a condition, `point`; None for none.
+
+        Only a part that ships may have some.
+        """
+        return None
+
+    @classmethod
+    def unasked_of(cls, text: str) -> "Stream | None":
+        """Return the stream of which a text says what an ego heard; None for that of another part.
+
+        The text is one that `Stream.heard` returned, read back from the key of a stored answer.
+        """
+        return None
 
     def speaker(self) -> "Speaker | None":
         """Return a new object that decides what helpers send, as attackers do; None for the truth.

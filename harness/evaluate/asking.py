@@ -24,6 +24,7 @@ from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
+from harness.coordination.streams import Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.at_once import first_at_once
 from harness.core.errors import Unanswered, UserError, printable
@@ -47,6 +48,8 @@ from harness.evaluate.requests import (
     heard_sets,
     request_id,
     requests,
+    stream_requests,
+    stream_sets,
     wanted_in,
 )
 from harness.evaluate.sharing import shared_graphs
@@ -453,6 +456,26 @@ class Asker:
             *(request_id(scene, viewer, question) for viewer in helpers),
         ]
         return [self.answers[name] if self._has(name) else None for name in ids]
+
+    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
+        """Return what the egos of n scenes answer once they have heard a stream, `(n, ...)`.
+
+        `stream` are the messages that helpers send unasked; an ego that has heard nothing answers
+        as without them. Only the scenes at the indices `at` are asked.
+        """
+        ids = [request_id(scene, scene.viewers[0], PLAIN) for scene in scenes]
+        sets = stream_sets(self.spec.scenario, [scenes[n] for n in at.tolist()], stream)
+        for n, each in zip(at.tolist(), sets, strict=True):
+            if each[1]:
+                ids[n] = fusion_id(*each)
+        lacking = [each for each in sets if each[1] and not self._has(fusion_id(*each))]
+        if lacking:
+            self.answer(list(stream_requests(self.spec, lacking)))
+        answers: list[list[Answer | None]] = []
+        for scene, name in zip(scenes, ids, strict=True):
+            answers.append([self.answers.get(name), *[None] * (len(scene.viewers) - 1)])
+        laid_out = intents_of(self.spec, self.latency, scenes, answers)
+        return Streamed(laid_out.own, laid_out.inference_s[:, 0])
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

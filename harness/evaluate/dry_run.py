@@ -12,7 +12,7 @@ from harness.coordination.operating_point import Rewrites
 from harness.coordination.parts import PLAIN
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.fusion import key_of
-from harness.evaluate.requests import EGO, fusion_id, requests
+from harness.evaluate.requests import EGO, fusion_id, requests, stream_requests, stream_sets
 from harness.evaluate.spec import Spec
 
 
@@ -21,10 +21,11 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
 
     The dict has the settings, `requests`, `requests_by_role`, `scenes`, `prompt_tokens` by role
     (None if no tokenizer is found) and, if a model has a price, `cost` by model, with answers as
-    long as they may be. Tokens are counted by the file `tokenizer`; None takes that of the ego's
-    model. Who asks a helper depends on answers, so numbers of helpers' requests and fusion calls
-    are the most possible unless all are asked. `cost` has no fusion calls (second questions with
-    the messages heard) and no repair turns (second questions after a failed answer).
+    long as they may be; `streamed`, if helpers send unasked, how many of the requests each
+    condition's stream adds. Tokens are counted by the file `tokenizer`; None takes that of the
+    ego's model. Who asks a helper depends on answers, so numbers of helpers' requests and fusion
+    calls are the most possible unless all are asked. `cost` has no fusion calls (second questions
+    with the messages heard) and no repair turns (second questions after a failed answer).
     """
     tokens_of, costs = counter(tokenizer, spec.ego.card), dict[str, dict[str, Any]]()
     sizes: dict[str, list[int]] = {}
@@ -55,6 +56,8 @@ def count(spec: Spec, dataset: Dataset, tokenizer: Path | None) -> dict[str, Any
         "scenes": len(scenes),
         "prompt_tokens": stats or None,
     }
+    if unasked := streamed(spec, scenes):
+        counts["streamed"] = unasked
     return {**counts, "cost": costs} if costs else counts
 
 
@@ -69,6 +72,24 @@ def planned(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     asking = spec.points if spec.asks_all else intents
     for question in {point.question for point in asking if point.question != PLAIN}:
         yield from requests(spec, scenes, question)
+    sets = {}
+    for stream in {point.stream for point in spec.points if point.stream}:
+        for each in stream_sets(spec.scenario, scenes, stream):
+            sets[fusion_id(*each)] = each
+    yield from stream_requests(spec, list(sets.values()))
+
+
+def streamed(spec: Spec, scenes: Sequence[Scene]) -> dict[str, int]:
+    """Return how many questions the stream of each condition adds in some scenes, by condition.
+
+    A stream is what helpers send unasked; conditions with equal streams share their questions.
+    """
+    counts = {}
+    for point in spec.points:
+        if point.stream:
+            sets = stream_sets(spec.scenario, scenes, point.stream)
+            counts[point.name] = sum(bool(senders) for _, senders in sets)
+    return counts
 
 
 def lacking(

@@ -25,6 +25,7 @@ from harness.evaluate.repair import as_text
 from harness.runs.records import ASKED, REWRITTEN, Answer, asked_key
 
 OF_AGENT = "plan"  # in a key, before what its sender, an agent, is itself going to do
+OF_STREAM = "stream:"  # in a key, before what its sender sent unasked
 FROM = "from:"  # in a key, before the id of the other scene that a message comes from
 
 
@@ -137,6 +138,20 @@ def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools
     return keys
 
 
+def stream_key(sender: str, text: str) -> str:
+    """Return the key of what an ego holds of the messages that a sender sends unasked.
+
+    `text` says what (`Stream.heard`). The key is such as `v3!stream:cpm:0.1:12.15`.
+    """
+    return f"{sender}{REWRITTEN}{OF_STREAM}{text}"
+
+
+def stream_text(key: str) -> str:
+    """Return what the key of a message says of its sender's stream; empty for another message."""
+    mark = key.partition(REWRITTEN)[2]
+    return mark.removeprefix(OF_STREAM) if mark.startswith(OF_STREAM) else ""
+
+
 def _plan_of(key: str) -> dict[str, Any] | None:
     """Return the plan of a sender's key as a prompt takes it; None for another message."""
     sender, _, change = key.partition(REWRITTEN)
@@ -214,6 +229,8 @@ def messages_of(
     """
     messages = []
     for sender in senders:
+        if stream_text(sender):
+            continue  # it is in the graph
         if plan := _plan_of(sender):
             messages.append(plan)
             continue

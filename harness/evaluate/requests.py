@@ -12,13 +12,16 @@ from harness.backends.base import Role as AskedRole
 from harness.coordination.operating_point import Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.coordination.parts_of_packages import shown_graph
+from harness.coordination.streams import Stream
 from harness.core.arrays import Bools, Ints
 from harness.dataset.load import Scene
-from harness.evaluate.fusion import heard_in, key_of, messages_of
+from harness.evaluate.fusion import heard_in, key_of, messages_of, stream_key
 from harness.evaluate.pictures import picture
+from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
 from harness.runs.records import Answer, asked_key
 from harness.world.perception.graph import truth_graph
+from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 
 EGO = (0,)
@@ -139,6 +142,31 @@ def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
     It names what the ego has heard: `senders` are the keys of the messages (`fusion.key_of`).
     """
     return f"{scene.id}/{'+'.join((scene.viewers[0], *senders))}"
+
+
+def stream_sets(
+    scenario: Scenario, scenes: Sequence[Scene], stream: Stream
+) -> list[tuple[Scene, list[str]]]:
+    """Return each scene with the keys of what its ego has heard of a stream.
+
+    `stream` are the messages that helpers send unasked, in `scenario`; a key is as in `heard_sets`.
+    """
+    sets = []
+    for scene, senders in zip(scenes, stream.heard(scenario, scenes), strict=True):
+        sets.append((scene, [stream_key(*each) for each in senders.items()]))
+    return sets
+
+
+def stream_requests(spec: Spec, sets: Sequence[tuple[Scene, Sequence[str]]]) -> Iterator[Request]:
+    """Yield the requests that ask egos with what they have heard of a stream, by `stream_sets`.
+
+    `spec` is the evaluation. An ego that has heard nothing is left out: its question is the plain
+    one.
+    """
+    heard = [each for each in sets if each[1]]
+    graphs = shared_graphs(spec.scenario, heard, {})
+    for (scene, senders), graph in zip(heard, graphs, strict=True):
+        yield fusion_request(spec, scene, {}, senders, graph)
 
 
 def heard_sets(

@@ -6,13 +6,13 @@ import numpy as np
 from msgspec import structs
 
 from harness.coordination.contents_of_packages import graphs as graphs_heard
-from harness.coordination.part_settings import change_of, questions
+from harness.coordination.part_settings import change_of, questions, stream_of
 from harness.coordination.parts_of_packages import shown_graph
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene, by_seat
-from harness.evaluate.fusion import marks_of, source_of
+from harness.evaluate.fusion import marks_of, source_of, stream_text
 from harness.runs.records import ASKED, REWRITTEN, Answer
 from harness.world.perception.shared import Heard
 from harness.world.scenario import Scenario
@@ -44,6 +44,12 @@ def _shared_graphs(
     scenario: Scenario, sets: Sequence[tuple[Scene, Sequence[str]]], scenes: Mapping[str, Scene]
 ) -> Sequence[SceneGraph | None]:
     keys = [key for _, senders in sets for key in senders]
+    if texts := [text for text in map(stream_text, keys) if text]:
+        heard = []
+        for scene, senders in sets:
+            of_scene = {key.partition(REWRITTEN)[0]: stream_text(key) for key in senders}
+            heard.append((scene, of_scene))
+        return stream_of(texts[0]).graphs(scenario, heard)
     calls = (marks_of(key).call for key in keys)
     call = next((call for call in calls if call and call.in_graph), None)
     if call is None:

@@ -23,6 +23,7 @@ from harness.coordination.parts_of_packages import sources
 from harness.coordination.plans import Plans
 from harness.coordination.scheduling import Outlook
 from harness.coordination.sent import SentIntents
+from harness.coordination.streams import Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
@@ -244,6 +245,14 @@ class Ask(Protocol[AskedPoint]):
         """
         ...
 
+    def streamed(self, points: Sequence[AskedPoint], /, stream: Stream, at: Ints) -> Streamed:
+        """Return what the egos of n points answer once they have heard a stream, `(n, ...)`.
+
+        `stream` are the messages that helpers send unasked. Only the points at the indices `at`
+        need values.
+        """
+        ...
+
     def fusion_call(
         self, points: Sequence[AskedPoint], /, codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
@@ -311,12 +320,15 @@ def _steps(
         due = _due(world, points)
         intents = _with_needs(world, due, intents)
         others = _others(ask, decision_points, due)
-        answers = _answers_of_helpers(ask, decision_points, due, {PLAIN: intents, **others})
+        streamed = _streamed(ask, decision_points, due)
+        answers = _answers_of_helpers(
+            ask, decision_points, due, {PLAIN: intents, **others}, streamed
+        )
         broadcasts: dict[OperatingPoint, SentIntents] = {}
         sent: dict[OperatingPoint, Exchange] = {}
         fusions: dict[OperatingPoint, FusionInputs] = {}
         for point, due_here in due.items():
-            intents_here = heard(point, answers, due_here)
+            intents_here = heard(point, answers, due_here, streamed)
             speaker, draws = speakers[point], due_here.draws
             broadcasts[point] = speaker.said(intents_here, draws, due_here.episode, due_here.seed)
             sent[point] = exchange(point, broadcasts[point].intents, broadcasts[point].draws)
@@ -397,11 +409,28 @@ def _others(
     }
 
 
+def _streamed(
+    ask: Ask[DecisionPoint],
+    decision_points: Sequence[DecisionPoint],
+    due: Mapping[OperatingPoint, Due],
+) -> dict[Stream, Streamed]:
+    """Return what egos answer that have heard what helpers send unasked, by stream."""
+    at: dict[Stream, list[Ints]] = {}
+    for point, due_here in due.items():
+        if point.stream is not None:
+            at.setdefault(point.stream, []).append(due_here.at)
+    return {
+        stream: ask.streamed(decision_points, stream, np.unique(np.concatenate(places)))
+        for stream, places in at.items()
+    }
+
+
 def _answers_of_helpers(
     ask: Ask[DecisionPoint],
     decision_points: Sequence[DecisionPoint],
     due: Mapping[OperatingPoint, Due],
     answers: Mapping[Question, Intents],
+    streamed: Mapping[Stream, Streamed],
 ) -> Mapping[Question, Intents]:
     """Ask the helpers whose answers some condition uses, and return the intents by question.
 
@@ -414,7 +443,7 @@ def _answers_of_helpers(
             for question, intents in answers.items()
         }
         for point, due_here in due.items():
-            here = heard(point, answers, due_here)
+            here = heard(point, answers, due_here, streamed)
             if here.unasked is not None and here.unasked.any():
                 decision, helper = np.nonzero(here.unasked & needed(point, here, due_here.draws))
                 shown_at = due_here.at[_sources(point, due_here)[decision]]
@@ -428,15 +457,24 @@ def _answers_of_helpers(
                 answers[question] = answers[question].replaced(at, new)
 
 
-def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) -> Intents:
+def heard(
+    point: OperatingPoint,
+    answers: Mapping[Question, Intents],
+    due: Due,
+    streamed: Mapping[Stream, Streamed],
+) -> Intents:
     """Return what vehicles intend in n decisions that are due, as the ego may hear it.
 
     `point` is the condition, the settings; `due` has the decisions, and `answers` the intents at
     all decision points observed, by the question that helpers were asked. Helpers' may be answers
     to another question, or come from another decision's scene, as in a control; who has no other to
-    hear from hears nobody. Distances and inference times stay the decision's own.
+    hear from hears nobody. Distances and inference times stay the decision's own. `streamed` has
+    what egos answer that have heard a stream, by stream.
     """
-    intents = _able(point, answers[PLAIN], due)
+    plain = answers[PLAIN]
+    if point.stream is not None:
+        plain = _with_own(plain, streamed[point.stream])
+    intents = _able(point, plain, due)
     if point.question != PLAIN:
         source = _able(point, answers[point.question], due)
         intents = _with_helpers(intents, source, source.valid)
@@ -445,6 +483,13 @@ def heard(point: OperatingPoint, answers: Mapping[Question, Intents], due: Due) 
         source, alone = intents.take(places), places == np.arange(len(places))
         intents = _with_helpers(intents, source, source.valid & ~alone[:, None])
     return as_sent(point, intents) if point.asks else intents
+
+
+def _with_own(intents: Intents, streamed: Streamed) -> Intents:
+    """Return intents with the ego's as it answers once it has heard a stream."""
+    inference_s = intents.inference_s.copy()
+    inference_s[:, 0] = streamed.inference_s
+    return replace(intents, own=streamed.own, inference_s=inference_s)
 
 
 def _with_helpers(intents: Intents, source: Intents, valid: Bools) -> Intents:

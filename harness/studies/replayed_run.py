@@ -27,6 +27,7 @@ from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, OperatingPoint, Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.coordination.scheduling import chosen
+from harness.coordination.streams import Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import alone, canonical_json
@@ -355,6 +356,20 @@ class ReplayedRun:
         with self._writing():
             return self._asker.others(scenes, question, at)
 
+    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
+        """Return what the egos of n scenes answer once they have heard a stream, (n, ...).
+
+        `stream` are the messages that helpers send unasked; only the scenes at the indices `at`
+        need values. The model is asked what is not stored. Raises UserError if it may not be.
+        """
+        if not self._asks:
+            raise UserError(
+                f"--no-model: {printable(self.run.path)} may lack answers of an ego that has heard "
+                "messages unasked; leave it out"
+            )
+        with self._writing():
+            return self._asker.streamed(scenes, stream, at)
+
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
@@ -452,6 +467,9 @@ class _Nearest:
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
     ) -> Fuses:
         return self._stored.fusion_call(scenes, codes, rewrites)
+
+    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
+        return self._stored.streamed(scenes, stream, at)
 
     def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
         return self._stored.call_of_agents(scenes, at, intents)

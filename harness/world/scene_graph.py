@@ -57,6 +57,12 @@ class Node(Closed, frozen=True):
     braking: bool | UnsetType | None = UNSET
 
 
+class AgedNode(Node, frozen=True):
+    """Describe a vehicle that is known by a message about an earlier time, carried on since."""
+
+    age_s: Number = 0.0  # since it was seen
+
+
 class Point(Closed, frozen=True):
     """A place in the viewer's frame."""
 

@@ -81,7 +81,8 @@ ORDINARY = {
     "schedules": "a kind of plug-ins, and the folder of their files",
     "seeds": "of layouts, channels and sampling",
     "serve": "what a server does with a model",
-    "streams": "of text that programs write",
+    "stream": "of text, or of messages that any part may have sent unasked",
+    "streams": "the same",
     "sumo": "an extra, of packages",
     "tells": "a verb",
     "text": "what is read and written",
@@ -202,6 +203,13 @@ LOOP = (
     "evaluate/spec.py",
     "evaluate/walk.py",
 )
+OF_STREAMS = (
+    "coordination/operating_point.py",
+    "coordination/part_settings.py",
+    "evaluate/asking.py",
+    "evaluate/requests.py",
+    "evaluate/walk.py",
+)
 OTHER_THINGS = {
     ("coordination/coordinate.py", "messages"): "what a rule fuses",
     ("coordination/operating_point.py", "objects"): "whether a call shows what is in the graph",
@@ -218,6 +226,7 @@ OTHER_THINGS = {
     ("evaluate/asking.py", "messages"): "of a chat, whose length bounds its tokens",
     ("coordination/operating_point.py", "messages"): "what is done to those of a fusion call",
     ("evaluate/spec.py", "messages"): "what a prompt shows",
+    **{(path, "stream"): "what any part may have sent unasked" for path in OF_STREAMS},
 }
 
 

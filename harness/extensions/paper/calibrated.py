@@ -187,7 +187,7 @@ class CalibratedWorld:
         """
         raise NotImplementedError
 
-    helpers = fusion_call = call_of_agents = others
+    helpers = streamed = fusion_call = call_of_agents = others
 
     def due(self, point: OperatingPoint) -> Due:
         """Return the decisions of this step, one in every episode, with the channel's random draws.

@@ -6,4 +6,8 @@ from harness.core.extensions import Extension
 
 _HERE = "harness.extensions.streams"
 
-EXTENSION = Extension(name="streams", commands={"radio congestion": f"{_HERE}.command:command"})
+EXTENSION = Extension(
+    name="streams",
+    commands={"radio congestion": f"{_HERE}.command:command"},
+    adds={"parts": {"stream": f"{_HERE}.part:Streams"}},
+)

@@ -18,7 +18,7 @@ ms, are in a simulator in Rust that cites the annex (its model `dcc/etsi/reactiv
 
 `settled` is where a channel comes to rest if all its stations obey. The adaptive rule has one such
 point. The reactive one may have none: where a state's interval makes the channel busier than the
-state's own bounds and the next state's makes it emptier, stations go to and fro between the two.
+state's own bounds and the next state's makes it emptier, stations go back and forth between the two.
 That it can oscillate is known (Rostami, Cheng, Bansal, Sjöberg, Gruteser and Kenney, "Stability
 Challenges and Enhancements for Vehicular Channel Congestion Control Approaches", 2016).
 
@@ -146,6 +146,11 @@ class Settled(NamedTuple):
         Of two phases each is taken to last as long as the other: it is by the mean of their rates.
         """
         return len(self.phases) / sum(1 / phase.interval_s for phase in self.phases)
+
+    @property
+    def allowed_s(self) -> float:
+        """Return the mean time from one packet of a station to its next that the rule allows."""
+        return len(self.phases) / sum(1 / phase.allowed_s for phase in self.phases)
 
     @property
     def busy_ratio(self) -> float:

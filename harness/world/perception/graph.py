@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, structs
 
 from harness.core.arrays import Bools
 from harness.world.beacons import estimated, last_heard
@@ -14,6 +14,7 @@ from harness.world.road import Road
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import (
     BY_BEACON,
+    AgedNode,
     Conflict,
     Ego,
     Node,
@@ -221,7 +222,7 @@ def listed_graphs(
 
 def _node(d: Detection, at: Point, heading_deg: float, lane: str, brake_lamps: bool) -> Node:
     """Return a known vehicle as a node, at a place of the viewer's frame and in a lane."""
-    return Node(
+    node = Node(
         d.id,
         d.kind or "vehicle",
         at.forward_m,
@@ -234,6 +235,7 @@ def _node(d: Detection, at: Point, heading_deg: float, lane: str, brake_lamps: b
         d.sensors,
         d.braking if brake_lamps else UNSET,
     )
+    return node if d.age_s is None else AgedNode(**structs.asdict(node), age_s=round(d.age_s, 2))
 
 
 def _arcs(road: Road, vehicles: Sequence[VehicleState]) -> list[float]:

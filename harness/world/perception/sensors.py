@@ -62,6 +62,8 @@ class Detection(Struct, frozen=True):
     # range rate from the radar, m/s, negative when closing; None without one
     range_rate_mps: float | None
     braking: bool | None = None  # whether it is seen to brake, from the camera; None without one
+    # seconds since it was seen, of one that a message reports of an earlier time; else None
+    age_s: float | None = None
 
 
 def detect(state: WorldState, viewer: VehicleState, parameters: Parameters) -> list[Detection]:

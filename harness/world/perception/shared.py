@@ -91,7 +91,7 @@ def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
     positions and speeds agree (chi-squared test), and the most precise of them is kept. Of each
     direction of danger as much counts as seen as whoever sees most of it does.
     """
-    told: list[Told] = []
+    of_road: list[Told] = []
     for case in cases:
         senders: list[list[Report]] = []
         for graph in case.helpers:
@@ -100,8 +100,8 @@ def merged(scenario: Scenario, cases: Sequence[Heard]) -> list[SceneGraph]:
             of_sender += [_reported(scenario.parameters, sender, node) for node in graph.sensed]
             senders.append(of_sender)
         sectors = [graph.sectors for graph in case.helpers]
-        told.append(Told(case.state, case.own, senders, sectors))
-    return with_reports(scenario, told)
+        of_road.append(Told(case.state, case.own, senders, sectors))
+    return with_reports(scenario, of_road)
 
 
 def with_reports(scenario: Scenario, cases: Sequence[Told]) -> list[SceneGraph]:

@@ -18,13 +18,14 @@ import numpy as np
 from harness.backends.base import Backend
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
+from harness.coordination.streams import Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.progress import Progress
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.asking import Asker
 from harness.evaluate.frozen_world import FrozenSource, FrozenWorld
 from harness.evaluate.kept_answers import read_kept
-from harness.evaluate.requests import Places
+from harness.evaluate.requests import Places, fusion_id, stream_sets
 from harness.evaluate.spec import Spec
 from harness.evaluate.walk import Fuses, walk
 from harness.extensions.learn.optimize.candidate import Candidate
@@ -305,6 +306,12 @@ class _Asker(Asker):
                     questions.append((scene.id, place, question.name))
         self._charge(questions)
         super()._ask_at(scenes, places, question)
+
+    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
+        where = [scenes[n] for n in at.tolist()]
+        sets = stream_sets(self.spec.scenario, where, stream)
+        self._charge([fusion_id(*each) for each in sets if each[1]])
+        return super().streamed(scenes, stream, at)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

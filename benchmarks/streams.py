@@ -1,0 +1,125 @@
+"""What a stream of CPMs rests on: how well motion between decisions is known, and what is sent.
+
+    python benchmarks/streams.py [--layouts 30] [--datasets NAME ...]
+
+The first table drives tune layouts of each scenario by drawn actions, and compares where vehicles
+are ten times a second with where `harness.extensions.streams.motion` puts them by the states at the
+decisions alone. The second has the CPMs at decision points of each dataset's report layouts, and
+what an ego holds of them under `6g`.
+"""
+
+import argparse
+import random
+from collections.abc import Sequence
+from statistics import mean
+
+import numpy as np
+
+from harness.coordination.named_points import named_point
+from harness.core.seeds import FIRST
+from harness.dataset.load import Earlier, Scene, find, load
+from harness.evaluate.live_world import look
+from harness.extensions.streams.cpm import Cpms
+from harness.extensions.streams.motion import moments
+from harness.extensions.streams.sending import stretch
+from harness.world import lockstep
+from harness.world.scenario import Scenario
+from harness.world.scene_graph import AgedNode
+from harness.world.state import WorldState
+from harness.world.world import World
+
+SMALLEST = "--layouts 1 --datasets hard-brake-ahead-v2"
+DATASETS = (
+    "occluded-intersection-v3", "hard-brake-ahead-v2", "do-not-pass-v2", "roundabout-entry-v2",
+    "parking-exit-v2", "blind-merge-v2",
+)  # fmt: skip
+EVERY_FRAMES = 5  # a tenth of a second
+
+
+def away_m(scenario: Scenario, seeds: Sequence[int]) -> list[float]:
+    """Return how far vehicles are from where their motion puts them, m."""
+    p, distances_m = scenario.parameters, list[float]()
+    for seed in seeds:
+        world, drawn = World.start(scenario, seed), random.Random(seed)
+        before = look(world, 0, 0, 0, ego_alone=True)
+        for step in range(p.decisions):
+            lockstep.advance([world], [p.due_frame(step) + p.lag_frames])
+            if not _goes_on(world):
+                break
+            world.take(drawn.choice(scenario.actions), 0)
+            states: list[WorldState] = []
+            begin, end = p.due_frame(step) + p.lag_frames, p.due_frame(step + 1)
+            for frame in (*range(begin + EVERY_FRAMES, end, EVERY_FRAMES), end):
+                lockstep.advance([world], [frame])
+                states.append(world.state(0))
+            if not _goes_on(world):
+                break
+            scene = look(world, 0, 0, step + 1, ego_alone=True)
+            distances_m += _distances_m(Scene(scene.record, before=Earlier(before)), states)
+            before = scene
+    return distances_m
+
+
+def _goes_on(world: World) -> bool:
+    return not world.outcome.ended
+
+
+def _distances_m(scene: Scene, states: Sequence[WorldState]) -> list[float]:
+    distances_m = []
+    found = moments(scene, [state.time_s for state in states])
+    for there, state in zip(found, states, strict=True):
+        for v in there.vehicles:
+            true = state.vehicle(v.id)
+            distances_m.append(float(np.hypot(v.x_m - true.x_m, v.y_m - true.y_m)))
+    return distances_m
+
+
+def load_of(name: str, layouts: int) -> tuple[float, ...]:
+    """Return what is sent and held at a dataset's decision points, by the columns of `main`."""
+    dataset = load(find(name), layouts)
+    scenario, stream = dataset.scenario, named_point("6g:stream=cpm").stream
+    assert isinstance(stream, Cpms)
+    scenes = [scene for scene in dataset.scenes(dataset.courses()) if scene.before()]
+    cpms = [cpm for s in scenes for cpm in stretch(scenario, s, stream.interval_s).cpms]
+    seconds = sum(len(s.state.helpers) for s in scenes) * scenario.parameters.decision_period_s
+    heard = stream.heard(scenario, scenes)
+    graphs = stream.graphs(scenario, list(zip(scenes, heard, strict=True)))
+    nodes = [node for graph in graphs for node in graph.nodes]
+    ages_s = [node.age_s for node in nodes if isinstance(node, AgedNode)]
+    own = [len(scene.graphs[scene.viewers[0]].nodes) for scene in scenes]
+    return (
+        len(cpms) / seconds,
+        mean(len(cpm.objects) for cpm in cpms),
+        mean(stream.bits(cpm) for cpm in cpms) / 8,
+        mean(len(scene.state.vehicles) - 1 for scene in scenes),
+        mean(own),
+        len(nodes) / len(graphs),
+        mean(ages_s),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--layouts", type=int, default=30)
+    parser.add_argument("--datasets", nargs="+", default=list(DATASETS))
+    args = parser.parse_args()
+    print("| scenario | places | exact to 1 cm, % | 99 % within, m | largest, m |")
+    print("|---|--:|--:|--:|--:|")
+    for name in args.datasets:
+        scenario = load(find(name), 1).scenario
+        first = FIRST["tune"]
+        found = np.array(away_m(scenario, range(first, first + args.layouts)))
+        exact = 100 * float(np.mean(found < 0.01))
+        within = float(np.quantile(found, 0.99))
+        print(
+            f"| `{scenario.name}` | {len(found)} | {exact:.1f} | {within:.2f} | {found.max():.2f} |"
+        )
+    print("\n| dataset | CPMs/s | objects | bytes | vehicles | seen | known | age, s |")
+    print("|---|--:|--:|--:|--:|--:|--:|--:|")
+    for name in args.datasets:
+        cells = " | ".join(f"{value:.2f}" for value in load_of(name, args.layouts))
+        print(f"| `{name}` | {cells} |")
+
+
+if __name__ == "__main__":
+    main()

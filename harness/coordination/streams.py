@@ -1,0 +1,45 @@
+"""Define streams: messages that vehicles send unasked, which the ego has before it asks anybody.
+
+What an ego has heard depends on the course to its decision point and on the radio, and not on what
+models answer. It stands in the key under which the ego's answer is kept, so that equal questions
+are asked once.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+from harness.core.arrays import Floats
+
+if TYPE_CHECKING:
+    from harness.world.scene_graph import SceneGraph
+
+
+class Stream(Protocol):
+    """Describe the messages that helpers send unasked under a condition, and what the ego hears.
+
+    It can be hashed: conditions with equal streams hear alike. Scenes are decision points
+    (`harness.dataset.load.Scene`) of a scenario (`harness.world.scenario.Scenario`).
+    """
+
+    def heard(self, scenario: Any, scenes: Sequence[Any]) -> list[Mapping[str, str]]:
+        """Return, for each scene, what its ego holds of each sender's messages, by sender.
+
+        It is a text that `Part.unasked_of` reads, without `+`, `&`, `!` and `/`. Senders of whom
+        the ego holds nothing are left out.
+        """
+
+    def graphs(
+        self, scenario: Any, heard: Sequence[tuple[Any, Mapping[str, str]]]
+    ) -> "list[SceneGraph]":
+        """Return the ego's scene graph with what it has heard, for each scene.
+
+        A scene graph is what one vehicle knows of a scene. `heard` has scenes, all of one road,
+        each with a text by sender, as `heard` returns it.
+        """
+
+
+class Streamed(NamedTuple):
+    """Hold what n egos answer that have heard a stream; others answer as without one."""
+
+    own: Floats  # each ego's probabilities of its A actions, `(n, A)`; NaN where an answer failed
+    inference_s: Floats  # seconds of each answer, `(n,)`; NaN where unknown

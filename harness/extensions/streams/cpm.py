@@ -1,0 +1,270 @@
+"""Tell what the ego holds, when it decides, of the CPMs that helpers have sent unasked.
+
+It holds the newest report of each object by each sender, and carries it on at constant speed, with
+an error that grows. Losses are drawn by layout and link, not by the channel's seed, so that n seeds
+ask no more questions than one.
+
+    loss      of the condition's channel, on each link, at the time of sending
+    delay     from a look to the ego, declared
+    size      of the condition's encoding, by the number of objects
+    errors    of the sender's sensors and of its own pose, which are a beacon's
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from math import cos, hypot, sin
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import structs
+
+from harness.coordination.encodings import ENCODINGS, JSON
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.core.files import canonical_bytes
+from harness.dataset.load import Scene
+from harness.extensions.streams.motion import moments
+from harness.extensions.streams.sending import (
+    NAME,
+    ROUNDING_S,
+    Cpm,
+    links,
+    most_looks,
+    stretch,
+)
+from harness.radio.channel import Channel, Physical
+from harness.radio.fading import Trips
+from harness.world.perception.graph import scene_graphs
+from harness.world.perception.sensors import Detection
+from harness.world.perception.shared import (
+    Report,
+    Told,
+    itself,
+    report,
+    state_in_message,
+    with_reports,
+)
+from harness.world.scenario import Scenario
+from harness.world.scene_graph import SceneGraph
+from harness.world.state import VehicleState, WorldState
+
+KEPT_S = 2.0  # age at which the ego drops a report: two of the longest intervals
+GROWS_MPS2 = 2.0  # standard deviation of the acceleration that a report does not tell, assumed
+NO_SEED = -1  # in place of the channel's seed, as beacons' links have it
+
+Key = tuple[str, str, int]  # id of a scene, sender, and number of its look
+
+
+class Held(NamedTuple):
+    """Hold what an ego holds of one sender in a scene."""
+
+    scene: Scene
+    last: Cpm  # the newest one
+    newest: tuple[tuple[Cpm, Detection], ...]  # of each object the newest CPM, and what it says
+
+    @property
+    def cpms(self) -> list[Cpm]:
+        """Return the CPMs that this is of; one may be there twice."""
+        return [self.last, *(cpm for cpm, _ in self.newest)]
+
+
+@dataclass(frozen=True)
+class Cpms:
+    """Hold how helpers send what they see unasked, a `Stream` (`harness.coordination.streams`)."""
+
+    interval_s: float  # seconds between two looks, and the least between two CPMs
+    delay_s: float = 0.0  # seconds from a look to the ego's having its CPM
+    channel: Channel | None = None  # radio channel; None where only what was heard is shown
+    encoding: str = JSON  # how CPMs are written, which is their size
+
+    def heard(self, scenario: Scenario, scenes: Sequence[Scene]) -> list[Mapping[str, str]]:
+        texts: list[Mapping[str, str]] = []
+        for scene in scenes:
+            of_senders: dict[str, set[int]] = {}
+            for sender, look in self._newest(scenario, scene):
+                of_senders.setdefault(sender, set()).add(look)
+            texts.append({name: self._text(looks) for name, looks in sorted(of_senders.items())})
+        return texts
+
+    def _text(self, looks: set[int]) -> str:
+        return f"{NAME}:{self.interval_s:g}:{'.'.join(map(str, sorted(looks)))}"
+
+    def _newest(self, scenario: Scenario, scene: Scene) -> set[tuple[str, int]]:
+        """Return sender and look of the newest CPM of each object, and of each sender."""
+        now_s = scene.state.time_s
+        newest: dict[tuple[str, str], int] = {}  # by sender and object; the object is "" for any
+        for cpm in self.received(scenario, scene):
+            sender, number, time_s = cpm.look
+            if now_s - KEPT_S <= time_s <= now_s - self.delay_s + ROUNDING_S:
+                for name in ("", *(d.id for d in cpm.objects)):
+                    newest[sender, name] = max(number, newest.get((sender, name), 0))
+        return {(sender, number) for (sender, _), number in newest.items()}
+
+    def received(self, scenario: Scenario, scene: Scene) -> Iterator[Cpm]:
+        """Yield the CPMs that the ego of a scene receives, however late, young enough to matter."""
+        for at in _young(scene):
+            cpms = stretch(scenario, at, self.interval_s).cpms
+            if cpms:
+                crosses = self._draws(scenario, at, cpms) >= self._loss(scenario, at, cpms)
+                yield from (cpm for cpm, there in zip(cpms, crosses, strict=True) if there)
+
+    def _draws(self, scenario: Scenario, scene: Scene, cpms: Sequence[Cpm]) -> Floats:
+        """Return the draws, by link and look, that decide which CPMs are lost, (n,)."""
+        seed, most = scene.state.episode_seed, most_looks(scenario, self.interval_s)
+        draws = []
+        for cpm in cpms:
+            of_link = _uniforms(seed, cpm.sender, scene.state.ego.id, most)
+            draws.append(of_link[cpm.look.number])
+        return np.array(draws)
+
+    def _loss(self, scenario: Scenario, scene: Scene, cpms: Sequence[Cpm]) -> Floats:
+        """Return the probability that each CPM is lost on its way to the ego, (n,)."""
+        n = len(cpms)
+        if not isinstance(self.channel, Physical):
+            return np.full(n, getattr(self.channel, "loss", 0.0))
+        sites, xy_m = links(scenario, scene, self.interval_s)
+        seeds = np.full(n, scene.state.episode_seed)
+        trips = Trips(np.full(n, NO_SEED), seeds, np.zeros(n, dtype=int), 1)
+        helpers = [helper.id for helper in scene.state.helpers]
+        senders = np.array([helpers.index(cpm.sender) for cpm in cpms])[:, None]
+        shadows = trips.shadow(xy_m, self.channel.decorrelation_m)
+        shadow = np.take_along_axis(shadows, senders, axis=1)
+        bits = np.array([self.bits(cpm) for cpm in cpms])[:, None]
+        return np.broadcast_to(self.channel.loss(sites, shadow, bits), shadow.shape)[:, 0]
+
+    def bits(self, cpm: Cpm) -> float:
+        """Return the size of a CPM in bits, in this stream's encoding."""
+        if self.encoding != JSON:
+            objects = np.array([len(cpm.objects)])
+            headers = isinstance(self.channel, Physical)
+            size = ENCODINGS[self.encoding].packet_bits("objects", headers, objects=objects)
+            return float(np.ravel(size)[0])
+        listed = []
+        for d in cpm.objects:
+            numbers = [round(d.x_m, 1), round(d.y_m, 1), round(d.speed_mps, 1)]
+            listed.append([d.id, d.kind, *numbers, d.indicator])
+        return 8.0 * len(canonical_bytes({"from": cpm.sender, "objects": listed}))
+
+    def graphs(
+        self, scenario: Scenario, heard: Sequence[tuple[Scene, Mapping[str, str]]]
+    ) -> list[SceneGraph]:
+        of_scenes = [self._held(scenario, scene, texts) for scene, texts in heard]
+        of_senders = [each for of_scene in of_scenes for each in of_scene]
+        states = _states(of_senders)
+        views = []
+        for each in of_senders:
+            views.append((states[_key(each.scene, each.last)], each.last.sender))
+        graphs = iter(scene_graphs(scenario, views))
+        cases = []
+        for (scene, _), of_scene in zip(heard, of_scenes, strict=True):
+            senders = [_reports(scenario, states, each) for each in of_scene]
+            sectors = [next(graphs).sectors for _ in of_scene]
+            cases.append(Told(scene.state, scene.graphs[scene.viewers[0]], senders, sectors))
+        return with_reports(scenario, cases)
+
+    def _held(self, scenario: Scenario, scene: Scene, texts: Mapping[str, str]) -> list[Held]:
+        """Return what an ego holds of each sender, of which `texts` name the looks."""
+        of_senders: dict[str, list[Cpm]] = {}
+        for at in _young(scene):
+            for cpm in stretch(scenario, at, self.interval_s).cpms:
+                of_senders.setdefault(cpm.sender, []).append(cpm)
+        held = []
+        for sender, text in texts.items():
+            looks = {int(number) for number in text.rpartition(":")[2].split(".")}
+            cpms = [cpm for cpm in of_senders.get(sender, ()) if cpm.look.number in looks]
+            cpms.sort(key=lambda cpm: cpm.look.number)
+            newest: dict[str, tuple[Cpm, Detection]] = {}
+            for cpm in cpms:
+                newest |= {d.id: (cpm, d) for d in cpm.objects}
+            if cpms:
+                held.append(Held(scene, cpms[-1], tuple(newest.values())))
+        return held
+
+
+def _young(scene: Scene) -> Iterator[Scene]:
+    """Yield a scene and those before it up to which CPMs were sent that are young enough."""
+    at: Scene | None = scene
+    while at is not None and at.state.time_s > scene.state.time_s - KEPT_S:
+        yield at
+        at = at.before()
+
+
+def _key(scene: Scene, cpm: Cpm) -> Key:
+    return scene.id, cpm.sender, cpm.look.number
+
+
+def _states(held: Sequence[Held]) -> dict[Key, WorldState]:
+    """Return the state of the world at the look of each CPM that egos hold."""
+    # by the scene up to which a stretch goes: the times that are wanted in it
+    times_s: dict[int, tuple[Scene, dict[Key, float]]] = {}
+    for each in held:
+        for cpm in each.cpms:
+            at = each.scene
+            while (before := at.before()) is not None and before.state.time_s >= cpm.look.time_s:
+                at = before
+            _, of_stretch = times_s.setdefault(id(at), (at, {}))
+            of_stretch[_key(each.scene, cpm)] = cpm.look.time_s
+    states: dict[Key, WorldState] = {}
+    for at, of_stretch in times_s.values():
+        states.update(zip(of_stretch, moments(at, list(of_stretch.values())), strict=True))
+    return states
+
+
+def _reports(scenario: Scenario, states: Mapping[Key, WorldState], held: Held) -> list[Report]:
+    """Return what a sender reports of itself, by its last CPM, and of each object."""
+    p, now_s = scenario.parameters, held.scene.state.time_s
+    poses: dict[int, tuple[VehicleState, VehicleState]] = {}  # true and stated, by look
+    for cpm in held.cpms:
+        if cpm.look.number not in poses:
+            state = states[_key(held.scene, cpm)]
+            pose = state_in_message(p, state, cpm.sender)
+            poses[cpm.look.number] = state.vehicle(cpm.sender), pose
+    last = held.last.look
+    reports = [aged(itself(p, poses[last.number][1]), now_s - last.time_s)]
+    for cpm, detection in held.newest:
+        true, pose = poses[cpm.look.number]
+        there = report(p, pose, as_stated(detection, true, pose))
+        reports.append(aged(there, now_s - cpm.look.time_s))
+    return reports
+
+
+def as_stated(d: Detection, true: VehicleState, pose: VehicleState) -> Detection:
+    """Return an object where its sender puts it, who has it in its own frame.
+
+    The sender is at `true`, and its message says that it is at `pose`, so that errors of its own
+    pose move the object, too.
+    """
+    turn = pose.heading_rad - true.heading_rad
+    dx, dy = d.x_m - true.x_m, d.y_m - true.y_m
+    return structs.replace(
+        d,
+        x_m=pose.x_m + dx * cos(turn) - dy * sin(turn),
+        y_m=pose.y_m + dx * sin(turn) + dy * cos(turn),
+        heading_rad=None if d.heading_rad is None else d.heading_rad + turn,
+    )
+
+
+def aged(earlier: Report, age_s: float) -> Report:
+    """Return a report as it is held some seconds later: carried on at constant speed.
+
+    Its object stays where it was seen if its heading is not known. The standard deviation of its
+    place grows by that of its speed and of an acceleration that it does not tell.
+    """
+    d = earlier.detection
+    x_m, y_m = d.x_m, d.y_m
+    drift_m = hypot(earlier.speed_m2ps2**0.5 * age_s, GROWS_MPS2 * age_s**2 / 2)
+    if d.heading_rad is None:
+        drift_m = hypot(drift_m, d.speed_mps * age_s)
+    else:
+        x_m += age_s * d.speed_mps * cos(d.heading_rad)
+        y_m += age_s * d.speed_mps * sin(d.heading_rad)
+    place_m2 = earlier.place_m2 + np.eye(2) * drift_m**2
+    speed_m2ps2 = earlier.speed_m2ps2 + (GROWS_MPS2 * age_s) ** 2
+    detection = structs.replace(d, x_m=x_m, y_m=y_m, age_s=age_s)
+    return Report(detection, earlier.node, place_m2, speed_m2ps2)
+
+
+@lru_cache(maxsize=4096)
+def _uniforms(seed: int, sender: str, receiver: str, n: int) -> Floats:
+    return noise.uniforms((n,), NAME, seed, sender, receiver)

@@ -1,0 +1,181 @@
+"""Say which CPMs helpers send between two decisions, and what is in them.
+
+A helper looks around every interval, from LEAD_S before the start on, and sends what the standard's
+rules pick (`inclusion.py`). The phase of its looks is drawn by layout and helper.
+"""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from math import floor, inf
+from typing import NamedTuple
+
+import numpy as np
+
+from harness.core import noise
+from harness.core.arrays import Floats
+from harness.dataset.load import Scene
+from harness.extensions.streams.inclusion import LONGEST_S, Sighting, due
+from harness.extensions.streams.motion import moments
+from harness.radio.channel import Site
+from harness.world.perception.rays import surfaces
+from harness.world.perception.sensors import Detection, reports
+from harness.world.scenario import Scenario
+from harness.world.sight_lines import site
+from harness.world.state import WorldState
+
+NAME = "cpm"
+LEAD_S = 2.0  # how long streams run before an episode starts
+AT_ONCE = 32  # looks whose rays fit into the processor's cache
+SCENES_KEPT = 2048  # whose CPMs stay in memory, some 20 kB each
+ROUNDING_S = 1e-9
+
+
+class Look(NamedTuple):
+    """Name one look of a helper around itself."""
+
+    sender: str  # id of the helper
+    number: int  # of the look, from 0, LEAD_S before the start
+    time_s: float  # from the start of the episode
+
+
+class Cpm(NamedTuple):
+    """Hold one CPM: the look that it is of, and the objects in it."""
+
+    look: Look
+    objects: tuple[Detection, ...]
+
+    @property
+    def sender(self) -> str:
+        """Return the id of the helper that sends it."""
+        return self.look.sender
+
+
+class Stretch(NamedTuple):
+    """Hold what is sent between two decisions, and what the next stretch goes on from."""
+
+    cpms: tuple[Cpm, ...]  # by time
+    # what each object was when its sender last included it, by sender and object
+    included: Mapping[str, Mapping[str, Sighting]]
+    last_s: Mapping[str, float]  # when each sender sent last
+
+
+OF_LINKS = ":links"  # ends the note of a stretch's links
+NOTHING = Stretch((), {}, {})
+_kept: deque[tuple[Scene, str]] = deque()  # scenes with a note of their stretch, the oldest first
+
+
+def stretch(scenario: Scenario, scene: Scene, interval_s: float) -> Stretch:
+    """Return what helpers send from the decision before to a scene, computed once.
+
+    `interval_s` is the time between two looks, s. At the first decision of a course it is what they
+    send from LEAD_S before on.
+    """
+    note = f"{NAME}:{interval_s:g}"
+    noted: Stretch | None = scene.notes.get(note)
+    if noted is not None:
+        return noted
+    before = scene.before()
+    earlier, since_s = NOTHING, scene.state.time_s - LEAD_S
+    if before is not None:
+        earlier, since_s = stretch(scenario, before, interval_s), before.state.time_s
+    new = scene.notes[note] = _new(scenario, scene, earlier, since_s, interval_s)
+    _kept.append((scene, note))
+    if len(_kept) > SCENES_KEPT:
+        oldest, oldest_note = _kept.popleft()
+        for name in (oldest_note, oldest_note + OF_LINKS):
+            oldest.notes.pop(name, None)
+    return new
+
+
+class CpmLinks(NamedTuple):
+    """Hold where vehicles are when n CPMs are sent."""
+
+    sites: Site  # of the ego and the sender alone, (n, ...)
+    xy_m: Floats  # places of the ego and all H helpers, m, (n, 1+H, 2)
+
+
+def links(scenario: Scenario, scene: Scene, interval_s: float) -> CpmLinks:
+    """Return the links to the ego of the CPMs of `stretch`, of which there are some."""
+    note = f"{NAME}:{interval_s:g}{OF_LINKS}"
+    noted: CpmLinks | None = scene.notes.get(note)
+    if noted is not None:
+        return noted
+    cpms, ego = stretch(scenario, scene, interval_s).cpms, scene.state.ego.id
+    radios = [ego, *(helper.id for helper in scene.state.helpers)]
+    points, places_m = [], []
+    states = moments(scene, [cpm.look.time_s for cpm in cpms])
+    for cpm, state in zip(cpms, states, strict=True):
+        points.append((state, (ego, cpm.sender)))
+        vehicles = [state.vehicle(name) for name in radios]
+        places_m.append([(v.x_m, v.y_m) for v in vehicles])
+    new = scene.notes[note] = CpmLinks(site(points), np.array(places_m))
+    return new
+
+
+def most_looks(scenario: Scenario, interval_s: float) -> int:
+    """Return an upper bound of a helper's looks in an episode, `interval_s` apart."""
+    return floor((LEAD_S + scenario.parameters.time_limit_s) / interval_s) + 2
+
+
+def _new(
+    scenario: Scenario, scene: Scene, earlier: Stretch, since_s: float, interval_s: float
+) -> Stretch:
+    looks = _looks(scene, since_s, interval_s)
+    states = moments(scene, [look.time_s for look in looks])
+    included = {sender: dict(objects) for sender, objects in earlier.included.items()}
+    last_s, cpms = dict(earlier.last_s), list[Cpm]()
+    for look, detections in zip(looks, _detections(scenario, looks, states), strict=True):
+        sightings = {d.id: _sighting(d, look.time_s) for d in detections}
+        before = included.get(look.sender, {})
+        names = due(sightings, before)
+        # Who is out of sight is new when it is seen again.
+        now = {name: before[name] for name in sightings if name in before}
+        now |= {name: sightings[name] for name in names}
+        included[look.sender] = now
+        if names or look.time_s - last_s.get(look.sender, -inf) >= LONGEST_S - ROUNDING_S:
+            last_s[look.sender] = look.time_s
+            cpms.append(Cpm(look, tuple(d for d in detections if d.id in names)))
+    return Stretch(tuple(cpms), included, last_s)
+
+
+def _looks(scene: Scene, since_s: float, interval_s: float) -> list[Look]:
+    """Return the helpers' looks after a time and up to a scene, by time."""
+    looks = []
+    for helper in scene.state.helpers:
+        begin_s = phase(scene.state.episode_seed, helper.id) * interval_s - LEAD_S
+        first = max(floor((since_s - begin_s) / interval_s + ROUNDING_S) + 1, 0)
+        last = floor((scene.state.time_s - begin_s) / interval_s + ROUNDING_S)
+        for number in range(first, last + 1):
+            looks.append(Look(helper.id, number, begin_s + number * interval_s))
+    return sorted(looks, key=lambda look: look.time_s)
+
+
+def _detections(
+    scenario: Scenario, looks: Sequence[Look], states: Sequence[WorldState]
+) -> list[list[Detection]]:
+    """Return what each helper's sensors report at its look, at which the world is in a state."""
+    views = []
+    for look, state in zip(looks, states, strict=True):
+        views.append((state, state.vehicle(look.sender)))
+    detections: list[list[Detection]] = [[] for _ in looks]
+    for begin in range(0, len(views), AT_ONCE):
+        some = views[begin : begin + AT_ONCE]
+        reported = reports(some, surfaces(some), scenario.parameters)
+        for (n, _), detection in reported.items():
+            detections[begin + n].append(detection)
+    return detections
+
+
+def _sighting(d: Detection, time_s: float) -> Sighting:
+    heading_rad = 0.0 if d.heading_rad is None else d.heading_rad
+    return Sighting(time_s, d.x_m, d.y_m, d.speed_mps, heading_rad, d.kind or "vehicle")
+
+
+@lru_cache(maxsize=4096)
+def phase(seed: int, sender: str) -> float:
+    """Return the share of an interval by which a helper's looks are late, 0 to 1.
+
+    It is drawn by the layout's `seed` and the helper's id, `sender`.
+    """
+    return float(noise.generator(NAME, seed, sender).random())

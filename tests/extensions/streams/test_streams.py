@@ -1,0 +1,280 @@
+"""What an ego has heard before it asks anybody: when it was seen, what became of it, and who pays.
+
+Scenes are frozen ones of a real dataset; where arithmetic is by hand, vehicles are put by hand.
+"""
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import run, spec_of
+from msgspec import structs
+
+from harness.coordination.named_points import named_point
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset, Earlier, Scene
+from harness.evaluate.dry_run import count
+from harness.extensions.streams import sending
+from harness.extensions.streams.cpm import KEPT_S, Cpms, aged
+from harness.extensions.streams.motion import moments
+from harness.radio.profiles import CHANNELS
+from harness.runs.folder import read
+from harness.world import lockstep, scenarios
+from harness.world.perception.sensors import Detection
+from harness.world.perception.shared import Heard, Report, merged
+from harness.world.scene_graph import AgedNode, SceneGraph
+from harness.world.world import World
+
+LOSSLESS = replace(CHANNELS["6g"], loss=0.0)
+AT_ONCE = Cpms(0.1, 0.0, LOSSLESS)
+
+
+def scenes_of(dataset: Dataset) -> list[Scene]:
+    return dataset.scenes(dataset.courses())
+
+
+def told(graph: SceneGraph) -> dict[str, float]:
+    """The age of each vehicle that is known by a message."""
+    return {n.id: n.age_s for n in graph.nodes if isinstance(n, AgedNode)}
+
+
+# -- where vehicles were between two decisions -----------------------------------------------------
+
+
+def test_a_motion_has_both_ends_and_even_motion_is_even(small: Dataset) -> None:
+    for scene in scenes_of(small):
+        before = scene.before()
+        ends = [scene.state.time_s]
+        if before:
+            ends.insert(0, before.state.time_s)
+        states = moments(scene, ends)
+        for state, end in zip(states, filter(None, (before, scene)), strict=True):
+            for v in state.vehicles:
+                there = end.state.vehicle(v.id)
+                assert (v.x_m, v.y_m) == pytest.approx((there.x_m, there.y_m), abs=1e-9)
+                assert v.speed_mps == pytest.approx(there.speed_mps, abs=1e-9)
+                assert math.cos(v.heading_rad - there.heading_rad) == pytest.approx(1)
+    first = scene_at_start(small)
+    [earlier] = moments(first, [first.state.time_s - 1.5])
+    for v, now in zip(earlier.vehicles, first.state.vehicles, strict=True):
+        assert math.hypot(v.x_m - now.x_m, v.y_m - now.y_m) == pytest.approx(1.5 * now.speed_mps)
+
+
+def scene_at_start(dataset: Dataset) -> Scene:
+    return next(scene for scene in scenes_of(dataset) if scene.before() is None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["occluded-intersection", "do-not-pass"])
+def test_a_motion_is_that_of_the_simulator_within_a_metre(name: str) -> None:
+    """At ten moments a second; half of all are exact to a centimetre."""
+    scenario, away_m = scenarios.get(name), list[float]()
+    p, drawn = scenario.parameters, random.Random(1)
+    for seed in range(4):
+        world = World.start(scenario, seed)
+        for step in range(3):
+            begin = world.state(0)
+            lockstep.advance([world], [p.due_frame(step) + p.lag_frames])
+            world.take(drawn.choice(scenario.actions), 0)
+            states = []
+            for frame in range(p.due_frame(step) + 10, p.due_frame(step + 1) + 1, 5):
+                lockstep.advance([world], [frame])
+                states.append(world.state(0))
+            if world.ended:
+                break
+            end = Scene(_record(states[-1]), before=Earlier(Scene(_record(begin))))
+            for there, state in zip(moments(end, [s.time_s for s in states]), states, strict=True):
+                for v in there.vehicles:
+                    true = state.vehicle(v.id)
+                    away_m.append(math.hypot(v.x_m - true.x_m, v.y_m - true.y_m))
+    assert len(away_m) > 300
+    assert max(away_m) < 1
+    assert np.median(away_m) < 0.01
+
+
+def _record(state: Any) -> Any:
+    class Record:  # of which motion reads the state alone
+        def __init__(self) -> None:
+            self.state = state
+
+    return Record()
+
+
+# -- what is held of what was sent -----------------------------------------------------------------
+
+
+def test_ages_are_those_of_the_looks_and_bounded(small: Dataset) -> None:
+    """A look every 0.1 s; an object is sent again within a second, and takes the delay."""
+    ages = list[float]()
+    for delay_s in (0.0, 0.3):
+        stream = Cpms(0.1, delay_s, LOSSLESS)
+        scenes = scenes_of(small)
+        heard = stream.heard(small.scenario, scenes)
+        graphs = stream.graphs(small.scenario, list(zip(scenes, heard, strict=True)))
+        here = [age for graph in graphs for age in told(graph).values()]
+        assert len(here) > 20
+        assert min(here) >= delay_s
+        assert max(here) <= KEPT_S
+        ages.append(float(np.mean(here)))
+    assert ages[1] - ages[0] == pytest.approx(0.3, abs=0.1)
+
+
+def test_what_was_heard_is_what_helpers_saw_carried_on(small: Dataset) -> None:
+    """By own arithmetic, for each node that is known by a message: the look, its place and speed."""
+    scenes, checked = scenes_of(small), 0
+    heard = AT_ONCE.heard(small.scenario, scenes)
+    exact = replace(small.scenario.parameters, perfect_knowledge=True)  # of senders' own poses
+    scenario = replace(small.scenario, parameters=exact)
+    graphs = AT_ONCE.graphs(scenario, list(zip(scenes, heard, strict=True)))
+    for scene, graph in zip(scenes, graphs, strict=True):
+        ego, objects = scene.state.ego, {}
+        for sent in AT_ONCE.received(small.scenario, scene):
+            age_s = round(scene.state.time_s - sent.look.time_s, 2)
+            objects |= {(f"v2v:{sent.sender}", d.id, age_s): d for d in sent.objects}
+        for node in graph.nodes:
+            if not isinstance(node, AgedNode) or node.sensors == (f"v2v:{node.id}",):
+                continue  # seen by the ego itself, or a sender that tells of itself
+            d = objects[node.sensors[0], node.id, node.age_s]
+            moved_m = 0.0 if d.heading_rad is None else node.age_s * d.speed_mps
+            dx = d.x_m + moved_m * math.cos(d.heading_rad or 0.0) - ego.x_m
+            dy = d.y_m + moved_m * math.sin(d.heading_rad or 0.0) - ego.y_m
+            c, s = math.cos(ego.heading_rad), math.sin(ego.heading_rad)
+            assert node.forward_m == pytest.approx(dx * c + dy * s, abs=0.13)
+            assert node.left_m == pytest.approx(dx * s - dy * c, abs=0.13)
+            checked += 1
+    assert checked > 20
+
+
+def test_an_error_grows_with_age() -> None:
+    """Of 3 m/s² variance of speed after 2 s: 3·4 and (2·4/2)² = 16 in place, (2·2)² = 16 in speed."""
+    seen = Detection("v4", ("lidar",), "car", "off", 10.0, 0.0, 0.0, 5.0, None)
+    then = aged(Report(seen, None, np.eye(2), 3.0), 2.0)
+    assert (then.detection.x_m, then.detection.y_m, then.detection.age_s) == (20.0, 0.0, 2.0)
+    assert then.place_m2 == pytest.approx(np.eye(2) * (1 + 12 + 16))
+    assert then.speed_m2ps2 == pytest.approx(3 + 16)
+    unknown = aged(Report(structs.replace(seen, heading_rad=None), None, np.eye(2), 3.0), 2.0)
+    assert unknown.detection.x_m == 10.0
+    assert unknown.place_m2 == pytest.approx(np.eye(2) * (1 + 12 + 16 + 100))
+
+
+def test_a_look_at_the_decision_tells_what_a_list_that_is_asked_for_does(
+    small: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Looks a second apart fall on decisions, and have all objects: the two differ by rounding."""
+    monkeypatch.setattr(sending, "phase", lambda seed, sender: 0.0)
+    stream, compared = Cpms(1.0, 0.0, LOSSLESS), 0
+    for scene in small.scenes(small.courses()):
+        scene = replace(scene, notes={})
+        own, *helpers = (scene.graphs[viewer] for viewer in scene.viewers)
+        [asked] = merged(small.scenario, [Heard(scene.state, own, helpers)])
+        [graph] = stream.graphs(small.scenario, [(scene, stream.heard(small.scenario, [scene])[0])])
+        nodes = {node.id: node for node in graph.nodes}
+        for node in asked.nodes:
+            there = nodes[node.id]
+            assert there.forward_m == pytest.approx(node.forward_m, abs=0.21)
+            assert there.left_m == pytest.approx(node.left_m, abs=0.21)
+            compared += isinstance(there, AgedNode) and there.age_s == 0.0
+        assert {s.sector: s.seen_share for s in graph.sectors} == {
+            s.sector: s.seen_share for s in asked.sectors
+        }
+    assert compared > 20
+
+
+def test_a_lost_or_late_stream_is_none(small: Dataset) -> None:
+    scenes = scenes_of(small)
+    for stream in (Cpms(0.1, 0.0, replace(LOSSLESS, loss=1.0)), Cpms(0.1, KEPT_S + 1, LOSSLESS)):
+        assert not any(stream.heard(small.scenario, scenes))
+    assert all(AT_ONCE.heard(small.scenario, scenes))
+
+
+def test_a_helper_tells_of_whom_the_ego_does_not_see(small: Dataset) -> None:
+    scenes = scenes_of(small)
+    heard = AT_ONCE.heard(small.scenario, scenes)
+    graphs = AT_ONCE.graphs(small.scenario, list(zip(scenes, heard, strict=True)))
+    more = 0
+    for scene, graph in zip(scenes, graphs, strict=True):
+        own = scene.graphs[scene.viewers[0]]
+        assert {node.id for node in own.nodes} <= {node.id for node in graph.nodes}
+        assert scene.viewers[0] not in {node.id for node in graph.nodes}
+        more += len(graph.nodes) - len(own.nodes)
+    assert more > len(scenes) / 2
+
+
+# -- runs ------------------------------------------------------------------------------------------
+
+
+def evaluated(dataset: Dataset, out: Path, texts: Sequence[str], seeds: Sequence[int]) -> Any:
+    points = tuple(map(named_point, texts))
+    return read(run(spec_of(dataset, points=points, seeds=seeds), out).out)
+
+
+def test_seeds_and_equal_streams_ask_no_more(small: Dataset, tmp_path: Path) -> None:
+    one = evaluated(small, tmp_path / "one", ["6g:stream=cpm,tau_nats=9"], (0,))
+    two = evaluated(small, tmp_path / "two", ["6g:stream=cpm,tau_nats=9"], (0, 1, 2))
+    both = ["6g:stream=cpm,tau_nats=9", "6g:stream=cpm,tau_nats=9,window_s=0.3"]
+    three = evaluated(small, tmp_path / "three", both, (0,))
+    keys = {answer.id for answer in one.answers}
+    assert any("!stream:cpm:0.1:" in key for key in keys)
+    assert {answer.id for answer in two.answers} == keys
+    assert {answer.id for answer in three.answers} == keys
+
+
+def test_a_lost_stream_leaves_every_decision_as_it_was(small: Dataset, tmp_path: Path) -> None:
+    lost = evaluated(small, tmp_path / "lost", ["6g:loss=1", "6g:loss=1,stream=cpm"], (0, 1))
+    plain, with_stream = (
+        [
+            (row.episode, row.seed, row.step, row.action, row.fused)
+            for row in lost.decisions.records(0, len(lost.decisions))
+            if ("stream" in row.condition) == has
+        ]
+        for has in (False, True)
+    )
+    assert plain == with_stream
+
+
+def test_a_dry_run_counts_what_a_stream_adds(small: Dataset) -> None:
+    points = tuple(map(named_point, ("single-local", "6g:stream=cpm,tau_nats=9")))
+    counted = count(spec_of(small, points=points), small, None)
+    without = count(spec_of(small, points=points[:1]), small, None)
+    [(name, more)] = counted["streamed"].items()
+    assert name == points[1].name
+    assert counted["requests_by_role"]["ego"] == without["requests_by_role"]["ego"] + more
+    assert "streamed" not in without
+
+
+def test_congestion_control_thins_the_radio_and_the_stream() -> None:
+    """At 600 vehicles a km reactive control lets each send every 200 ms (`radio congestion`)."""
+    crowded = named_point("its-g5:density_per_km=600,stream=cpm")
+    obeying = named_point("its-g5:density_per_km=600,stream=cpm,congestion=reactive")
+    assert isinstance(crowded.stream, Cpms)
+    assert isinstance(obeying.stream, Cpms)
+    assert (crowded.stream.interval_s, obeying.stream.interval_s) == (0.1, 0.2)
+    assert obeying.channel.rate_hz == 5  # type: ignore[attr-defined]
+    assert obeying.physical.busy_ratio() < crowded.physical.busy_ratio()
+    wrapped = named_point("its-g5:density_per_km=600,loss=0.2,congestion=reactive")
+    assert wrapped.channel.channel.rate_hz == 5  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("6g:stream=cam", "unknown stream 'cam'; did you mean 'cpm'?"),
+        ("6g:stream=cpm,stream_interval_s=0.05", "seconds from 0.1 to 1 (ETSI TS 103 324)"),
+        ("6g:stream=cpm,stream_interval_s=2", "seconds from 0.1 to 1 (ETSI TS 103 324)"),
+        ("6g:stream=cpm,content=objects", "it must be none where content is objects"),
+        ("6g:stream=cpm,messages=blind", "it must be none where the ego hears others"),
+        ("6g:congestion=adaptive", "channel 6g has no packets of other vehicles"),
+        ("its-g5:congestion=fast", "unknown congestion 'fast'; known: adaptive, none, reactive"),
+        ("single-local:stream=cpm", "has no channel, so stream changes nothing"),
+    ],
+)
+def test_what_cannot_be_sent_is_refused_in_one_line(text: str, message: str) -> None:
+    with pytest.raises(UserError) as error:
+        named_point(text)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
