@@ -11,6 +11,7 @@ from studied import trials
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.dataset.schema import End
+from harness.extensions.roads.reaction.stopping import could_stop
 from harness.extensions.roads.reaction.study import manifest_of, reaction
 
 pytestmark = pytest.mark.slow
@@ -57,9 +58,22 @@ def test_every_course_is_counted_in_both_worlds(made: Made) -> None:
         assert rows[slower][name] * of == pytest.approx(count)
     whole = rows["all"]
     assert (whole["courses"], whole["n"], found.scenes) == (250, 2, 1)
-    assert whole["struck_replay"] > whole["struck_react"] == 0
+    assert whole["struck_replay"] > whole["struck_react"] == whole["could_stop_react"] == 0
     [recorded] = found.drivers[found.drivers.driver == "recorded"].to_dict("records")
     assert (recorded["courses"], recorded["otherwise"], recorded["collisions_replay"]) == (2, 0, 0)
+
+
+def test_who_could_stop_shows_in_the_course_played_again(
+    made: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replay = made("without")
+    ends = {each: end_of(replay, 0, each) for each in product(replay.actions, repeat=3)}
+    course, end = next(item for item in ends.items() if item[1].striker == "other")
+    assert could_stop(replay.scenario, replay.seeds[0], course, end.partner or "")
+    with pytest.raises(UserError, match="unknown road user of layout 0 'v77'"):
+        could_stop(replay.scenario, replay.seeds[0], course, "v77")
+    monkeypatch.setattr("harness.extensions.roads.replay.HARDEST_MPS2", 1.0)
+    assert not could_stop(replay.scenario, replay.seeds[0], course, end.partner or "")
 
 
 @pytest.mark.parametrize(

@@ -17,20 +17,22 @@ from harness.core.statistics import rate_interval
 from harness.core.versions import versions
 from harness.dataset.load import Dataset
 from harness.extensions.roads.family import PREFIX
+from harness.extensions.roads.reaction.stopping import could_stop
+from harness.extensions.roads.replay import HARDEST_MPS2
 from harness.report.document import Table
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from harness.dataset.forest import Forest
     from harness.studies.study import Study
 
 REACT = "react"  # the parameter in which the two datasets differ
 CAREFUL = "SLOWER"
 WORLDS = ("replay", "react")  # columns of a table end so
 COUNTED = ("collisions", "struck", "other_crashes")  # of each world
-HEADS = ("crashes", "struck by another", "crashes of others")
+HEADS = ("crashes", "struck by another", "who could stop", "crashes of others")
+AVOIDABLE = "could_stop_react"  # column of strikes with reaction that braking avoids
 # columns with intervals, and what is counted for each
 RATES = {
     "otherwise": "otherwise",
@@ -51,6 +53,7 @@ class Ends:
     results: Texts  # such as `cleared`, (n,)
     collisions: Bools  # whether the ego collides, (n,)
     struck: Bools  # whether another's front makes that collision, (n,)
+    could_stop: Bools  # whether that other reacts, and could have stopped, (n,)
     other_crashes: Ints  # vehicles that crash without the ego on the way, (n,)
 
 
@@ -60,8 +63,9 @@ class Reaction:
 
     A row has `courses`, `n` layouts, the share `otherwise` of courses that have another result, and
     of each world (`_replay`, `_react`) the numbers of `collisions`, of those `struck` by another,
-    of `other_crashes`, and the share `struck_rate` of courses that are struck. Shares are from 0 to
-    1, with `_low` and `_high`.
+    of `other_crashes`, and the share `struck_rate` of courses that are struck. `could_stop_react`
+    is the number of those struck with reaction by another that could have stopped. Shares are from
+    0 to 1, with `_low` and `_high`.
     """
 
     courses: "pd.DataFrame"  # all courses, a row a number of SLOWER in them (`slower`), then `all`
@@ -121,7 +125,7 @@ def reaction(
     """
     import pandas as pd
 
-    worlds = [World(dataset.forest) for dataset in (without_reaction, with_reaction)]
+    worlds = [World(without_reaction), World(with_reaction)]
     actions, clusters = with_reaction.actions, with_reaction.clusters
     decisions = with_reaction.scenario.parameters.decisions
     sequences = np.indices((len(actions),) * decisions).reshape(decisions, -1).T
@@ -153,13 +157,14 @@ def reaction(
 class World:
     """Follow courses through the decision trees of a dataset, in which others react or replay."""
 
-    def __init__(self, forest: "Forest") -> None:
+    def __init__(self, dataset: Dataset) -> None:
         """Read how the edges of the trees end."""
-        ends = [edge.end for edge in forest.edges]
-        self.forest = forest
+        self.dataset, self.forest = dataset, dataset.forest
+        ends = [edge.end for edge in self.forest.edges]
         self.result = np.array([end.result if end else "" for end in ends])
         self.struck = np.array([end is not None and end.striker == "other" for end in ends])
-        self.crashes = np.array([edge.other_crashes for edge in forest.edges])
+        self.crashes = np.array([edge.other_crashes for edge in self.forest.edges])
+        self._could_stop: dict[int, bool] = {}  # by the index of an edge that ends in a strike
 
     def ends(self, first: Ints, chosen: Chosen) -> Ends:
         """Return how n courses end that begin at some decision points, (n,).
@@ -168,15 +173,33 @@ class World:
         """
         at, courses = first.copy(), np.arange(len(first))
         last, crashes, step = np.full(len(first), -1), np.zeros(len(first), dtype=np.int64), 0
+        taken: list[list[int]] = [[] for _ in courses]
         while courses.size:
             action = chosen(step, courses, at[courses])
+            for course, number in zip(courses.tolist(), action.tolist(), strict=True):
+                taken[course].append(number)
             edge = self.forest.edge[at[courses], action]
             last[courses] = edge
             crashes[courses] += self.crashes[edge]
             at[courses] = self.forest.child[at[courses], action]
             courses, step = np.flatnonzero(at >= 0), step + 1
-        results = self.result[last]
-        return Ends(results, results == "collision", self.struck[last], crashes)
+        results, could_stop = self.result[last], np.zeros(len(last), dtype=bool)
+        if self.dataset.manifest.parameters[REACT]:
+            for course in np.flatnonzero(self.struck[last]).tolist():
+                layout = int(self.forest.tree[first[course]])
+                could_stop[course] = self.could_stop(layout, taken[course], int(last[course]))
+        return Ends(results, results == "collision", self.struck[last], could_stop, crashes)
+
+    def could_stop(self, layout: int, taken: Sequence[int], edge: int) -> bool:
+        """Return whether who strikes the ego at the end of a layout's course could have stopped.
+
+        `taken` are the numbers of the course's actions, and `edge` is the index of its last edge.
+        """
+        if edge not in self._could_stop:
+            actions = [self.forest.actions[number] for number in taken]
+            seed, striker = int(self.forest.seeds[layout]), self.forest.end(edge).partner or ""
+            self._could_stop[edge] = could_stop(self.dataset.scenario, seed, actions, striker)
+        return self._could_stop[edge]
 
 
 def _of_sequences(world: World, layout: int, sequences: Ints) -> Ends:
@@ -205,6 +228,7 @@ def _tally(pair: Sequence[Ends], groups: Ints) -> dict[str, Ints]:
     for world, ends in zip(WORLDS, pair, strict=True):
         for name in COUNTED:
             counts[f"{name}_{world}"] = np.bincount(groups, getattr(ends, name))
+    counts[AVOIDABLE] = np.bincount(groups, react.could_stop)
     return {name: each.astype(np.int64) for name, each in counts.items()}
 
 
@@ -216,7 +240,7 @@ def _row(counts: Mapping[str, Ints], clusters: Ints | None) -> dict[str, Any]:
         row |= {name: rate.value, f"{name}_low": rate.low, f"{name}_high": rate.high}
     for name in COUNTED:
         row |= {f"{name}_{world}": int(counts[f"{name}_{world}"].sum()) for world in WORLDS}
-    return row
+    return row | {AVOIDABLE: int(counts[AVOIDABLE].sum())}
 
 
 def reaction_study(result: Reaction, manifest: Mapping[str, Any]) -> "Study":
@@ -231,9 +255,10 @@ def reaction_study(result: Reaction, manifest: Mapping[str, Any]) -> "Study":
         for row in rows.to_dict("records"):
             share = percent(row, "otherwise", "otherwise_low", "otherwise_high")
             counts = [f"{row[f'{name}_replay']} / {row[f'{name}_react']}" for name in COUNTED]
+            counts.insert(2, str(row[AVOIDABLE]))
             cells.append((row[head], str(row["courses"]), share, *counts, str(row["n"])))
         heads = (head, "courses", "otherwise %", *HEADS, "n")
-        return Table(title, heads, cells, terminal=(0, 1, 2, 3, 4), total=total)
+        return Table(title, heads, cells, terminal=(0, 1, 2, 3, 4, 5), total=total)
 
     whole = result.courses.to_dict("records")[-1]
     share = percent(whole, "otherwise", "otherwise_low", "otherwise_high")
@@ -247,6 +272,8 @@ def reaction_study(result: Reaction, manifest: Mapping[str, Any]) -> "Study":
             f"without reaction, {whole['struck_react']} of {whole['collisions_react']} with it; "
             f"crashes of others in all: {whole['other_crashes_replay']} and "
             f"{whole['other_crashes_react']}.",
+            f"With reaction {whole[AVOIDABLE]} of {whole['collisions_react']} crashes are of "
+            "another that could have stopped.",
         ],
         [
             "A course is a sequence of the ego's actions, one for each decision, and every course "
@@ -257,7 +284,9 @@ def reaction_study(result: Reaction, manifest: Mapping[str, Any]) -> "Study":
             "n is the number of layouts, and crashes are counted without reaction / with it; "
             f"95 % intervals are over the {over} that layouts are cut from. All is conditional on "
             "the moments of this recording, and on the model by which others react: they brake for "
-            "whoever is off the recording, by the Intelligent Driver Model.",
+            "whoever is off the recording, by the Intelligent Driver Model. Who strikes the ego "
+            f"could have stopped if braking by {HARDEST_MPS2:g} m/s² avoids that crash, from the "
+            "first frame on in which the ego stands in its way; the course is played again so.",
         ],
         [
             table("All courses, by how often the ego slows down", "slower", result.courses, True),
