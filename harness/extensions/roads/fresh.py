@@ -211,10 +211,11 @@ class FreshStage(Stage):
 
     def step(self, dt: float) -> None:
         play, ego = self.play, self.ego
-        before = play.poses.copy()
+        before, there = play.poses.copy(), play.there
         play.move(ego.commands)
         ego.step(dt)
-        self.show()
+        if not np.array_equal(there, play.there):
+            self.show()
         self._collide(before)
 
 

@@ -5,6 +5,7 @@ is mirrored: recordings have it to the north, and the harness to the south.
 """
 
 import logging
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -57,16 +58,22 @@ class Line(AbstractLane):  # type: ignore[misc]
         # at each point that between its two sides, so that headings change steadily
         inner = (turned[1:] + turned[:-1]) / 2
         self._headings = np.concatenate([turned[:1], inner, turned[-1:]])
+        # as plain numbers, which are read one at a time: where each side begins, and where it leads
+        self._arcs = self.arc_m.tolist()
+        self._sides = list(zip(points.tolist(), self._ways.tolist(), strict=False))
+        self._columns = points[:-1].T.copy(), self._ways.T.copy()
         self._least = np.concatenate([[-np.inf], np.zeros(len(steps) - 1)])
         self._most = np.concatenate([lengths[:-1], [np.inf]])
         # the place that was asked for last, and what it was: one is asked for several times a frame
         self._asked: tuple[tuple[float, float], tuple[float, float]] = (np.nan, np.nan), (0.0, 0.0)
 
     def position(self, longitudinal: float, lateral: float) -> Floats:
-        n = int(np.clip(self.arc_m.searchsorted(longitudinal) - 1, 0, len(self._ways) - 1))
-        x, y = self._ways[n]
-        along = longitudinal - self.arc_m[n]
-        return np.asarray(self.points[n] + along * self._ways[n] + lateral * np.array([-y, x]))
+        n = min(max(bisect_left(self._arcs, longitudinal) - 1, 0), len(self._sides) - 1)
+        (x, y), (east, south) = self._sides[n]
+        along = longitudinal - self._arcs[n]
+        return np.array(
+            [x + along * east - lateral * south, y + along * south + lateral * east], dtype=float
+        )
 
     def heading_at(self, longitudinal: float) -> float:
         return float(np.interp(longitudinal, self.arc_m, self._headings))
@@ -77,15 +84,19 @@ class Line(AbstractLane):  # type: ignore[misc]
     def local_coordinates(self, position: Floats) -> tuple[float, float]:
         place = float(position[0]), float(position[1])
         if self._asked[0] != place:
-            along, lateral = self.places(np.array([place]))
-            self._asked = place, (float(along[0]), float(lateral[0]))
+            (begin_x, begin_y), (east, south) = self._columns
+            x, y = place[0] - begin_x, place[1] - begin_y
+            along = np.minimum(np.maximum(x * east + y * south, self._least), self._most)
+            n = int(((x - along * east) ** 2 + (y - along * south) ** 2).argmin())
+            lateral = y[n] * east[n] - x[n] * south[n]
+            self._asked = place, (float(self.arc_m[n] + along[n]), float(lateral))
         return self._asked[1]
 
     def places(self, positions: Floats) -> tuple[Floats, Floats]:
         """Return how far along the lane and to its right n positions (n, 2) are, each (n,) m."""
         x, y = (positions[:, None] - self.points[:-1]).transpose(2, 0, 1)
         ways = self._ways.T
-        along = np.clip(x * ways[0] + y * ways[1], self._least, self._most)
+        along = np.minimum(np.maximum(x * ways[0] + y * ways[1], self._least), self._most)
         lateral = y * ways[0] - x * ways[1]
         away = (x - along * ways[0]) ** 2 + (y - along * ways[1]) ** 2
         rows, nearest = np.arange(len(positions)), away.argmin(axis=1)

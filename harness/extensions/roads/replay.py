@@ -195,6 +195,8 @@ class Cast:
         reach_m = self.reach_m[owners] + self.reach_m[whom] + SPACING_M
         apart = (places[:, 0] - there[:, 0]) ** 2 + (places[:, 1] - there[:, 1]) ** 2
         kept = np.flatnonzero((front > 0) & (apart < reach_m**2) & (owners != whom))
+        if not kept.size:
+            return kept, kept, np.empty(0), np.empty(0)
         kept = kept[np.lexsort((at[kept], whom[kept], owners[kept]))]
         at, whom, owners = at[kept], whom[kept], owners[kept]
         apart_m = separation_m(places[kept], self.sizes_m[owners], there[kept], self.sizes_m[whom])
@@ -492,9 +494,10 @@ def touching(poses: Floats, before: Floats, sizes_m: Floats, pairs: Ints) -> Boo
     steps_m = np.hypot(*moves[:, :2].T) + np.abs(moves[:, 2]) * np.hypot(*sizes_m.T) / 2
     # who is farther apart than both have moved cannot have touched
     may = np.flatnonzero((gaps_m >= 0) & (gaps_m <= steps_m[pairs].sum(axis=1)))
-    first, second = pairs[may].T
-    for share in np.linspace(0, 1, SWEEPS + 1)[1:-1].tolist():
-        at = before[:, :3] + share * moves
-        apart_m = separation_m(at[first], sizes[may], at[second], its_sizes[may])
-        touch[may] |= apart_m < 0
+    if may.size:
+        shares = np.linspace(0, 1, SWEEPS + 1)[1:-1, None, None]
+        at = (before[:, :3] + shares * moves)[:, pairs[may]].reshape(-1, 2, 3)
+        both = np.tile(may, SWEEPS - 1)
+        apart_m = separation_m(at[:, 0], sizes[both], at[:, 1], its_sizes[both])
+        touch[may] |= (apart_m.reshape(SWEEPS - 1, -1) < 0).any(axis=0)
     return touch

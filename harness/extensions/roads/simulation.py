@@ -212,16 +212,18 @@ def _driven(
 ) -> Iterator[tuple[str, Track]]:
     due = {round(command.time_s / STEP_S): command for command in commands}
     watch, to_left = _Watch(sumo), 0
-    for step in range(1, end + 1):
-        if ego in sumo.vehicle.getIDList():
-            if command := due.get(step - 1):
+    if begin > 1:
+        sumo.simulationStep((begin - 1) * STEP_S)
+    for step in range(max(begin, 1), end + 1):
+        command = due.get(step - 1)
+        if (command or to_left) and ego in sumo.vehicle.getIDList():
+            if command:
                 _aim(sumo.vehicle, ego, command.speed_mps)
                 to_left = command.to_left
             if to_left and _change(sumo, ego, to_left):
                 to_left = 0
         sumo.simulationStep()
-        if step >= begin:
-            watch.look(step * STEP_S)
+        watch.look(step * STEP_S)
     yield from watch.tracks()
 
 

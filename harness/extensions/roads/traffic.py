@@ -349,17 +349,17 @@ class Stage(Road):  # type: ignore[misc]
         `before` are the poses of the frame before. Those who touch in the recording, too, err.
         """
         play, cast, ego = self.play, self.play.cast, self.ego
-        off = np.flatnonzero(play.off() | (np.arange(len(play.there)) == 0))
-        present = np.flatnonzero(play.there)
-        apart_m = np.hypot(
-            *np.moveaxis(play.poses[off][:, None, :2] - play.poses[present][:, :2], -1, 0)
-        )
+        is_off = play.off()
+        is_off[0] = True
+        off, present = np.flatnonzero(is_off), np.flatnonzero(play.there)
+        x, y = play.poses[off, :2].T[..., None] - play.poses[present, :2].T[:, None]
         moved_m = np.hypot(*(play.poses - before)[:, :2].T)
-        reach_m = cast.reach_m + np.nan_to_num(moved_m)
-        near = apart_m < reach_m[off][:, None] + reach_m[present]
-        pairs = np.stack([off[near.nonzero()[0]], present[near.nonzero()[1]]], axis=-1)
-        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
-        pairs = pairs[~np.isnan(before[pairs[:, 1], 0])]
+        reach_m = cast.reach_m + np.fmax(moved_m, 0.0)
+        near = x * x + y * y < (reach_m[off][:, None] + reach_m[present]) ** 2
+        lines, columns = near.nonzero()
+        pairs = np.stack([off[lines], present[columns]], axis=-1)
+        once = (pairs[:, 0] < pairs[:, 1]) | ~is_off[pairs[:, 1]]
+        pairs = pairs[once & ~np.isnan(before[pairs[:, 1], 0])]
         if not len(pairs):
             return
         sizes_m = cast.sizes_m.copy()
