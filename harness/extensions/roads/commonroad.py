@@ -14,6 +14,7 @@ import numpy as np
 
 from harness.core.arrays import Floats
 from harness.core.errors import printable
+from harness.extensions.roads.scene import MOST_LANES, MOST_TRACKS, House, Lane, Scene, Track
 from harness.extensions.roads.sources import (
     distinct,
     elements,
@@ -27,7 +28,6 @@ from harness.extensions.roads.sources import (
     sum_up,
     tracks_of,
 )
-from harness.extensions.roads.tables import MOST_LANES, MOST_TRACKS, House, Lane, Scene, Track
 
 ROOT, VERSIONS = "commonRoad", ("2018b", "2020a")
 KINDS = {

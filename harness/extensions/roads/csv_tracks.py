@@ -20,6 +20,18 @@ import pyarrow.csv
 from harness.core.arrays import Floats, Ints
 from harness.core.config import toml
 from harness.core.errors import UserError, printable, unknown
+from harness.extensions.roads.scene import (
+    KINDS,
+    MOST_HOUSES,
+    MOST_LANES,
+    MOST_ROWS,
+    MOST_TRACKS,
+    House,
+    Lane,
+    Scene,
+    Track,
+    step_of,
+)
 from harness.extensions.roads.sources import (
     distinct,
     few_enough,
@@ -32,19 +44,7 @@ from harness.extensions.roads.sources import (
     tracks_of,
     unpacked,
 )
-from harness.extensions.roads.tables import (
-    KINDS,
-    MOST_HOUSES,
-    MOST_LANES,
-    MOST_ROWS,
-    MOST_TRACKS,
-    House,
-    Lane,
-    Scene,
-    Track,
-    runs_of,
-    step_of,
-)
+from harness.extensions.roads.tables import runs_of
 
 NEEDED = ("time_s", "id", "x_m", "y_m")
 FURTHER = ("kind", "heading_rad", "speed_mps", "length_m", "width_m", "scene")

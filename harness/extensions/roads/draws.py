@@ -12,8 +12,9 @@ from harness.core import noise
 from harness.core.errors import UserError
 from harness.extensions.roads.moments import Chooser
 from harness.extensions.roads.replay import AHEAD_S
+from harness.extensions.roads.scene import Scene
 from harness.extensions.roads.simulation import Inputs, map_of, run
-from harness.extensions.roads.tables import Moment, Scene
+from harness.extensions.roads.tables import Moment
 
 ATTEMPTS = 8
 MOST_SEED = 2**31 - 1  # of SUMO

@@ -14,7 +14,8 @@ from harness.extensions.roads.driver import NAME
 from harness.extensions.roads.family import in_memory
 from harness.extensions.roads.held import horizon_s
 from harness.extensions.roads.moments import NOT_REACHED, Choice, Chooser, Key, key_of
-from harness.extensions.roads.tables import FACTS, Moment, Recording, Scene
+from harness.extensions.roads.scene import Scene
+from harness.extensions.roads.tables import FACTS, Moment, Recording
 from harness.extensions.roads.world import scenario
 from harness.world.reference import drive
 

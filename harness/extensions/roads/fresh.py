@@ -18,9 +18,9 @@ from harness.extensions.environments.world import scenario as scenario_of_enviro
 from harness.extensions.roads import driver, simulation
 from harness.extensions.roads.draws import Drawn, drawn
 from harness.extensions.roads.replay import AHEAD_S, Cast, Puppet
+from harness.extensions.roads.scene import Track
 from harness.extensions.roads.simulation import STEP_S, Command, Inputs, run
 from harness.extensions.roads.sumo import inputs_named
-from harness.extensions.roads.tables import Track
 from harness.extensions.roads.traffic import (
     MOST_OTHERS,
     Ego,

@@ -10,8 +10,9 @@ import numpy as np
 from harness.core.errors import UserError, printable
 from harness.extensions.environments.place import AFTER
 from harness.extensions.roads.moments import conflicts_at
+from harness.extensions.roads.scene import EARLY_S, SLACK_M, Scene
 from harness.extensions.roads.sessions import Sessions, Traffic
-from harness.extensions.roads.tables import EARLY_S, FACTS, SLACK_M, Facts, Moment, Recording, Scene
+from harness.extensions.roads.tables import FACTS, Facts, Moment, Recording
 
 EVERY = 10  # rows of a track from one speed to the next that counts
 

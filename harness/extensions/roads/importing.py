@@ -18,7 +18,8 @@ from harness.core.progress import Progress
 if TYPE_CHECKING:
     from harness.extensions.roads.csv_tracks import Columns
     from harness.extensions.roads.held import Speeds
-    from harness.extensions.roads.tables import Moment, Recording, Scene
+    from harness.extensions.roads.scene import Scene
+    from harness.extensions.roads.tables import Moment, Recording
 
 MOST_FILES = 10_000
 MOST_LEFT_OUT = 0.1  # share of road users that are left out since they cannot be so
@@ -345,7 +346,7 @@ def _watched(scenes: Iterable["Scene"], taken: _Taken, progress: Progress) -> It
 
     Raises UserError, which says what the first lacks, if there is none such.
     """
-    from harness.extensions.roads.tables import checked
+    from harness.extensions.roads.scene import checked
 
     first_without: Scene | None = None
     for scene in scenes:
@@ -376,7 +377,7 @@ def without_few(scene: "Scene") -> "Scene":
     """
     import numpy as np
 
-    from harness.extensions.roads.tables import other_movement, overlaps
+    from harness.extensions.roads.scene import other_movement, overlaps
 
     tracks = dict(scene.tracks)
     for track in tracks.values():

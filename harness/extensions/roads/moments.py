@@ -22,8 +22,9 @@ from msgspec import structs
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.seeds import FIRST
+from harness.extensions.roads.scene import STILL_M, Scene, Track
 from harness.extensions.roads.sessions import APART, FEW, SHARED, Sessions, Traffic
-from harness.extensions.roads.tables import STILL_M, Moment, Scene, Track
+from harness.extensions.roads.tables import Moment
 from harness.world.conflict_measures import MOMENTS_HZ, SHORT_PET_S
 from harness.world.state import separation_m
 

@@ -17,8 +17,8 @@ from highway_env.road.lane import AbstractLane, LineType
 from highway_env.road.road import RoadNetwork
 
 from harness.core.arrays import Floats
-from harness.extensions.roads.tables import Lane as Recorded
-from harness.extensions.roads.tables import Scene
+from harness.extensions.roads.scene import Lane as Recorded
+from harness.extensions.roads.scene import Scene
 from harness.world.road import Lane
 
 # It warns in each frame of who is off the route, as vehicles on recorded maps often are.

@@ -15,7 +15,8 @@ from matplotlib.patches import Patch
 from harness.core.arrays import Floats
 from harness.core.errors import printable
 from harness.core.figures import amount
-from harness.extensions.roads.tables import Moment, Recording, Scene, Track
+from harness.extensions.roads.scene import Scene, Track
+from harness.extensions.roads.tables import Moment, Recording
 from harness.report.drawing.colours import COLOURS, INK, LIGHT, ROLES
 from harness.report.drawing.pictures import Format, save, styled
 from harness.world.state import rectangle

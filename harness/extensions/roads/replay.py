@@ -21,7 +21,7 @@ import shapely
 from highway_env.vehicle.kinematics import Vehicle
 
 from harness.core.arrays import Bools, Floats, Ints
-from harness.extensions.roads.tables import Track
+from harness.extensions.roads.scene import Track
 from harness.world.state import separation_m
 
 # Treiber and others 2000, table I

@@ -16,7 +16,7 @@ import numpy as np
 
 from harness.core.arrays import Floats, Ints
 from harness.core.seeds import FIRST, Purpose
-from harness.extensions.roads.tables import Scene, Track
+from harness.extensions.roads.scene import Scene, Track
 
 DEALT: Sequence[Purpose] = ("report", "report", "tune", "train")  # by the rest of a digest by 4
 FEW = 2  # sessions of a recording that are cut by time, so that each purpose has a part

@@ -22,9 +22,9 @@ from harness.core.errors import UserError, one_line, printable
 from harness.core.extras import need
 from harness.core.files import canonical_bytes, sha256_bytes
 from harness.extensions.roads import sumo_files
+from harness.extensions.roads.scene import Track
 from harness.extensions.roads.sources import elements, no_use
 from harness.extensions.roads.sumo_files import KINDS, Map, centres
-from harness.extensions.roads.tables import Track
 
 STEP_S = 0.1
 MOST_VEHICLES = 2000  # at one time

@@ -14,7 +14,7 @@ import numpy as np
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, one_line, printable
 from harness.core.files import MOST_TIMES, opened
-from harness.extensions.roads.tables import FASTEST_MPS, LONGEST_ID, STILL_M, Track
+from harness.extensions.roads.scene import FASTEST_MPS, LONGEST_ID, STILL_M, Track
 
 GZIP = b"\x1f\x8b"
 CHUNK = 1 << 18

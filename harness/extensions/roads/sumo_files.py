@@ -16,6 +16,17 @@ import numpy as np
 
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
+from harness.extensions.roads.scene import (
+    MOST_HOUSES,
+    MOST_LANES,
+    MOST_ROWS,
+    MOST_TRACKS,
+    House,
+    Lane,
+    Scene,
+    Track,
+    step_of,
+)
 from harness.extensions.roads.sources import (
     distinct,
     elements,
@@ -28,17 +39,6 @@ from harness.extensions.roads.sources import (
     stem_of,
     sum_up,
     tracks_of,
-)
-from harness.extensions.roads.tables import (
-    MOST_HOUSES,
-    MOST_LANES,
-    MOST_ROWS,
-    MOST_TRACKS,
-    House,
-    Lane,
-    Scene,
-    Track,
-    step_of,
 )
 
 NET, POSITIONS = "net", "fcd-export"

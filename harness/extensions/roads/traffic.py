@@ -24,7 +24,8 @@ from harness.core.seeds import FIRST
 from harness.extensions.environments.place import AFTER, LIMIT
 from harness.extensions.roads.network import MIRROR, Ground, ground
 from harness.extensions.roads.replay import AHEAD_S, Cast, Play, Puppet, touching
-from harness.extensions.roads.tables import House, Moment, Recording, Scene, Track
+from harness.extensions.roads.scene import House, Scene, Track
+from harness.extensions.roads.tables import Moment, Recording
 from harness.world.road import Lane, PathKey
 from harness.world.scenario import LAYOUTS_KEPT
 

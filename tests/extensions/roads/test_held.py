@@ -13,7 +13,8 @@ from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.extensions.roads import family, tables
 from harness.extensions.roads.by_digest import DIGITS
-from harness.extensions.roads.tables import Lane, Moment, Scene, Track
+from harness.extensions.roads.scene import Lane, Scene, Track
+from harness.extensions.roads.tables import Moment
 
 Edit = Callable[[dict[str, Any]], object]
 

@@ -18,7 +18,8 @@ from harness.core.progress import Progress
 from harness.extensions.roads import fitness, importing, moments, tables
 from harness.extensions.roads.csv_tracks import columns_of
 from harness.extensions.roads.importing import Sources, kind_of
-from harness.extensions.roads.tables import Lane, Moment, Scene, Track
+from harness.extensions.roads.scene import Lane, Scene, Track, checked
+from harness.extensions.roads.tables import Moment
 
 Said = tuple[int, str, str]
 FILES = {
@@ -179,13 +180,13 @@ def test_a_few_that_appear_where_others_are_are_left_out() -> None:
     whole = importing.without_few(doubled)
     assert len(whole.tracks) == 10
     assert whole.left_out == {"appears where another is": 1}
-    tables.checked(whole)
+    checked(whole)
     fast = replace(first, id="again", time_s=np.arange(2.0), poses=np.array([[9, 99, 0, 36.0]] * 2))
     whole = importing.without_few(replace(scene, tracks={**scene.tracks, "again": fast}))
     assert whole.left_out == {"states another speed or heading than it moves with": 1}
     crowd = importing.without_few(scene_of(10, 1))
     with pytest.raises(UserError, match="01 appears at 0 s where 00 is already"):
-        tables.checked(crowd)
+        checked(crowd)
 
 
 WRONG: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {

@@ -27,8 +27,8 @@ from harness.extensions.roads.moments import (
     Chooser,
     key_of,
 )
+from harness.extensions.roads.scene import House, Lane, Scene, Track, checked
 from harness.extensions.roads.sessions import Sessions, Traffic, dealt, part_of
-from harness.extensions.roads.tables import House, Lane, Scene, Track, checked
 
 HORIZON_S = 6.0
 EAST, NORTH = 0.0, np.pi / 2

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.extensions.roads import tables
-from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track
+from harness.extensions.roads.scene import KINDS, House, Lane, Scene, Track, checked
+from harness.extensions.roads.tables import Moment
 
 SHA = "0" * 64
 
@@ -96,7 +97,7 @@ def drawn(draw: Callable[..., Any]) -> Scene:
         poses = np.array(draw(st.lists(NUMBERS, min_size=4 * n, max_size=4 * n))).reshape(n, 4)
         poses[:, :2] = place * 100.0, poses[0, 1]
         poses[:, 2:] *= np.pi / 1e6, 1e-6
-        kind = draw(st.sampled_from(tables.KINDS))
+        kind = draw(st.sampled_from(KINDS))
         begin_s = draw(st.floats(-1e3, 1e3))
         tracks[key] = Track(key, kind, 4.0, 2.0, begin_s + np.arange(n) / 10, poses)
     lanes = {}
@@ -143,7 +144,7 @@ def moves(at_mps: float = 10.0, **columns: float) -> Track:
     ],
 )
 def test_what_sensors_err_by_is_taken(columns: dict[str, float]) -> None:
-    tables.checked(road(tracks={"a": moves(**columns)}))
+    checked(road(tracks={"a": moves(**columns)}))
 
 
 LINE = np.array([[0.0, 0.0], [9.0, 0.0]])
@@ -201,7 +202,7 @@ WRONG: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("words", WRONG)
 def test_a_scene_that_cannot_be_is_refused_in_one_line(words: str) -> None:
     with pytest.raises(UserError) as refusal:
-        tables.checked(road(**WRONG[words]))
+        checked(road(**WRONG[words]))
     assert words in str(refusal.value)
     assert "scene s of s.xml" in str(refusal.value)
     assert "\n" not in str(refusal.value)

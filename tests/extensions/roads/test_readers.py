@@ -11,8 +11,8 @@ import pytest
 import road_files as files
 
 from harness.core.errors import UserError
-from harness.extensions.roads import commonroad, csv_tracks, sources, sumo_files, tables
-from harness.extensions.roads.tables import Scene
+from harness.extensions.roads import commonroad, csv_tracks, sources, sumo_files
+from harness.extensions.roads.scene import Scene, checked
 
 
 def written(folder: Path, name: str, text: str) -> Path:
@@ -32,7 +32,7 @@ def lane(scene: Scene, key: str) -> tuple:
 
 def test_commonroad_of_2018(tmp_path: Path) -> None:
     [scene] = commonroad.scenes(written(tmp_path, "a.xml", files.COMMONROAD_2018B))
-    tables.checked(scene)
+    checked(scene)
     assert (scene.name, scene.file, scene.step_s, scene.lights) == (
         *("XXX_Hand-1_1_T-1", "a.xml", 0.5, False),
     )
@@ -51,7 +51,7 @@ def test_commonroad_of_2018(tmp_path: Path) -> None:
 
 def test_commonroad_of_2020(tmp_path: Path) -> None:
     [scene] = commonroad.scenes(written(tmp_path, "a.xml", files.COMMONROAD_2020A))
-    tables.checked(scene)
+    checked(scene)
     assert lane(scene, "1") == (4, 8.33, (), None, None)
     assert scene.lights
     bus, walker = scene.tracks["20"], scene.tracks["21"]
@@ -72,7 +72,7 @@ def test_sumo_gives_front_bumpers_and_degrees_of_a_compass(tmp_path: Path) -> No
     packed = tmp_path / "run1.fcd.xml.gz"
     packed.write_bytes(gzip.compress(files.FCD.encode()))
     [scene] = sumo_files.scenes(*paths, packed)
-    tables.checked(scene)
+    checked(scene)
     assert (scene.name, scene.file, scene.step_s, scene.lights) == (
         *("run1", "run1.fcd.xml.gz", 0.5, True),
     )
@@ -113,7 +113,7 @@ def test_a_table_is_read_by_its_declared_columns(tmp_path: Path) -> None:
     columns = csv_tracks.columns_of(MAPPED)
     columns = columns._replace(kinds={"2": "van"})
     [scene] = csv_tracks.scenes(path, columns=columns, lanes=lanes, houses=houses)
-    tables.checked(scene)
+    checked(scene)
     assert lane(scene, "1") == (3.5, 13.9, ("3",), "2", None)
     assert close(scene.lanes["2"].points, [0, 4], [50, 4])
     car, van = scene.tracks["a"], scene.tracks["c"]
@@ -237,7 +237,7 @@ BAD_SUMO = {
 def test_wrong_files_of_sumo_are_refused_in_one_line(words: str, tmp_path: Path) -> None:
     texts = {"net": files.NET, "fcd": files.FCD, "further": files.ROUTES} | BAD_SUMO[words]
     paths = [written(tmp_path, f"{name}.xml", text) for name, text in texts.items()]
-    refused(words, lambda: [tables.checked(scene) for scene in sumo_files.scenes(*paths)])
+    refused(words, lambda: [checked(scene) for scene in sumo_files.scenes(*paths)])
 
 
 BAD_COLUMNS = {

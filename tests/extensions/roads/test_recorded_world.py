@@ -24,7 +24,8 @@ from harness.extensions.roads.fitness import is_mastered
 from harness.extensions.roads.held import sessions_of
 from harness.extensions.roads.network import ground, streets
 from harness.extensions.roads.replay import HARDEST_MPS2, Cast, Play
-from harness.extensions.roads.tables import House, Lane, Moment, Scene, Track
+from harness.extensions.roads.scene import House, Lane, Scene, Track
+from harness.extensions.roads.tables import Moment
 from harness.extensions.roads.traffic import Recorded, box, frames_a_second, nth, setting
 from harness.extensions.roads.world import RecordedWorld
 from harness.world import scenarios

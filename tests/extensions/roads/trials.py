@@ -12,7 +12,7 @@ from harness.dataset.build import build
 from harness.extensions.roads import family, tables
 from harness.extensions.roads.fitness import choose_fit
 from harness.extensions.roads.held import horizon_s
-from harness.extensions.roads.tables import Lane, Scene, Track
+from harness.extensions.roads.scene import Lane, Scene, Track
 from harness.world import scenarios
 
 TIMES = np.arange(0.0, 16.01, 0.1)
