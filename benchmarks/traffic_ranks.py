@@ -31,10 +31,11 @@ from harness.core.statistics import Estimate, known_mean, mean_of, too_few
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, find, load
 from harness.dataset.suites import datasets
+from harness.extensions.roads import driver
 from harness.extensions.roads.family import PREFIX, recording_of
 from harness.runs.metric_names import BASELINE
 from harness.runs.success import Success, by_condition, mean_difference
-from harness.world.drivers import ALWAYS, OPEN_LOOP, PRIVILEGED, RECORDED, UNIFORM, open_loop
+from harness.world.drivers import ALWAYS, OPEN_LOOP, PRIVILEGED, UNIFORM, open_loop
 from harness.world.scenario import Scenario
 
 SMALLEST = "--only right-hand --layouts 2 --tune 2 --ours blind-merge-v2 --sumo parking-exit-v2"
@@ -49,7 +50,7 @@ ASKED = (
     Row("swarm-tiny-six-v2", "v10", "readout"),
 )
 BLIND = (*ALWAYS, OPEN_LOOP, UNIFORM, "always")  # how names begin of who looks at nothing
-UNRANKED = (PRIVILEGED, RECORDED)  # one sees everything, one has been there
+UNRANKED = (PRIVILEGED, driver.NAME)  # one sees everything, one has been there
 
 
 def main() -> None:

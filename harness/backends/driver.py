@@ -14,7 +14,6 @@ from harness.world.drivers import (
     DRIVERS,
     OPEN_LOOP,
     OPEN_LOOPS,
-    RECORDED,
     UNIFORM,
     choices,
     constant,
@@ -24,7 +23,7 @@ from harness.world.drivers import (
 from harness.world.precedence import RULES
 from harness.world.scenario import Scenario
 
-REFERENCES = (*DRIVERS, *RULES, UNIFORM, CONSTANT, OPEN_LOOP, RECORDED)
+REFERENCES = (*DRIVERS, *RULES, UNIFORM, CONSTANT, OPEN_LOOP)
 # What the choice of those that look at nothing follows from, by name
 CHOSEN = {CONSTANT: ("constants", CONSTANTS), OPEN_LOOP: ("open_loops", OPEN_LOOPS)}
 
@@ -33,10 +32,8 @@ def open(card: Card, **_: Any) -> "DriverBackend":
     """Return the backend of the driver that a model card names: a rule in place of a model.
 
     `card` is what a TOML file of `models/` says. Drivers are such as `cruise` and `brake`; other
-    options of engines are ignored. Raises UserError if there is none of that name.
+    options of engines are ignored. One that is not in `REFERENCES` is of worlds of its own.
     """
-    if card.name not in REFERENCES:
-        raise unknown("driver", card.name, REFERENCES)
     return DriverBackend(card.name)
 
 
@@ -57,11 +54,10 @@ class DriverBackend:
         scenario = requests[0].scenario
         if scenario is None:
             raise ValueError(f"request {requests[0].id} has no scenario; a driver needs its road")
-        if self.driver == RECORDED and RECORDED not in drivers_of(scenario):
-            raise UserError(
-                f"driver {RECORDED}: nobody was recorded in {printable(scenario.name)}; take a "
-                "dataset of a recording"
-            )
+        known_names = {*REFERENCES, *drivers_of(scenario)}
+        if self.driver not in known_names:
+            hint = "; or give a dataset whose worlds have it"
+            raise unknown(f"driver of {printable(scenario.name)}", self.driver, known_names, hint)
         if self.driver == UNIFORM:
             return [self._answer(request, request.actions) for request in requests]
         cases = [

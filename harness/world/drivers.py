@@ -4,8 +4,8 @@
 and `full-view` plans with everything in view. `right-hand` and `first-come` know what `local-view`
 knows, and keep a rule of the road with those who keep it, too (`precedence`).
 
-`recorded` is of worlds that replay a recording alone (`OwnWorld.drivers`), and reads no more than
-the ego's own place in what `local-view` knows.
+Worlds may have drivers of their own (`OwnWorld.drivers`), who read no more than what `local-view`
+knows.
 
 Three references look at nothing at all. `uniform` holds every action for equally likely. `constant`
 always takes the action that did best in a scenario's tune layouts: `constants.csv` has what each
@@ -31,7 +31,6 @@ ALWAYS = {"cruise": "IDLE", "brake": "SLOWER"}
 PRIVILEGED = "full-view"  # the only one that may read the truth
 LOOKING = ("local-view", PRIVILEGED, *RULES)  # decide by a scene graph
 UNIFORM, CONSTANT, OPEN_LOOP = "uniform", "constant", "open-loop"
-RECORDED = "recorded"  # who was recorded as the ego; only worlds that replay a recording have it
 BLIND = (*ALWAYS, UNIFORM, CONSTANT, OPEN_LOOP)  # look at nothing
 CONSTANTS = Path(__file__).with_name("constants.csv")
 OPEN_LOOPS = Path(__file__).with_name("open_loop.csv")

@@ -27,6 +27,7 @@ from tiers import some
 from harness.backends import cards
 from harness.backends.base import AnswerMode, Completion, Request
 from harness.backends.card import Card
+from harness.backends.driver import REFERENCES
 from harness.backends.openai import shapes
 from harness.backends.openai.faults import fault_in
 from harness.backends.registry import BUILT_IN, missing, open_backend
@@ -40,7 +41,6 @@ from harness.dataset.load import Dataset, find, load
 from harness.evaluate.requests import requests
 from harness.parsing.parse import parse
 from harness.runs import folder
-from harness.world.drivers import RECORDED
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "versions.json"
 ASKED = 3  # questions to each engine
@@ -48,11 +48,7 @@ TOLERANCE = 0.02  # of a probability: float32 is summed in another order on anot
 CARDS = {
     "proxy": ("proxy", ("json",)),
     "proxy-faulty": ("proxy", ("json",)),
-    **{  # `recorded` has answers only where somebody was recorded
-        name: ("driver", ("json",))
-        for name in cards.names()
-        if cards.load(name).engine == "driver" and name != RECORDED
-    },
+    **dict.fromkeys(REFERENCES, ("driver", ("json",))),
     "openai-example": ("openai", get_args(AnswerMode)),
     "systemone-example": ("systemone", ("decision",)),
     "decisions-example": ("decisions", ("decision",)),

@@ -17,6 +17,7 @@ from misbehaving import Asked, completion, read_out, serving
 from harness.backends import cards
 from harness.backends.answers_file import AnswersFile, Question
 from harness.backends.base import AnswerMode, Backend, Completion, Request
+from harness.backends.driver import REFERENCES
 from harness.backends.gguf_export import export
 from harness.backends.openai.constraint import broken
 from harness.backends.registry import (
@@ -32,7 +33,6 @@ from harness.backends.registry import (
 from harness.core.files import digest
 from harness.dataset.load import load
 from harness.evaluate.requests import requests
-from harness.world.drivers import RECORDED
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 
@@ -53,9 +53,9 @@ class Case:
 
 
 def model_free() -> list[str]:
-    """Return the models that are rules, but for the driver who was recorded, if somebody was."""
-    rules = [name for name in cards.names() if cards.load(name).engine in ("proxy", "driver")]
-    return [name for name in rules if name != RECORDED]
+    """Return the models that are rules, but for drivers that only worlds of their own have."""
+    proxies = [name for name in cards.names() if cards.load(name).engine == "proxy"]
+    return [*proxies, *REFERENCES]
 
 
 WITH_WEIGHTS = [engine for engine in BUILT_IN if capabilities(engine).has_weights]

@@ -307,7 +307,7 @@ def test_nobody_was_recorded_elsewhere() -> None:
     backend = driver_backend.DriverBackend("recorded")
     scenario = scenarios.get("blind-merge")
     request = Request("1", "ego", (), ("IDLE",), 100, scenario=scenario)
-    with pytest.raises(UserError, match=r"nobody was recorded in blind-merge"):
+    with pytest.raises(UserError, match=r"unknown driver of blind-merge 'recorded'.* a dataset"):
         backend.complete([request])
 
 
