@@ -139,9 +139,9 @@ def map_of(*paths: Path) -> Map:
     """Return the map of the one net among these files, with the buildings of the others."""
     nets = [path for path in paths if root_of(path) == NET]
     if len(nets) != 1:
-        raise UserError(
-            f"{len(nets)} files are nets of SUMO; give one, such as my.net.xml, with the others"
-        )
+        names = " and ".join(printable(net.name, 80) for net in nets[:2])
+        are = f"{names} are nets of SUMO" if nets else "no file is a net of SUMO"
+        raise UserError(f"{are}; give one, such as my.net.xml, with the others")
     houses: list[House] = []
     left_out: dict[str, int] = {}
     for path in paths:

@@ -349,8 +349,10 @@ def read(folder: Path) -> Recording:
         data = bytes_of(path, "record")
         text = data.decode()
     except (OSError, ValueError) as error:
+        lacks = isinstance(error, FileNotFoundError)
+        reason = f"it has no {FACTS}" if lacks else one_line(error)
         raise UserError(
-            f"{printable(folder)} is no recording: {one_line(error)}; make one: "
+            f"{printable(folder)} is no recording: {reason}; make one: "
             "`harness dataset import FILE --out FOLDER`"
         ) from None
     where = f"recording {printable(path)}"

@@ -215,7 +215,7 @@ WRONG: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "--licence `a\\n": (("hand-1.xml",), ("--licence", "a\nb")),
     "README.md: its first line names no columns": (("README.md",), ("--licence", "x")),
     "no file has the positions of SUMO's vehicles": (("my.net.xml",), ("--licence", "x")),
-    "0 files are nets of SUMO": (("my.fcd.xml",), ("--licence", "x")),
+    "no file is a net of SUMO": (("my.fcd.xml",), ("--licence", "x")),
     "tables of tracks need one map": (("tracks.csv", "--columns", COLUMNS), ("--licence", "x")),
     "no file has road users": (("lanes.csv",), ("--licence", "x")),
     "nobody moves or stands there; left out: lanelet that is named": (

@@ -253,7 +253,7 @@ def test_a_folder_with_other_tables_is_refused(tmp_path: Path) -> None:
     (tmp_path / "lanes.parquet").write_bytes((tmp_path / "buildings.parquet").read_bytes())
     with pytest.raises(UserError, match=r"lanes\.parquet: its digest is"):
         tables.read(tmp_path).scene("s")
-    with pytest.raises(UserError, match="is no recording"):
+    with pytest.raises(UserError, match=r"is no recording: it has no recording\.json"):
         tables.read(tmp_path / "nowhere")
 
 

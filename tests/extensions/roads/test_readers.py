@@ -212,7 +212,7 @@ def test_a_gzip_bomb_is_refused(tmp_path: Path) -> None:
 
 
 BAD_SUMO = {
-    "0 files are nets of SUMO": {"net": files.ROUTES},
+    "no file is a net of SUMO": {"net": files.ROUTES},
     "no file has the positions": {"fcd": files.NET},
     "two lanes have the id in_1": {"net": files.NET.replace('"in_2"', '"in_1"')},
     "could not convert string to float: 'x'": {"net": files.NET.replace("50,4.7,1", "x,4.7")},
