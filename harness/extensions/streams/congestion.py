@@ -18,8 +18,8 @@ ms, are in a simulator in Rust that cites the annex (its model `dcc/etsi/reactiv
 
 `settled` is where a channel comes to rest if all its stations obey. The adaptive rule has one such
 point. The reactive one may have none: where a state's interval makes the channel busier than the
-state's own bounds and the next state's makes it emptier, stations go back and forth between the two.
-That it can oscillate is known (Rostami, Cheng, Bansal, Sjöberg, Gruteser and Kenney, "Stability
+state's own bounds and the next state's makes it emptier, stations swing between the two. That it
+can oscillate is known (Rostami, Cheng, Bansal, Sjöberg, Gruteser and Kenney, "Stability
 Challenges and Enhancements for Vehicular Channel Congestion Control Approaches", 2016).
 
 Sidelinks have rules of their own (ETSI TS 103 574), which are not here: on `mode4` and `mode2`

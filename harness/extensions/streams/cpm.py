@@ -10,6 +10,7 @@ ask no more questions than one.
     errors    of the sender's sensors and of its own pose, which are a beacon's
 """
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,8 +23,10 @@ from msgspec import structs
 from harness.coordination.encodings import ENCODINGS, JSON
 from harness.core import noise
 from harness.core.arrays import Floats
+from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
 from harness.dataset.load import Scene
+from harness.extensions.streams.inclusion import LONGEST_S, SHORTEST_S
 from harness.extensions.streams.motion import moments
 from harness.extensions.streams.sending import (
     NAME,
@@ -49,6 +52,10 @@ from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph
 from harness.world.state import VehicleState, WorldState
 
+HEARD = re.compile(
+    rf"{NAME}:(?P<interval>[0-9]{{1,9}}(\.[0-9]{{1,9}})?):"
+    r"(?P<looks>[0-9]{1,6}(\.[0-9]{1,6})*)"
+)
 KEPT_S = 2.0  # age at which the ego drops a report: two of the longest intervals
 GROWS_MPS2 = 2.0  # standard deviation of the acceleration that a report does not tell, assumed
 NO_SEED = -1  # in place of the channel's seed, as beacons' links have it
@@ -149,7 +156,7 @@ class Cpms:
     def graphs(
         self, scenario: Scenario, heard: Sequence[tuple[Scene, Mapping[str, str]]]
     ) -> list[SceneGraph]:
-        of_scenes = [self._held(scenario, scene, texts) for scene, texts in heard]
+        of_scenes = [_held(scenario, scene, texts) for scene, texts in heard]
         of_senders = [each for of_scene in of_scenes for each in of_scene]
         states = _states(of_senders)
         views = []
@@ -163,23 +170,39 @@ class Cpms:
             cases.append(Told(scene.state, scene.graphs[scene.viewers[0]], senders, sectors))
         return with_reports(scenario, cases)
 
-    def _held(self, scenario: Scenario, scene: Scene, texts: Mapping[str, str]) -> list[Held]:
-        """Return what an ego holds of each sender, of which `texts` name the looks."""
-        of_senders: dict[str, list[Cpm]] = {}
+
+def _held(scenario: Scenario, scene: Scene, texts: Mapping[str, str]) -> list[Held]:
+    """Return what an ego holds of each sender, of which `texts` name the looks."""
+    held = []
+    for sender, text in texts.items():
+        interval_s, looks = heard_of(text)
+        cpms = []
         for at in _young(scene):
-            for cpm in stretch(scenario, at, self.interval_s).cpms:
-                of_senders.setdefault(cpm.sender, []).append(cpm)
-        held = []
-        for sender, text in texts.items():
-            looks = {int(number) for number in text.rpartition(":")[2].split(".")}
-            cpms = [cpm for cpm in of_senders.get(sender, ()) if cpm.look.number in looks]
-            cpms.sort(key=lambda cpm: cpm.look.number)
-            newest: dict[str, tuple[Cpm, Detection]] = {}
-            for cpm in cpms:
-                newest |= {d.id: (cpm, d) for d in cpm.objects}
-            if cpms:
-                held.append(Held(scene, cpms[-1], tuple(newest.values())))
-        return held
+            for cpm in stretch(scenario, at, interval_s).cpms:
+                if cpm.sender == sender and cpm.look.number in looks:
+                    cpms.append(cpm)
+        cpms.sort(key=lambda cpm: cpm.look.number)
+        newest: dict[str, tuple[Cpm, Detection]] = {}
+        for cpm in cpms:
+            newest |= {d.id: (cpm, d) for d in cpm.objects}
+        if cpms:
+            held.append(Held(scene, cpms[-1], tuple(newest.values())))
+    return held
+
+
+def heard_of(text: str) -> tuple[float, frozenset[int]]:
+    """Return the interval, s, and the looks that the key of an answer names.
+
+    Raises UserError if the text, which may be a stranger's, names none.
+    """
+    match = HEARD.fullmatch(text)
+    interval_s = float(match["interval"]) if match else 0.0
+    if not match or not SHORTEST_S <= interval_s <= LONGEST_S:
+        raise UserError(
+            f"answers.jsonl has an answer that heard {printable(text)!r}, which is no stream; "
+            "make the run again"
+        )
+    return interval_s, frozenset(map(int, match["looks"].split(".")))
 
 
 def _young(scene: Scene) -> Iterator[Scene]:

@@ -9,7 +9,7 @@ from harness.coordination.parts import PLAIN, Part, RunFacts, Text, wrong
 from harness.core.config import Seconds
 from harness.core.errors import unknown
 from harness.extensions.streams.congestion import NONE, RULES, Settled, settled
-from harness.extensions.streams.cpm import Cpms
+from harness.extensions.streams.cpm import Cpms, heard_of
 from harness.extensions.streams.inclusion import LONGEST_S, SHORTEST_S, interval_s
 from harness.extensions.streams.sending import NAME
 from harness.radio.channel import Channel, Physical
@@ -105,8 +105,7 @@ class Streams(Part, frozen=True, kw_only=True):
 
     @classmethod
     def unasked_of(cls, text: str) -> Cpms | None:
-        name, _, rest = text.partition(":")
-        return Cpms(float(rest.partition(":")[0])) if name == NAME else None
+        return Cpms(heard_of(text)[0]) if text.startswith(f"{NAME}:") else None
 
 
 def with_rate(channel: Channel, rate_hz: float) -> Channel:

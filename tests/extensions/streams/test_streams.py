@@ -19,6 +19,8 @@ from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Earlier, Scene
 from harness.evaluate.dry_run import count
+from harness.evaluate.requests import stream_sets
+from harness.evaluate.sharing import shared_graphs
 from harness.extensions.streams import sending
 from harness.extensions.streams.cpm import KEPT_S, Cpms, aged
 from harness.extensions.streams.motion import moments
@@ -278,3 +280,25 @@ def test_what_cannot_be_sent_is_refused_in_one_line(text: str, message: str) -> 
         named_point(text)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["cpm:", "cpm:0.1:", "cpm:x:1", "cpm:1e-9:1", "cpm:0.00001:1", "cpm:9:1", "cpm:0.1:1..2"],
+)
+def test_a_key_that_is_no_stream_is_refused_in_one_line(small: Dataset, text: str) -> None:
+    """As a stranger's file may have it: an interval could make a program look for ever."""
+    scene = scenes_of(small)[0]
+    with pytest.raises(UserError, match=r"which is no stream; make the run again$"):
+        shared_graphs(small.scenario, [(scene, [f"{scene.viewers[1]}!stream:{text}"])], {})
+
+
+def test_streams_of_two_intervals_are_each_shown_by_its_own(small: Dataset) -> None:
+    """A dry run has the questions of several conditions at once."""
+    scenes, sets = scenes_of(small)[:6], []
+    for interval_s in (0.1, 0.5):
+        sets += stream_sets(small.scenario, scenes, Cpms(interval_s, 0.0, LOSSLESS))
+    together = shared_graphs(small.scenario, sets, {})
+    alone = [shared_graphs(small.scenario, [each], {})[0] for each in sets]
+    assert together == alone
+    assert alone[:6] != alone[6:]
