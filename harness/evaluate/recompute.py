@@ -230,7 +230,7 @@ def _lacking(run: Run, ours: Run) -> Iterator[str]:
     """
     if current(run):
         return
-    table, here = run.decisions.table, ours.decisions.table
+    table, here = run.decisions.rows, ours.decisions.rows
     names = [
         *(
             name
@@ -396,7 +396,7 @@ def _of_decisions(run: Run, ours: Run) -> Iterator[str]:
             f"{len(ours.decisions)}"
         )
         return
-    table, here = run.decisions.table, ours.decisions.table
+    table, here = run.decisions.rows, ours.decisions.rows
     for name in (name for name in here.column_names if name in table.column_names):
         if table[name].equals(here[name]) or (_null(table, name) and not current(run)):
             continue

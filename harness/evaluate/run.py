@@ -6,7 +6,7 @@ import math
 import os
 import shlex
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from functools import partial
 from itertools import chain
@@ -53,7 +53,7 @@ from harness.evaluate.lifecycle import (
 )
 from harness.evaluate.sources import sources
 from harness.evaluate.spec import Spec
-from harness.evaluate.table import of_all_seeds, table
+from harness.evaluate.table import of_all_seeds, packed, table
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import walk
 from harness.runs import answer_counts, answer_times, folder, run_parts, stopping, writer
@@ -260,6 +260,8 @@ def _walk(
     at_once = len(spec.seeds)
     if isinstance(spec.source, FrozenSource):
         at_once = max(1, WALKS_AT_ONCE // (len(chunk) * len(spec.points)))
+    walks = len(spec.seeds) * len(spec.points)
+    layouts = _split(sorted(chunk), max(1, WALKS_AT_ONCE // walks))
     answers: Mapping[str, Answer] = {}
     tables, episodes, viewers = list[Decisions](), list[Episode](), dict[str, Sequence[str]]()
     served = list[Served]()
@@ -271,10 +273,11 @@ def _walk(
         answers, more = asker.asked_answers(), world.columns()
         if spec.timer:
             more = {**more, **spec.timer.columns(asker.latency, decided, answers)}
-        tables.append(table(decided, more, spec.actions).rounded())
+        rows = table(decided, more, spec.actions).rounded()
+        tables.append(rows if at_once >= len(spec.seeds) else packed(rows, layouts))
         episodes += world.episodes()
     files = run_parts.part_files(
-        of_all_seeds(tables, spec.points), episodes, answers.values(), viewers
+        of_all_seeds(tables, spec.points, layouts), episodes, answers.values(), viewers
     )
     return {**files, servers.FILE: servers.lines(served)} if served else files
 
@@ -628,28 +631,30 @@ def _gather(
     works = [place, *(shard / WORK for shard in folders)]
     names = tuple(condition["name"] for condition in settings["conditions"])
 
-    def scored(chunk: Sequence[int], part: Path) -> tuple[list[Episode], Figures]:
-        decisions, ended, answers = run_parts.read_part(part, settings["actions"])
-        grid = Grid(names, tuple(settings["seeds"]), tuple(chunk))
-        episodes = counted(grid, decisions, ended)
-        return episodes, Figures.of(settings["world"]["kind"], grid, decisions, episodes, answers)
+    seeds = tuple(settings["seeds"])
+    by_piece: list[list[Episode]] = []
+
+    def scored() -> Iterator[Figures]:
+        """Yield the figures of some layouts: the decisions of all would not fit into memory."""
+        for chunk, part in zip(chunks, parts, strict=True):
+            for piece in run_parts.read_part(part, chunk, settings["actions"]):
+                grid = Grid(names, seeds, tuple(piece.layouts))
+                by_piece.append(counted(grid, piece.decisions, piece.episodes))
+                yield Figures.of(
+                    settings["world"]["kind"], grid, piece.decisions, by_piece[-1], piece.answers
+                )
 
     with uncollected():
-        # One part after the other: the decisions of all would not fit into memory.
-        by_part: list[list[Episode]] = []
-        figures: list[Figures] = []
-        for chunk, part in zip(chunks, parts, strict=True):
-            episodes_here, figures_here = scored(chunk, part)
-            by_part.append(episodes_here)
-            figures.append(figures_here)
-        whole = Figures.joined(figures)
+        whole = Figures.joined(Grid(names, seeds, tuple(chain.from_iterable(chunks))), scored())
         answers = [answer for answer, _ in whole.answers]
         _settle(parts, answers)
         summary = whole.scores()
         episodes: list[Episode] = []
-        for cell in range(len(names) * len(settings["seeds"])):
-            for chunk, of_part in zip(chunks, by_part, strict=True):
-                episodes += of_part[cell * len(chunk) : (cell + 1) * len(chunk)]
+        n_cells = len(names) * len(seeds)
+        for cell in range(n_cells):
+            for of_piece in by_piece:
+                layouts_here = len(of_piece) // n_cells
+                episodes += of_piece[cell * layouts_here : (cell + 1) * layouts_here]
         if rule := stopping.rule_of(settings["world"].get(LOOKS)):
             summary = [*summary, *rule.scores(whole.grid, episodes)]
         if layouts:

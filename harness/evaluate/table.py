@@ -1,7 +1,8 @@
 """Tabulate decisions: one row for each decision point, condition and seed."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -136,17 +137,49 @@ def table(
     return Decisions.of({**values, **labels}, actions, helpers).take(order)
 
 
-def of_all_seeds(tables: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
+def packed(decisions: Decisions, layouts: Sequence[Sequence[int]]) -> Decisions:
+    """Return decisions that are sorted by episode, packed, in groups that can be read apart.
+
+    `layouts` are the numbers of each group's episodes, ascending.
+    """
+    groups = (decisions.take(rows) for rows in _rows(decisions, layouts))
+    return Decisions.packed(groups, [decisions], least=1)
+
+
+def of_all_seeds(
+    tables: Sequence[Decisions],
+    points: Sequence[OperatingPoint],
+    layouts: Sequence[Sequence[int]],
+) -> Decisions:
     """Return one table of several, which have the same episodes under different channel seeds.
 
     Rows are sorted by episode, step, decision point, condition and seed; `points` are the
     conditions, in the order of the rows. A condition is a named set of settings of the radio, of
-    asking helpers and of fusing their messages.
+    asking helpers and of fusing their messages. Several tables come `packed`, and so does the
+    result: the episodes of each of `layouts` are in memory together.
     """
     if len(tables) == 1:
         return tables[0]
-    whole = Decisions.concat(tables)
-    ids = sorted(set().union(*(part.scenes for part in tables)))
+    rows_by_table = [_rows(table, layouts) for table in tables]
+
+    def merged() -> Iterator[Decisions]:
+        for rows_of_group in zip(*rows_by_table, strict=True):
+            pairs = zip(tables, rows_of_group, strict=True)
+            yield _merged([table.take(rows) for table, rows in pairs], points)
+
+    return Decisions.packed(merged(), tables)
+
+
+def _rows(decisions: Decisions, layouts: Sequence[Sequence[int]]) -> list[range]:
+    """Return which rows are of each group of episodes."""
+    firsts = [numbers[0] for numbers in layouts[1:]]
+    ends = np.searchsorted(decisions.whole("episode"), firsts).tolist()
+    return [range(*pair) for pair in pairwise([0, *ends, len(decisions)])]
+
+
+def _merged(parts: Sequence[Decisions], points: Sequence[OperatingPoint]) -> Decisions:
+    whole = Decisions.concat(parts)
+    ids = sorted(set().union(*(part.scenes for part in parts)))
     condition = whole.codes("condition", [point.name for point in points])
     order = np.lexsort(
         (condition, whole.codes("scene", ids), whole.whole("step"), whole.whole("episode"))

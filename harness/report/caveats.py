@@ -317,12 +317,16 @@ def unheard(run: Run) -> Iterator[str]:
     count. A condition is a named set of settings of the radio, of asking helpers and of fusing
     their messages.
     """
-    d = run.decisions
-    delivered, on_time = d.of_messages("delivered") == 1.0, d.of_messages("on_time") == 1.0
-    conditions = d.codes("condition", run.conditions)
-    for place, name in enumerate(run.conditions):
-        arrived = int(delivered[conditions == place].sum())
-        if arrived and not on_time[conditions == place].any():
+    n_arrived, n_on_time = Counter[str](), Counter[str]()
+    for d in run.decisions.pieces():
+        delivered, on_time = d.of_messages("delivered") == 1.0, d.of_messages("on_time") == 1.0
+        conditions = d.codes("condition", run.conditions)
+        for place, name in enumerate(run.conditions):
+            n_arrived[name] += int(delivered[conditions == place].sum())
+            n_on_time[name] += int(on_time[conditions == place].sum())
+    for name in run.conditions:
+        arrived = n_arrived[name]
+        if arrived and not n_on_time[name]:
             yield (
                 f"Under {printable(name)}, nobody is heard: of {arrived} messages that arrived, "
                 "none came within the decision window, so that the ego decided alone."

@@ -3,6 +3,8 @@
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 from harness.core.files import bytes_of
 from harness.report import words
 from harness.report.library import on_dark_too, picture
@@ -66,14 +68,17 @@ def probabilities(runs: Runs) -> list[dict[str, Any]]:
     lines = []
     for name, run in zip(runs.names, runs.runs, strict=True):
         flips = run.score("all", "flip_rate_ego")
-        judged = run.decisions.of_actions("safe").max(axis=-1) == 1.0
-        places = run.decisions.codes("condition", run.conditions)
+        n_judged = np.zeros(len(run.conditions), dtype=int)
+        for d in run.decisions.pieces():
+            judged = d.of_actions("safe").max(axis=-1) == 1.0
+            places = d.codes("condition", run.conditions)
+            n_judged += np.bincount(places[judged], minlength=len(n_judged))
         one_optimal = judged_of(run.grid, run.decisions, run.grid.places(run.decisions))
         for place, condition in enumerate(run.conditions):
             scores = [run.score(condition, metric) for metric in HONEST]
             if not any(scores):
                 continue
-            of_judged = {"n": int(judged[places == place].sum()), "scores": [*scores, flips]}
+            of_judged = {"n": int(n_judged[place]), "scores": [*scores, flips]}
             scores_of_one = [run.score(condition, metric) for metric in SURE]
             of_one_optimal = {"n": len(one_optimal[place].sure), "scores": scores_of_one}
             groups = [of_judged, of_one_optimal]

@@ -190,11 +190,12 @@ def _places(runs: Sequence[Run]) -> dict[str, tuple[int | str | None, ...]]:
     """
     places: dict[str, tuple[int, int, str | None, str | None]] = {}
     for run in reversed(runs):
-        episode, step = run.decisions.whole("episode"), run.decisions.whole("step")
-        danger, agent = run.decisions.labels("danger"), run.decisions.labels("agent")
-        for scene, rows in run.decisions.scenes.items():
-            row = rows.start
-            places[scene] = int(episode[row]), int(step[row]), danger[row], agent[row]
+        scenes = run.decisions.scenes
+        columns = run.decisions.selected(["episode", "step", "danger", "agent"])
+        firsts = columns.take([rows.start for rows in scenes.values()])
+        for row, scene in enumerate(scenes):
+            of_scene = firsts.row(row)
+            places[scene] = tuple(of_scene.values())
 
     def order(scene: str) -> tuple[int, int, str, str]:
         number, step, _, agent = places[scene]

@@ -29,6 +29,7 @@ Table = list[dict[str, Any]]
 ENTROPY_NATS, TOKENS, ARRIVAL_MS = 0.1, 25, 10.0  # widths of bins
 Part = Literal["overview", "probabilities", "answers", "communication"]
 ENTROPY = "entropy of the ego's own intent, nats"
+REPLIES = ("on time", "late", "lost")
 BUDGET = (200, 400)  # tokens of a prompt: the paper's
 
 
@@ -370,17 +371,16 @@ def replies(run: Run) -> Table:
     its `count`, its `share` of the condition's `n` replies, and `n`. A condition is a named set of
     settings of the radio, of asking helpers and of fusing their messages.
     """
-    d = run.decisions
-    delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
-    by_reply = {
-        "on time": on_time == 1.0,
-        "late": (delivered == 1.0) & (on_time == 0.0),
-        "lost": delivered == 0.0,
-    }
-    conditions = d.codes("condition", run.conditions)
+    counts = {condition: dict.fromkeys(REPLIES, 0) for condition in run.conditions}
+    for d in run.decisions.pieces():
+        delivered, on_time = d.of_messages("delivered"), d.of_messages("on_time")
+        conditions = d.codes("condition", run.conditions)
+        masks = on_time == 1.0, (delivered == 1.0) & (on_time == 0.0), delivered == 0.0
+        for reply, which in zip(REPLIES, masks, strict=True):
+            for place, condition in enumerate(run.conditions):
+                counts[condition][reply] += int(which[conditions == place].sum())
     rows = []
-    for place, condition in enumerate(run.conditions):
-        count = {reply: int(which[conditions == place].sum()) for reply, which in by_reply.items()}
+    for condition, count in counts.items():
         total = sum(count.values())
         rows += [
             {"condition": condition, "reply": reply, "count": n, "share": n / total, "n": total}
@@ -397,15 +397,15 @@ def arrivals(run: Run) -> Table:
     `share` of those that arrived. Lost ones are not in it. A condition is a named set of settings
     of the radio, of asking helpers and of fusing their messages.
     """
-    d = run.decisions
-    arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
+    bins_by_condition = {condition: Counter[int]() for condition in run.conditions}
+    for d in run.decisions.pieces():
+        arrival_ms, conditions = d.of_messages("arrival_ms"), d.codes("condition", run.conditions)
+        for place, bins in enumerate(bins_by_condition.values()):
+            of_condition = arrival_ms[conditions == place]
+            bins.update(_binned(of_condition[~np.isnan(of_condition)], ARRIVAL_MS))
     rows = []
-    for place, condition in enumerate(run.conditions):
-        of_condition = arrival_ms[conditions == place]
-        arrived = of_condition[~np.isnan(of_condition)]
-        if len(arrived):
-            bars = _histogram(arrived, ARRIVAL_MS, "arrival_ms")
-            rows += [{"condition": condition, **bar} for bar in bars]
+    for condition, bins in bins_by_condition.items():
+        rows += [{"condition": condition, **bar} for bar in _bars(bins, ARRIVAL_MS, "arrival_ms")]
     return rows
 
 
@@ -413,11 +413,20 @@ def _histogram(values: Sequence[float] | Floats, width: float, name: str) -> Tab
     """Return bars of one width with their lower end,
     from the first that is not empty to the last.
     """
+    return _bars(_binned(np.asarray(values, dtype=float), width), width, name)
+
+
+def _binned(values: Floats, width: float) -> Counter[int]:
+    """Return how many values are in each bin, by its number."""
     # A value on a bin's edge belongs to the bin above it, whatever rounding makes of the quotient.
-    bins = np.floor(np.asarray(values, dtype=float) / width + 1e-9).astype(int)
-    first = int(bins.min())
-    count = np.bincount(bins - first)
+    bins, counts = np.unique(np.floor(values / width + 1e-9).astype(int), return_counts=True)
+    return Counter(dict(zip(bins.tolist(), counts.tolist(), strict=True)))
+
+
+def _bars(bins: Counter[int], width: float, name: str) -> Table:
+    total = bins.total()
+    places = range(min(bins), max(bins) + 1) if bins else ()
     return [
-        {name: round((first + n) * width, 6), "count": int(c), "share": float(c / len(bins))}
-        for n, c in enumerate(count)
+        {name: round(place * width, 6), "count": bins[place], "share": bins[place] / total}
+        for place in places
     ]

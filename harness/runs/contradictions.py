@@ -335,8 +335,10 @@ def _ends(run: Run) -> Sequence[bool | None]:
     places, steps = run.grid.places(decisions), decisions.whole("step")
     order = np.lexsort((steps, places))
     last = order[np.flatnonzero(np.diff(places[order], append=-1))]
-    actions = decisions.codes("action", run.actions)[last]
-    possible = decisions.of_actions("safe")[last, actions]
+    columns = ["action", *(f"safe_{action}" for action in run.actions)]
+    at_end = decisions.selected(columns).take(last)
+    safe = at_end.of_actions("safe")
+    possible = safe[np.arange(len(safe)), at_end.codes("action", run.actions)]
     for place, of_last in zip(places[last].tolist(), possible.tolist(), strict=True):
         ends[place] = None if math.isnan(of_last) else of_last == 1.0
     return ends

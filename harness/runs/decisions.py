@@ -4,11 +4,11 @@ one row for each decision point, condition and seed.
 
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from io import BytesIO
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.files import opened, replacing
 from harness.runs import formats
+from harness.runs.packed import Packed, of_buffer
 from harness.runs.records import Decision, Message
 from harness.runs.timers import added_columns
 
@@ -120,6 +121,7 @@ DECIMALS_ADDED = 6
 CELL, SLACK = 256, 1 << 26
 ROWS = 2048  # how many rows become mappings at a time
 ROW_GROUP = 1 << 18  # least rows of a group in the file but the last: about 0.1 GB in memory
+KEPT = 1 << 26  # most bytes of columns that are kept as arrays
 
 
 def schema(actions: Sequence[str], helpers: int) -> pa.Schema:
@@ -175,11 +177,12 @@ class Decisions:
     settings of the radio, of asking helpers and of fusing their messages under which it is decided,
     and the seed is that of the channel's random numbers. `actions` are the names of the A
     meta-actions, in the order of every distribution, and `helpers` is the greatest number of
-    messages in a decision. Columns of `table` are read by name as arrays (n,), or (n, A), which
-    `_arrays` keeps, and its rows as dicts, of which `_rows` keeps some.
+    messages in a decision. Columns of `rows` are read by name as arrays (n,), or (n, A), of which
+    `_arrays` keeps some, and its rows as dicts, of which `_rows` keeps some. More than `ROW_GROUP`
+    rows of a file stay packed, and `pieces` reads them some at a time.
     """
 
-    table: pa.Table  # its columns, (n,) each, are those of `schema`
+    rows: pa.Table | Packed  # its columns, (n,) each, are those of `schema`
     # names of the meta-actions, in the order of every distribution over them
     actions: tuple[str, ...]
     helpers: int  # the greatest number of messages in a decision: of columns such as `helper_1`
@@ -216,17 +219,40 @@ class Decisions:
         )
 
     def __len__(self) -> int:
-        return len(self.table)
+        return len(self.rows)
+
+    @property
+    def table(self) -> pa.Table:
+        """Return all rows in memory, (n,) a column."""
+        return self.rows.whole() if isinstance(self.rows, Packed) else self.rows
+
+    def pieces(self) -> "Iterator[Decisions]":
+        """Yield the decisions some at a time, in order, since columns of all may be large."""
+        if isinstance(self.rows, Packed):
+            for piece in self.rows.pieces():
+                yield Decisions(piece, self.actions, self.helpers)
+        else:
+            yield self
 
     def __getitem__(self, name: str) -> Floats:
         """Return a column of numbers or flags (n,) as floats; NaN where unknown."""
+        return self._kept(name, lambda: _values(self.rows[name].cast(NUMBER), np.nan, np.float64))
+
+    def _kept(self, name: str, values: Callable[[], Floats]) -> Floats:
+        """Return an array by its name, which is read if it is not kept. Nobody can change it:
+        a package's metric is given the same as all others.
+        """
         if name not in self._arrays:
-            self._arrays[name] = _kept(_values(self.table[name].cast(NUMBER), np.nan, np.float64))
+            array = values()
+            array.setflags(write=False)
+            if array.nbytes + sum(each.nbytes for each in self._arrays.values()) > KEPT:
+                self._arrays.clear()
+            self._arrays[name] = array
         return self._arrays[name]
 
     def whole(self, name: str) -> Ints:
         """Return a column of whole numbers of the table of decisions, by its name, (n,)."""
-        return cast(Ints, _values(self.table[name], 0, np.int64))
+        return cast(Ints, _values(self.rows[name], 0, np.int64))
 
     def flags(self, name: str) -> Bools:
         """Return in which of n decisions a yes-or-no column is true and known, (n,).
@@ -240,11 +266,10 @@ class Decisions:
 
         `name` is the start of its columns' names, such as that of `fused_IDLE`; NaN where unknown.
         """
-        key = f"{name} of actions"
-        if key not in self._arrays:
-            columns = [self[f"{name}_{action}"] for action in self.actions]
-            self._arrays[key] = _kept(np.stack(columns, axis=-1))
-        return self._arrays[key]
+        names = [f"{name}_{action}" for action in self.actions]
+        return self._kept(
+            f"{name} of actions", lambda: np.stack([self[each] for each in names], axis=-1)
+        )
 
     def of_messages(self, name: str) -> Floats:
         """Return a value that each of H messages has in n decisions, such as `on_time`, (n, H).
@@ -261,7 +286,7 @@ class Decisions:
         It is of n decisions, and -1 in a row without one. `name` is the column's. Raises ValueError
         for a label that is not in `names`.
         """
-        column = self.table[name].combine_chunks()
+        column = self.rows[name].combine_chunks()
         position = {label: place for place, label in enumerate(names)}
         labels = column.dictionary.to_pylist()
         if unknown := [label for label in labels if label not in position]:
@@ -269,9 +294,15 @@ class Decisions:
         lookup = np.array([*(position[label] for label in labels), -1])
         return cast(Ints, lookup[_values(column.indices, len(labels), np.int32)])
 
+    def names(self, name: str) -> list[str]:
+        """Return the labels that a column such as `agent` may have, each once, in any order."""
+        return cast("list[str]", self.rows[name].combine_chunks().dictionary.to_pylist())
+
     def labels(self, name: str) -> list[str | None]:
         """Return a column of labels, such as `danger`, as a list of n texts; None where unknown."""
-        return cast("list[str | None]", self.table[name].to_pylist())
+        column = self.rows[name].combine_chunks()
+        names = [*column.dictionary.to_pylist(), None]
+        return [names[code] for code in _values(column.indices, -1, np.int32).tolist()]
 
     @cached_property
     def scenes(self) -> dict[str, range]:
@@ -282,7 +313,7 @@ class Decisions:
         """
         if not len(self):
             return {}
-        codes = self.table["scene"].combine_chunks()
+        codes = self.rows["scene"].combine_chunks()
         changes = np.flatnonzero(np.diff(_values(codes.indices, -1, np.int32))) + 1
         starts = [0, *changes.tolist(), len(self)]
         names = codes.dictionary.to_pylist()
@@ -299,7 +330,7 @@ class Decisions:
         return [self._record(self.row(index)) for index in range(start, stop)]
 
     def selected(self, names: Sequence[str]) -> "Decisions":
-        return Decisions(self.table.select(names), self.actions, self.helpers)
+        return Decisions(self.rows.select(names), self.actions, self.helpers)
 
     def row(self, index: int) -> Mapping[str, Any]:
         """Return the row of this index, from 0, as values by column, None where unknown.
@@ -309,7 +340,7 @@ class Decisions:
         chunk, offset = divmod(index, ROWS)
         if chunk not in self._rows:  # only the last is kept, since rows are read in order
             self._rows.clear()
-            self._rows[chunk] = self.table.slice(chunk * ROWS, ROWS).to_pylist()
+            self._rows[chunk] = self.rows.slice(chunk * ROWS, ROWS).to_pylist()
         return self._rows[chunk][offset]
 
     def _record(self, row: Mapping[str, Any]) -> Decision:
@@ -325,17 +356,17 @@ class Decisions:
 
     def infinite(self) -> str | None:
         """Return the name of a column with an infinite number, which no run has, or None."""
-        for column in self.table.schema:
+        for column in self.rows.schema:
             if (
                 column.type == NUMBER
-                and np.isinf(_values(self.table[column.name], np.nan, np.float64)).any()
+                and np.isinf(_values(self.rows[column.name], np.nan, np.float64)).any()
             ):
                 return str(column.name)
         return None
 
     def take(self, which: Any) -> "Decisions":
-        places = _of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)
-        return Decisions(self.table.take(places), self.actions, self.helpers)
+        places = of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)
+        return Decisions(self.rows.take(places), self.actions, self.helpers)
 
     def replace(self, **columns: Any) -> "Decisions":
         table = self.table
@@ -349,7 +380,7 @@ class Decisions:
         decimals = {
             column: digits
             for name, digits in decimals_by_name.items()
-            for column in self.table.column_names
+            for column in self.rows.column_names
             if column == name or (name not in COLUMNS and column.startswith(f"{name}_"))
         }
         return self.replace(
@@ -362,13 +393,38 @@ class Decisions:
             self._write(part)
 
     def encoded(self) -> bytes:
+        if isinstance(self.rows, Packed) and self.rows.is_file:
+            return bytes(self.rows.content)
         data = BytesIO()
         self._write(data)
         return data.getvalue()
 
     def _write(self, target: Path | BytesIO) -> None:
-        unknown = [name for name in _optional() if self.table[name].null_count == len(self)]
-        _write(target, [self], schema(self.actions, self.helpers), unknown)
+        _write(target, self.pieces(), schema(self.actions, self.helpers), self.unknown)
+
+    @property
+    def unknown(self) -> set[str]:
+        """Return the names of the columns that a file need not have, and that are unknown here."""
+        return {name for name in _optional() if self.rows[name].null_count == len(self)}
+
+    @classmethod
+    def packed(
+        cls,
+        pieces: "Iterable[Decisions]",
+        like: Sequence["Decisions"],
+        least: int | None = None,
+    ) -> "Decisions":
+        """Return decisions that come in pieces, one after another, packed as in their file.
+
+        `like` are tables that together know the same columns. Each row group but the last has
+        `least` rows or more, `ROW_GROUP` if that is None.
+        """
+        actions, helpers = like[0].actions, max(each.helpers for each in like)
+        unknown = set.intersection(*(each.unknown for each in like))
+        data, columns = BytesIO(), schema(actions, helpers)
+        _write(data, pieces, columns, unknown, least)
+        content = pa.py_buffer(data.getvalue())
+        return cls(Packed.of(content, columns), actions, helpers)
 
     @classmethod
     def read(cls, path: Path, actions: Sequence[str], most: int | None = None) -> "Decisions":
@@ -378,36 +434,28 @@ class Decisions:
         lacks a column, or has more than `most` rows or more bytes than its rows can need: a file of
         a few bytes may hold a thousand million rows.
         """
-        with arrow_file(path) as file:  # read_table would make columns of folder names
-            source = pq.ParquetFile(file)
-            if most is not None and source.metadata.num_rows > most:
-                raise ValueError(
-                    f"{source.metadata.num_rows} rows; {most} is the most for its episodes"
-                )
-            there = source.schema_arrow.names
-            helpers = _helpers(there)
-            expected = schema(actions, helpers)
-            missing = [name for name in expected.names if name not in there]
-            may_lack = {*formats.COLUMNS, *added_columns()}
-            if lacking := [name for name in missing if re.sub(r"_\d+$", "", name) not in may_lack]:
-                raise ValueError(f"it lacks {', '.join(lacking)}")
-            wanted = [name for name in expected.names if name in there]
-            if (
-                _bytes(source.metadata, set(wanted))
-                > SLACK + len(source.schema_arrow) * source.metadata.num_rows * CELL
-            ):
-                raise ValueError("it holds more bytes than decisions need")
-            table = source.read(columns=wanted)
-        for name in missing:
-            table = table.append_column(name, pa.nulls(len(table), expected.field(name).type))
-        for name in NEVER_UNKNOWN:
-            if table[name].null_count:
+        content = _content(path)
+        source = pq.ParquetFile(pa.BufferReader(content))
+        n = source.metadata.num_rows
+        if most is not None and n > most:
+            raise ValueError(f"{n} rows; {most} is the most for its episodes")
+        there = source.schema_arrow.names
+        helpers = _helpers(there)
+        expected = schema(actions, helpers)
+        may_lack = {*formats.COLUMNS, *added_columns()}
+        missing = [name for name in expected.names if name not in there]
+        if lacking := [name for name in missing if re.sub(r"_\d+$", "", name) not in may_lack]:
+            raise ValueError(f"it lacks {', '.join(lacking)}")
+        wanted = {name for name in expected.names if name in there}
+        if _bytes(source.metadata, wanted) > SLACK + len(there) * n * CELL:
+            raise ValueError("it holds more bytes than decisions need")
+        packed = Packed.of(content, expected)
+        table = packed.whole() if n <= ROW_GROUP else packed
+        for name in expected.names:  # any of which may be broken
+            n_unknown = table[name].null_count
+            if n_unknown and name in NEVER_UNKNOWN:
                 raise ValueError(f"{name} is unknown in some rows")
-        return cls(
-            table.select(expected.names).cast(expected).unify_dictionaries(),
-            tuple(actions),
-            helpers,
-        )
+        return cls(table, tuple(actions), helpers)
 
     def frame(self) -> "pd.DataFrame":
         """Return the decisions as a pandas table: names are categories, flags may be unknown."""
@@ -439,7 +487,8 @@ class DecisionFiles:
         unknown = set(_optional()).difference(*columns)
         with replacing(path) as part:
             decisions = (Decisions.read(file, self.actions) for file in self.files)
-            _write(part, decisions, schema(self.actions, helpers), unknown)
+            pieces = chain.from_iterable(each.pieces() for each in decisions)
+            _write(part, pieces, schema(self.actions, helpers), unknown)
 
 
 def _optional() -> list[str]:
@@ -465,16 +514,17 @@ def _write(
     parts: Iterable[Decisions],
     columns: pa.Schema,
     left_out: Collection[str],
+    least: int | None = None,
 ) -> None:
     """Write decisions as one Parquet file with these columns but some;
-    whole parts share a row group.
+    whole parts share a row group, which has `least` rows or more.
     """
     kinds = pa.schema([column for column in columns if column.name not in left_out])
     with pq.ParquetWriter(target, kinds, compression="zstd") as writer:
         group = [_empty(kinds)]
         for part in parts:
             group.append(part.table.drop_columns(list(left_out)))
-            if sum(map(len, group)) >= ROW_GROUP:
+            if sum(map(len, group)) >= (least or ROW_GROUP):
                 writer.write_table(_row_group(group))
                 group = [_empty(kinds)]
         if len(group) > 1:
@@ -500,14 +550,14 @@ def arrow_file(path: Path) -> pa.BufferReader:
     Arrow's threads let go of a file after the call that read it. Of an object of Python, bytes as
     well, they need the interpreter for that, and abort the process if it has begun to end.
     """
+    return pa.BufferReader(_content(path))
+
+
+def _content(path: Path) -> pa.Buffer:
     with opened(path, "rows") as file:
         content = pa.allocate_buffer(os.fstat(file.fileno()).st_size)
         size = file.readinto(memoryview(content).cast("B"))
-    return pa.BufferReader(content.slice(0, size))
-
-
-# pyarrow loads pandas when it converts a foreign array to its own or back; going by buffers avoids
-# that.
+    return content.slice(0, size)
 
 
 def _empty(kinds: pa.Schema) -> pa.Table:
@@ -517,7 +567,7 @@ def _empty(kinds: pa.Schema) -> pa.Table:
 def _array(values: Any, kind: pa.DataType) -> pa.Array:
     """Return an array or `Labels` as a column; null for NaN and for no label."""
     if isinstance(values, Labels):
-        codes = _of_buffer(values.codes.astype(np.int32), values.codes >= 0, pa.int32())
+        codes = of_buffer(values.codes.astype(np.int32), values.codes >= 0, pa.int32())
         texts = [name.encode() for name in values.names]
         ends = np.cumsum([0] + [len(text) for text in texts], dtype=np.int32)
         names = pa.StringArray.from_buffers(
@@ -525,22 +575,9 @@ def _array(values: Any, kind: pa.DataType) -> pa.Array:
         )
         return pa.DictionaryArray.from_arrays(codes, names)
     if kind == WHOLE:
-        return _of_buffer(values.astype(np.int64), None, kind)
+        return of_buffer(values.astype(np.int64), None, kind)
     numbers = values.astype(np.float64)
-    return _of_buffer(numbers, ~np.isnan(numbers), NUMBER).cast(kind)
-
-
-def _of_buffer(values: Any, valid: Any, kind: pa.DataType) -> pa.Array:
-    mask = None if valid is None else pa.py_buffer(np.packbits(valid, bitorder="little"))
-    return pa.Array.from_buffers(
-        kind, len(values), [mask, pa.py_buffer(np.ascontiguousarray(values))]
-    )
-
-
-def _kept(values: Floats) -> Floats:
-    """Return values that nobody can change: a package's metric is given the same as all others."""
-    values.setflags(write=False)
-    return values
+    return of_buffer(numbers, ~np.isnan(numbers), NUMBER).cast(kind)
 
 
 def _values(column: Any, unknown: float | int, kind: type) -> Any:

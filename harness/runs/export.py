@@ -32,10 +32,10 @@ def decisions_csv(decisions: Decisions, path: Path) -> Path:
     """
     plain = pa.schema(
         (column.name, pa.string() if pa.types.is_dictionary(column.type) else column.type)
-        for column in decisions.table.schema
+        for column in decisions.rows.schema
     )
     with replacing(path) as part, pacsv.CSVWriter(part, plain) as writer:
-        for piece in decisions.table.to_batches(AT_ONCE):
+        for piece in decisions.rows.to_batches(AT_ONCE):
             table = pa.Table.from_batches([piece]).cast(plain)
             writer.write_table(
                 pa.table([_neutral(column) for column in table.columns], schema=plain)
@@ -55,7 +55,7 @@ def decisions_jsonl(decisions: Decisions, path: Path) -> Path:
     """Write decisions as JSON Lines, with the columns of `decisions.parquet`; unknown is null."""
     encoder = msgspec.json.Encoder()
     with replacing(path) as part, part.open("wb") as file:
-        for piece in decisions.table.to_batches(AT_ONCE):
+        for piece in decisions.rows.to_batches(AT_ONCE):
             file.write(encoder.encode_lines(piece.to_pylist()))
     return path
 

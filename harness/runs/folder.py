@@ -51,6 +51,7 @@ Record = TypeVar("Record", bound=Struct)
 # Arrow raises NotImplementedError for a column of another type.
 _BROKEN = (*BROKEN, NotImplementedError, csv.Error)
 OF_LAYOUT = ("layout_seed", "danger", "cluster")  # columns that are the same in all rows of one
+BLOCK = 1 << 22  # bytes of a table's file that are read at a time
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
@@ -287,10 +288,9 @@ class Run:
             raise ValueError(f"{infinite} is infinite")
         places = self.grid.places(decisions)
         steps, step = np.unique(decisions.whole("step"), return_inverse=True)
-        agent = np.unique(np.array(decisions.labels("agent"), dtype=str), return_inverse=True)[1]
-        keys = np.sort(
-            (places * len(steps) + step) * (1 + agent.max(initial=0)) + agent, kind="stable"
-        )
+        agents = decisions.names("agent")
+        agent = 1 + decisions.codes("agent", agents)  # 0 for none
+        keys = np.sort((places * len(steps) + step) * (1 + len(agents)) + agent, kind="stable")
         if (keys[1:] == keys[:-1]).any():
             raise ValueError("a decision is there twice")
         counts = np.bincount(places, minlength=len(self.episodes))
@@ -396,8 +396,10 @@ def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
         lines.seek(0)
         if lacking := hints.keys() - {*there, *formats.EPISODE}:
             raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
-        table = pacsv.read_csv(
+        records: list[Record] = []
+        batches = pacsv.open_csv(
             lines,
+            read_options=pacsv.ReadOptions(block_size=BLOCK),
             parse_options=parsed,
             convert_options=pacsv.ConvertOptions(
                 column_types={
@@ -410,16 +412,27 @@ def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
                 false_values=["False"],
             ),
         )
-    columns = {}
-    for field, name, column in zip(kind.__struct_fields__, hints, table.columns, strict=True):
-        values = column.to_pylist()
-        if name in optional:
-            values = [None if value == "" else value for value in values]
-        elif column.null_count:
-            raise ValueError(f"{name} is unknown in some rows")
-        columns[field] = values
-    rows = zip(*columns.values(), strict=True)
-    return tuple(kind(**dict(zip(columns, row, strict=True))) for row in rows)
+        for batch in batches:
+            columns = {}
+            for field, name in zip(kind.__struct_fields__, hints, strict=True):
+                if batch[name].null_count and name not in optional:
+                    raise ValueError(f"{name} is unknown in some rows")
+                columns[field] = _cells(batch[name], name in optional)
+            rows = zip(*columns.values(), strict=True)
+            records += [kind(**dict(zip(columns, row, strict=True))) for row in rows]
+    return tuple(records)
+
+
+def _cells(column: pa.Array, is_optional: bool) -> list[Any]:
+    """Return a column's n values, of which those that are equal are one object.
+
+    Millions of episodes have few different values. An empty text is None in an optional column.
+    """
+    encoded = column.dictionary_encode("encode")
+    values = encoded.dictionary.to_pylist()
+    if is_optional:
+        values = [None if value == "" else value for value in values]
+    return [values[code] for code in encoded.indices.to_pylist()]
 
 
 def scores_of(file: Path) -> tuple[Score, ...]:

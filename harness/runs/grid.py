@@ -1,14 +1,17 @@
 """The grid of a run: its conditions, seeds and episodes, the axes of its figures."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+from typing import TypeVar
 
 import numpy as np
 
 from harness.core.arrays import Ints
 from harness.runs.decisions import Decisions
 from harness.runs.records import Episode
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -46,11 +49,23 @@ class Grid:
 
         It is the order of arrays (C, S, E). Raises ValueError unless there is exactly one for each.
         """
-        by_cell = {(e.condition, e.seed, e.episode): e for e in episodes}
-        cells = [*product(self.conditions, self.seeds, self.episodes)]
-        if len(by_cell) != len(episodes) or set(by_cell) != set(cells):
+        condition, seed, episode = map(_places_of, (self.conditions, self.seeds, self.episodes))
+        _, seeds, layouts = self.shape
+        try:
+            cells = [
+                (condition[e.condition] * seeds + seed[e.seed]) * layouts + episode[e.episode]
+                for e in episodes
+            ]
+        except KeyError:
+            cells = []
+        order = np.argsort(cells)
+        if not np.array_equal(np.sort(cells), np.arange(math.prod(self.shape))):
             raise ValueError("not every episode is there once in every condition and seed")
-        return [by_cell[cell] for cell in cells]
+        return [episodes[place] for place in order.tolist()]
+
+
+def _places_of(axis: Sequence[T]) -> dict[T, int]:
+    return {each: place for place, each in enumerate(axis)}
 
 
 def _position(values: Ints, names: Sequence[int]) -> Ints:

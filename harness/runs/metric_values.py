@@ -59,7 +59,13 @@ def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Fl
     """
     function = metric.decisions
     assert function
-    values = _values(metric, lambda: np.asarray(function(decisions), dtype=float), len(places))
+    pieces = decisions.pieces() if isinstance(decisions, Decisions) else [decisions]
+
+    def of_pieces() -> Floats:
+        of_each = [np.asarray(function(piece), dtype=float) for piece in pieces]
+        return of_each[0] if len(of_each) == 1 else np.concatenate(of_each)
+
+    values = _values(metric, of_pieces, len(places))
     if not metric.total:
         return mean_by_place(values, places, n)
     unknown = sum_by_place(np.isnan(values), places, n)

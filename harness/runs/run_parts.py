@@ -5,6 +5,7 @@ each a folder of some episodes.
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -18,7 +19,7 @@ from harness.runs.records import (
     AnswerFacts,
     Episode,
 )
-from harness.runs.writer import csv_text, lines, ordered
+from harness.runs.writer import csv_bytes, lines, ordered
 
 _FACTS = msgspec.json.Decoder(AnswerFacts)
 
@@ -37,7 +38,7 @@ def part_files(
     return {
         "decisions.parquet": decisions.encoded(),
         "answers.jsonl": lines(ordered(answers, decisions, viewers)),
-        "episodes.csv": csv_text(Episode, episodes).encode(),
+        "episodes.csv": csv_bytes(Episode, episodes),
     }
 
 
@@ -55,21 +56,35 @@ def write_part(out: Path, files: Mapping[str, bytes]) -> None:
     os.replace(part, out)
 
 
-def read_part(
-    part: Path, actions: Sequence[str]
-) -> tuple[Decisions, tuple[Episode, ...], list[AnswerFacts]]:
-    """Return the decisions, episodes and answers (without texts) of a part of a run.
+@dataclass(frozen=True)
+class Piece:
+    """Hold some layouts of a run, few enough that their decisions are in memory together."""
 
-    `part` is its folder, as `write_part` wrote it, and `actions` are the names of the meta-actions.
-    Raises UserError if a file is broken.
+    layouts: Sequence[int]  # numbers of the episodes, one of each layout, ascending
+    decisions: Decisions  # all that were made in them
+    episodes: Sequence[Episode]  # how each ended under every condition and seed, in any order
+    answers: Sequence[AnswerFacts]  # those that the decisions are made of
+
+
+def read_part(part: Path, layouts: Sequence[int], actions: Sequence[str]) -> Iterator[Piece]:
+    """Yield the decisions, episodes and answers (without texts) of a part of a run.
+
+    `part` is its folder, as `write_part` wrote it, `layouts` are the numbers of its episodes, and
+    `actions` the names of the meta-actions. Raises UserError if a file is broken.
     """
-    return whole(
-        part,
-        lambda part: (
-            *_read_tables(part, actions),
-            facts_of(part),
-        ),
-    )
+    decisions, episodes = whole(part, lambda part: _read_tables(part, actions))
+    answers, pieces = facts_of(part), [*decisions.pieces()]
+    if len(pieces) == 1:
+        yield Piece(layouts, decisions, episodes, answers)
+        return
+    for piece in pieces:
+        numbers, scenes = set(piece.whole("episode").tolist()), piece.scenes
+        yield Piece(
+            [number for number in layouts if number in numbers],
+            piece,
+            [episode for episode in episodes if episode.episode in numbers],
+            [answer for answer in answers if answer.scene in scenes],
+        )
 
 
 def facts_of(part: Path) -> list[AnswerFacts]:

@@ -1,7 +1,7 @@
 """Compute `summary.csv` and `episodes.csv` from decisions, answers and how episodes ended."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, product
 from typing import Any
 
@@ -95,25 +95,32 @@ class Figures:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence["Figures"]) -> "Figures":
+    def joined(cls, grid: Grid, parts: Iterable["Figures"]) -> "Figures":
         """Return the figures of a run from those of its parts, which have different episodes.
 
-        They are in the order of the parts.
+        `grid` is the run's, whose episodes are in the order of the parts; each part is let go of
+        before the next is asked for.
         """
-        episodes = tuple(chain.from_iterable(part.grid.episodes for part in parts))
-        values = {}
-        for name in parts[0].values:
-            values[name] = np.concatenate([part.values[name] for part in parts], axis=2)
-        by_condition = zip(*[part.latency_ms for part in parts], strict=True)
-        judged_by_condition = zip(*[part.judged for part in parts], strict=True)
-        sizes = [len(part.grid.episodes) for part in parts]
+        values, start = dict[str, Floats](), 0
+        sizes, latency_ms, judged = list[int](), list[Sequence[Floats]](), list[Sequence[Judged]]()
+        answers, cluster_names = list[tuple[Answer | AnswerFacts, int]](), list[str | None]()
+        for part in parts:
+            sizes.append(len(part.grid.episodes))
+            stop = start + sizes[-1]
+            for name, of_part in part.values.items():
+                values.setdefault(name, np.empty(grid.shape))[..., start:stop] = of_part
+            latency_ms.append(part.latency_ms)
+            judged.append(part.judged)
+            answers += part.answers
+            cluster_names += part.cluster_names
+            start = stop
         return cls(
-            replace(parts[0].grid, episodes=episodes),
+            grid,
             values,
-            [np.concatenate(each) for each in by_condition],
-            [Judged.joined(each, sizes) for each in judged_by_condition],
-            list(chain.from_iterable(part.answers for part in parts)),
-            list(chain.from_iterable(part.cluster_names for part in parts)),
+            [np.concatenate(each) for each in zip(*latency_ms, strict=True)],
+            [Judged.joined(each, sizes) for each in zip(*judged, strict=True)],
+            answers,
+            cluster_names,
         )
 
     def scores(self, older: bool = False) -> list[Score]:
@@ -194,10 +201,16 @@ def judged_of(grid: Grid, decisions: Decisions, cells: Ints) -> list[Judged]:
     condition is a named set of settings of the radio, of asking helpers and of fusing their
     messages.
     """
-    fused, optimal = decisions.of_actions("fused"), decisions.of_actions("safe") == 1.0
-    condition, _, episode = np.unravel_index(cells, grid.shape)
-    rows = [np.flatnonzero(condition == place) for place in range(len(grid.conditions))]
-    return [Judged.of(fused[here], optimal[here], episode[here]) for here in rows]
+    parts, start = list[list[Judged]](), 0
+    for piece in decisions.pieces():
+        stop = start + len(piece)
+        condition, _, episode = np.unravel_index(cells[start:stop], grid.shape)
+        fused, optimal = piece.of_actions("fused"), piece.of_actions("safe") == 1.0
+        rows = [np.flatnonzero(condition == place) for place in range(len(grid.conditions))]
+        parts.append([Judged.of(fused[here], optimal[here], episode[here]) for here in rows])
+        start = stop
+    sizes = [0] * len(parts)  # all have the run's episodes
+    return [Judged.joined(each, sizes) for each in zip(*parts, strict=True)]
 
 
 def _of_judged(

@@ -54,7 +54,7 @@ def write(
     with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
         file.writelines(answers)
     decisions.write(out / "decisions.parquet")
-    write_whole(out / "episodes.csv", csv_text(Episode, episodes, manifest.variant))
+    write_whole(out / "episodes.csv", csv_bytes(Episode, episodes, manifest.variant))
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
     if layouts:
         write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
@@ -99,11 +99,19 @@ def ordered(
 
 
 def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
+    """Return records as CSV, as `csv_bytes` does."""
+    return csv_bytes(kind, records, variant).decode()
+
+
+def csv_bytes(
+    kind: type[Record], records: Iterable[Record], variant: Variant | None = None
+) -> bytes:
     """Return records as CSV: the columns of `variant`, then one for each field; None is empty.
 
     Columns of `formats.SPARSE` are left out if no record has a value.
     """
-    text, records = io.StringIO(), list(records)
+    content, records = io.BytesIO(), list(records)
+    text = io.TextIOWrapper(content, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     variant_columns = asdict(variant) if variant else {}
     columns = {}
@@ -114,4 +122,5 @@ def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | N
     writer.writerow([*variant_columns, *columns.values()])
     values = attrgetter(*columns)
     writer.writerows((*variant_columns.values(), *values(record)) for record in records)
-    return text.getvalue()
+    text.flush()
+    return content.getvalue()
