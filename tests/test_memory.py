@@ -1,10 +1,30 @@
-"""The garbage collector is back as it was, whatever happened meanwhile."""
+"""The garbage collector is back as it was, whatever happened meanwhile; large blocks go back."""
 
 import gc
+import platform
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from harness.core.memory import uncollected
+from harness.core.memory import LARGE, return_large_blocks, uncollected
+
+
+def resident() -> int:
+    """Bytes of this process in memory."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc alone")
+def test_large_blocks_that_are_freed_go_back_to_the_system_one_by_one():
+    size = 4 * LARGE
+    np.ones(size, dtype=np.uint8)  # after which glibc would keep blocks of this size
+    return_large_blocks()
+    blocks = [np.ones(size, dtype=np.uint8) for _ in range(6)]
+    full = resident()
+    blocks = blocks[-1:]
+    assert resident() < full - 4 * size
+    assert len(blocks) == 1
 
 
 def test_nothing_is_collected_inside_and_all_is_as_before_outside():

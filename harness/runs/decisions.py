@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.files import opened, replacing
+from harness.core.memory import return_large_blocks
 from harness.runs import formats
 from harness.runs.packed import Packed, of_buffer
 from harness.runs.records import Decision, Message
@@ -450,7 +451,9 @@ class Decisions:
         if _bytes(source.metadata, wanted) > SLACK + len(there) * n * CELL:
             raise ValueError("it holds more bytes than decisions need")
         packed = Packed.of(content, expected)
-        table = packed.whole() if n <= ROW_GROUP else packed
+        if n > ROW_GROUP:
+            return_large_blocks()
+        table = packed if n > ROW_GROUP else packed.whole()
         for name in expected.names:  # any of which may be broken
             n_unknown = table[name].null_count
             if n_unknown and name in NEVER_UNKNOWN:
