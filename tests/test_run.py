@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
@@ -43,6 +44,9 @@ from harness.evaluate.kept_answers import read_kept
 from harness.evaluate.run import evaluate
 from harness.evaluate.spec import Spec
 from harness.prompts import versions as prompts
+from harness.report import panels
+from harness.runs.contradictions import contradictions
+from harness.runs.export import decisions_csv
 from harness.runs.folder import read
 from harness.runs.records import Answer, FrozenScenes
 from harness.runs.settings import words
@@ -103,6 +107,32 @@ def test_decisions_in_row_groups_are_the_same_rows(
     groups = pq.ParquetFile(tmp_path / "run" / "decisions.parquet").num_row_groups
     assert groups == len(small.episodes) > 1
     assert rows_of(tmp_path / "run") == rows_of(proxy_run)
+
+
+@pytest.mark.slow
+def test_a_table_that_stays_packed_reads_as_one_in_memory(
+    proxy_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its row groups end within scenes, as those of a stranger's file may."""
+    whole = read(proxy_run)
+    out = Path(shutil.copytree(proxy_run, tmp_path / proxy_run.name))
+    pq.write_table(whole.decisions.table, out / "decisions.parquet", row_group_size=41)
+    monkeypatch.setattr("harness.runs.decisions.ROW_GROUP", 40)
+    packed = read(out)
+    a, b = whole.decisions, packed.decisions
+    assert len(list(a.pieces())) == 1 < len(list(b.pieces())) == -(-len(a) // 41)
+    order = np.random.default_rng(0).permutation(len(a))[:99]
+    assert a.take(order).table.to_pylist() == b.take(order).table.to_pylist()
+    assert a.row(45) == b.row(45)
+    assert a.labels("helper_1") == b.labels("helper_1")
+    assert a.scenes == b.scenes
+    assert list(contradictions(packed)) == []
+    for panel in (panels.reliability, panels.errors, panels.replies, panels.arrivals):
+        assert panel(whole) == panel(packed)
+    files = [
+        decisions_csv(run.decisions, tmp_path / f"{n}.csv") for n, run in enumerate((whole, packed))
+    ]
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 @pytest.fixture(scope="module")
