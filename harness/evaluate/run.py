@@ -662,6 +662,7 @@ def _gather(
         times = answer_times.times(
             answers, whole.grid.episodes, cluster_numbers(whole.cluster_names)
         )
+        del whole  # its values take as much as the episodes
         cost = costs.total(settings, works)
         manifest = msgspec.convert(
             {

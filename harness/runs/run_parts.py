@@ -85,6 +85,8 @@ def read_part(part: Path, layouts: Sequence[int], actions: Sequence[str]) -> Ite
             [episode for episode in episodes if episode.episode in numbers],
             [answer for answer in answers if answer.scene in scenes],
         )
+        # those that were given away need not be held
+        episodes = tuple(episode for episode in episodes if episode.episode not in numbers)
 
 
 def facts_of(part: Path) -> list[AnswerFacts]:

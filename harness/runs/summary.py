@@ -309,7 +309,15 @@ def counted(grid: Grid, decisions: Decisions, episodes: Sequence[Episode]) -> li
         columns[f"least_{name}"] = numbers_or_none(least_by_place(decisions[name], places, n))
     if not np.isnan(decisions["acted"]).all():
         columns["never_acted"] = totals(1.0 - decisions["acted"])
+    shared_columns = [_shared(values) for values in columns.values()]
+    rows = zip(*shared_columns, strict=True)
     return [
         structs.replace(episode, **dict(zip(columns, values, strict=True)))
-        for episode, *values in zip(ordered, *columns.values(), strict=True)
+        for episode, values in zip(ordered, rows, strict=True)
     ]
+
+
+def _shared(values: Sequence[Any]) -> list[Any]:
+    """Return the values, of which those that are equal are one object: episodes may be millions."""
+    objects: dict[Any, Any] = {}
+    return [objects.setdefault(value, value) for value in values]

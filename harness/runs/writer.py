@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 import pyarrow as pa
@@ -54,7 +54,8 @@ def write(
     with replacing(out / "answers.jsonl") as part, part.open("wb") as file:
         file.writelines(answers)
     decisions.write(out / "decisions.parquet")
-    write_whole(out / "episodes.csv", csv_bytes(Episode, episodes, manifest.variant))
+    with replacing(out / "episodes.csv") as part, part.open("wb") as file:
+        write_csv(file, Episode, episodes, manifest.variant)
     write_whole(out / "summary.csv", csv_text(Score, scores, manifest.variant))
     if layouts:
         write_whole(out / DIFFICULTY, csv_text(Layout, layouts))
@@ -99,19 +100,27 @@ def ordered(
 
 
 def csv_text(kind: type[Record], records: Iterable[Record], variant: Variant | None = None) -> str:
-    """Return records as CSV, as `csv_bytes` does."""
-    return csv_bytes(kind, records, variant).decode()
+    """Return records as CSV, as `write_csv` writes them."""
+    return csv_bytes(kind, list(records), variant).decode()
 
 
 def csv_bytes(
-    kind: type[Record], records: Iterable[Record], variant: Variant | None = None
+    kind: type[Record], records: Sequence[Record], variant: Variant | None = None
 ) -> bytes:
-    """Return records as CSV: the columns of `variant`, then one for each field; None is empty.
+    """Return records as CSV in UTF-8, as `write_csv` writes them."""
+    content = io.BytesIO()
+    write_csv(content, kind, records, variant)
+    return content.getvalue()
+
+
+def write_csv(
+    file: BinaryIO, kind: type[Record], records: Sequence[Record], variant: Variant | None = None
+) -> None:
+    """Write records as CSV: the columns of `variant`, then one for each field; None is empty.
 
     Columns of `formats.SPARSE` are left out if no record has a value.
     """
-    content, records = io.BytesIO(), list(records)
-    text = io.TextIOWrapper(content, encoding="utf-8", newline="")
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     variant_columns = asdict(variant) if variant else {}
     columns = {}
@@ -122,5 +131,4 @@ def csv_bytes(
     writer.writerow([*variant_columns, *columns.values()])
     values = attrgetter(*columns)
     writer.writerows((*variant_columns.values(), *values(record)) for record in records)
-    text.flush()
-    return content.getvalue()
+    text.detach()  # what is written so far is flushed; the file stays open
