@@ -26,7 +26,7 @@ from shares import SHARES, share_of
 from harness import cli
 from harness.cli import scenario, shell
 from harness.coordination import operating_point, parts, schedules
-from harness.core import extensions, resources
+from harness.core import cores, extensions, resources
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
@@ -52,6 +52,9 @@ sys.dont_write_bytecode = False
 # Before anyone imports torch: threads of several workers that wait for each other make tiny models
 # a hundred times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# Processors differ, and tests do not: by what they see, none multiplies in bfloat16.
+cores.BFLOAT16 = ()
 
 
 # What tests write need not outlast a power cut. Processes that they start are as they are.

@@ -26,7 +26,9 @@ from harness.backends.chat import HubTokenizer
 from harness.backends.language_model import LanguageModel
 from harness.backends.registry import missing, open_backend
 from harness.backends.weights import find_checkpoint
+from harness.core import cores
 from harness.core.errors import UserError
+from harness.core.plugins import say_once
 
 pytestmark = pytest.mark.slow  # a whole file, for `make quick` not to import torch
 
@@ -43,7 +45,7 @@ def backend(tiny: Path) -> LanguageModel:
     return open_tiny(tiny)
 
 
-def open_tiny(folder: Path, batch_size: int = 8, **options: str) -> LanguageModel:
+def open_tiny(folder: Path, batch_size: int = 8, **options: str | None) -> LanguageModel:
     opened = open_backend(resolve(str(folder)), batch_size=batch_size, device="cpu", **options)
     assert isinstance(opened, LanguageModel)
     return opened
@@ -430,6 +432,39 @@ def test_a_local_checkpoint_is_known_by_its_files_whatever_else_lies_beside_them
     assert changed["files_sha256"] != here["files_sha256"]
     assert changed["chat_template_sha256"] != here["chat_template_sha256"]
     assert open_tiny(tiny, dtype="bfloat16").identity()["dtype"] == "bfloat16"
+
+
+@pytest.mark.parametrize(
+    ("processor", "typed", "dtype", "why"),
+    [
+        ("flags : fpu avx512_bf16 amx_bf16", None, "bfloat16", "multiplies in it (amx_bf16)"),
+        ("flags : fpu avx512_bf16", "auto", "bfloat16", "multiplies in it (avx512_bf16)"),
+        ("flags : fpu avx512f", None, "float32", "does not multiply in bfloat16"),
+        (None, None, "float32", "does not multiply in bfloat16"),
+        ("flags : fpu avx512_bf16", "float32", "float32", ""),
+    ],
+)
+def test_a_card_without_a_number_format_takes_what_the_processor_multiplies_in_and_says_so(
+    tiny: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    processor: str | None,
+    typed: str | None,
+    dtype: str,
+    why: str,
+) -> None:
+    stated = tmp_path / "cpuinfo"
+    if processor is not None:
+        stated.write_text(processor)
+    monkeypatch.setattr(cores, "CPU_INFO", stated)
+    monkeypatch.setattr(cores, "BFLOAT16", ("amx_bf16", "avx512_bf16"))
+    say_once.cache_clear()
+    assert open_tiny(tiny, dtype=typed).identity()["dtype"] == dtype
+    said = capsys.readouterr().err
+    assert why in said
+    assert said.count("\n") == bool(why)
+    assert bool(why) == (f"dtype auto is {dtype} here" in said)
 
 
 def split_into_folders(folder: Path) -> Path:

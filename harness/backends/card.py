@@ -161,7 +161,9 @@ class Card:
     sha256: Sha256 | None = None
     # whether the hub gives the weights only to those who have accepted their licence
     gated: bool = False
-    dtype: Dtype = "auto"  # number format of a checkpoint's weights; `auto` is the checkpoint's own
+    # number format of a checkpoint's weights; `auto` is the engine's choice, on transformers the
+    # checkpoint's own on a GPU, and on a CPU bfloat16 where it multiplies in it, else float32
+    dtype: Dtype = "auto"
     # number format of a GGUF file, for people only; the file decides
     quantisation: str | None = None
     # most tokens of prompt and answer; None: the checkpoint's own limit

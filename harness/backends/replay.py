@@ -5,7 +5,7 @@ rule or mix without a model.
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from msgspec import structs
 
@@ -20,7 +20,7 @@ from harness.backends.base import (
     say_newly_stated,
 )
 from harness.backends.cache import cached
-from harness.backends.card import Card
+from harness.backends.card import Card, Dtype
 from harness.backends.cards import find_own
 from harness.backends.registry import BUILT_IN, ENGINES, capabilities, open_backend
 from harness.backends.token_counts import too_few
@@ -132,13 +132,14 @@ class Replay:
             card = find_own(
                 stated_card, (), lacking, "write one of that name, or make the run again"
             )
-            model = open_backend(
-                card, dtype=manifest.settings.dtype, batch_size=manifest.settings.batch_size
-            )
             stored = {key: value for key, value in manifest.identity.items() if key != "helpers"}
             if manifest.helpers and role == "helper":
                 helpers = manifest.identity.get("helpers")
                 stored = helpers[0] if isinstance(helpers, list) and helpers else {}
+            dtype = manifest.settings.dtype
+            if stored.get("dtype") in get_args(Dtype):  # what `auto` was there, and may not be here
+                dtype = stored["dtype"]
+            model = open_backend(card, dtype=dtype, batch_size=manifest.settings.batch_size)
             if not same_model(stored, model.identity()):
                 changed = f"{printable(card.name)} has changed since that run"
                 raise UserError(f"{lacking}, and {changed}; make the run again")

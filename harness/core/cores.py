@@ -1,6 +1,13 @@
-"""How many cores this process may use, and how many threads a model's engine computes with."""
+"""How many cores this process may use, how many threads a model's engine computes with,
+and whether the processor multiplies in bfloat16.
+"""
 
 import os
+from pathlib import Path
+
+# products of bfloat16, the fastest first, as Linux names what a processor has
+BFLOAT16: tuple[str, ...] = ("amx_bf16", "avx512_bf16")
+CPU_INFO = Path("/proc/cpuinfo")  # where Linux says it
 
 
 def usable() -> int:
@@ -17,3 +24,15 @@ def threads() -> int:
     """
     setting = os.environ.get("OMP_NUM_THREADS", "")
     return int(setting) if setting.isdigit() and int(setting) else max(1, usable() // 2)
+
+
+def bfloat16_products() -> str | None:
+    """Return the name of the processor's products in bfloat16, such as `avx512_bf16`.
+
+    None if it has none and would emulate them, or if the system does not say, as only Linux does.
+    """
+    try:
+        words = CPU_INFO.read_text("utf-8").split()
+    except OSError:
+        return None
+    return next((name for name in BFLOAT16 if name in words), None)

@@ -125,7 +125,8 @@ def another_model(spec: Spec) -> str:
     `spec` is the evaluation, whose models it names.
     """
     names = " or ".join(printable(card.name) for card in dict.fromkeys(spec.cards))
-    return f"another model behind {names} (its files, package versions or device differ)"
+    differs = "files, package versions, number format or device"
+    return f"another model behind {names} (its {differs} differ)"
 
 
 def as_finished(spec: Spec, run_start: RunStart, looks: InterimLooks | None = None) -> RunStart:

@@ -24,10 +24,11 @@ from harness.backends.weights import (
     sha256_weights,
     shards,
 )
-from harness.core.cores import threads
+from harness.core.cores import bfloat16_products, threads
 from harness.core.errors import UserError, one_line, printable
 from harness.core.files import digest, sha256_bytes, sha256_file, text_of
 from harness.core.image import Image
+from harness.core.plugins import say_once
 
 # Suffixes of the files that decide an answer; a README or a licence does not.
 _HASHED = {".bin", ".jinja", ".json", ".model", ".safetensors", ".txt"}
@@ -40,9 +41,10 @@ def open(
     """Return the backend of a model card's checkpoint, loaded by the package transformers.
 
     `card` is the model card, the TOML file that describes a model. `device` is `cpu`, `cuda` or
-    `cuda:N`, None for CUDA if there is any; `dtype` a number format instead of the card's;
-    `batch_size` the most requests computed together. Raises UserError if the weights are not found,
-    do not load, or an option is not allowed.
+    `cuda:N`, None for CUDA if there is any; `dtype` a number format instead of the card's, where
+    `auto` is that of the checkpoint on CUDA, and on a CPU what `format_of_cpu` says, which is then
+    said once; `batch_size` the most requests computed together. Raises UserError if the weights are
+    not found, do not load, or an option is not allowed.
     """
     dtype = dtype or card.dtype
     if dtype not in get_args(Dtype):
@@ -50,9 +52,19 @@ def open(
     import torch
 
     where, device = checkpoint(card), choose_device(device)
+    chosen, why = format_of_cpu() if dtype == "auto" and device == "cpu" else (dtype, "")
     torch.set_num_threads(min(threads(), torch.get_num_threads()))  # fewer may have been asked for
-    tokenizer, model = load(card, where, dtype=dtype, device=device)
+    tokenizer, model = load(card, where, dtype=chosen, device=device)
+    if why:
+        say_once(f"{card.shown}: dtype auto is {chosen} here: {why}; --dtype names another")
     return LanguageModel(TransformersEngine(card, where, tokenizer, model), batch_size)
+
+
+def format_of_cpu() -> tuple[Dtype, str]:
+    """Return the number format in which this processor computes fastest, and why."""
+    if products := bfloat16_products():
+        return "bfloat16", f"this processor multiplies in it ({products})"
+    return "float32", "this processor does not multiply in bfloat16"
 
 
 def checkpoint(card: Card) -> Path:

@@ -13,7 +13,11 @@ from former import SCENARIO
 from run_on_disk import answers_of
 
 from harness.backends import cards
+from harness.backends.base import Backend
+from harness.backends.card import Card
+from harness.backends.registry import open_backend
 from harness.coordination.named_points import POINTS
+from harness.core.at_once import AtOnce
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.agent import Agent
@@ -117,6 +121,26 @@ def test_a_stored_run_whose_model_has_changed_is_not_asked_on(
     with pytest.raises(UserError, match="has changed since that run; make the run again"):
         run(stored, tmp_path / "stored")
     assert not (tmp_path / "stored" / "run.json").exists()
+
+
+@pytest.mark.parametrize(("stated", "dtype"), [("float32", "float32"), ("Q4_1", None)])
+def test_a_stored_run_is_asked_on_in_the_number_format_that_it_states(
+    small: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: str, dtype: str | None
+) -> None:
+    """What a card's `auto` was when the run was made may be another on this processor."""
+    formats = list[str | None]()
+
+    def opening(card: Card, *, dtype: str | None, batch_size: AtOnce) -> Backend:
+        formats.append(dtype)
+        return open_backend(card, batch_size=batch_size)
+
+    identity = {"engine": "proxy", "dtype": stated}
+    monkeypatch.setattr("harness.backends.proxy.Proxy.identity", lambda self: identity)
+    monkeypatch.setattr("harness.backends.replay.open_backend", opening)
+    runs = [run(spec_of(small, name), tmp_path / name).out for name in ("proxy", "proxy-faulty")]
+    stored = mixed(small, helper(f"replay:{runs[1]}"), model=f"replay:{runs[0]}")
+    run(stored, tmp_path / "stored")
+    assert set(formats) == {dtype}
 
 
 def test_every_agent_takes_its_own_time(small: Dataset, tmp_path: Path) -> None:
