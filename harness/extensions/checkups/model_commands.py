@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from harness.backends.card import Card
     from harness.evaluate.spec import Spec
     from harness.extensions.checkups.answers import Checkup
+    from harness.extensions.checkups.number_formats import FormatPace
     from harness.extensions.checkups.pace import Pace
     from harness.extensions.checkups.read_outs import Findings
 
@@ -44,12 +45,14 @@ def check(
     one fact, show whether its read-outs follow the letter and whether it reads the scene; later
     pages of runs asked so say it. A model that takes pictures is also asked with a picture and with
     a blank one. If its card names several engines and its weights are small, each is timed shortly,
-    and a line says which is faster here. Exit code 1 if no answer can be read, or if it ignores the
-    picture; 3 if it answers in no mode.
+    and a line says which is faster here; on a CPU another says how fast each number format is, how
+    many prompts are read alike in both, and which is taken. Exit code 1 if no answer can be read,
+    or if it ignores the picture; 3 if it answers in no mode.
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import capabilities
     from harness.extensions.checkups import model as checkup
+    from harness.extensions.checkups import number_formats
     from harness.extensions.checkups.pace import advice
 
     card = resolve(name, engine)
@@ -72,6 +75,8 @@ def check(
             err=True,
         )
     paces = _paces(card)
+    formats = _formats(card, seen.identity.get("device"))
+    taken, why = number_formats.chosen_format(card, dtype)
     if as_json:
         result = done.findings
         echo_json(
@@ -82,6 +87,7 @@ def check(
                 **asdict(seen),
                 "findings": result and {**to_builtins(result), "reads_scene": result.reads_scene},
                 "paces": paces,
+                "number_formats": {"measured": formats, "taken": taken, "why": why},
             }
         )
     else:
@@ -89,6 +95,8 @@ def check(
         _show_findings(done.findings)
         if paces:
             typer.echo(f"engines      {advice(paces)}")
+        if formats:
+            typer.echo(f"formats      {number_formats.advice(formats, taken, why)}")
     errors = [answer.error for answer in done.completions if answer.error is not None]
     if len(errors) == len(done.completions):
         raise Unanswered(f"{printable(errors[0], 300)}: no answer of {who} in any answer mode")
@@ -187,6 +195,18 @@ def _paces(card: "Card") -> "list[Pace]":
             return paces(card.name.partition(":")[0])
     except (UserError, Unanswered) as error:
         typer.echo(f"harness: its engines are not compared: {printable(error, 300)}", err=True)
+        return []
+
+
+def _formats(card: "Card", device: object) -> "list[FormatPace]":
+    """Return how fast a model is in each number format; empty where that cannot be told."""
+    from harness.extensions.checkups.number_formats import format_paces
+
+    try:
+        with bar(f"timing number formats of {printable(card.name, 30)}"):
+            return format_paces(card, device)
+    except (UserError, Unanswered) as error:
+        typer.echo(f"harness: its formats are not compared: {printable(error, 300)}", err=True)
         return []
 
 

@@ -42,7 +42,7 @@ def paces(stem: str) -> list[Pace]:
     if weights do not load or the model cannot answer, and Unanswered if an answer fails.
     """
     able = [card for card in each_engine(stem) if missing(card) is None] if stem in names() else []
-    if len(able) < 2 or not all(_small(card) for card in able):
+    if len(able) < 2 or not all(is_small(card) for card in able):
         return []
     return [_pace(card) for card in able]
 
@@ -94,7 +94,7 @@ def _fastest(measured: Sequence[Pace], seconds: Sequence[float]) -> str | None:
     return measured[seconds.index(first)].engine if second >= CLEAR * first else None
 
 
-def _small(card: Card) -> bool:
+def is_small(card: Card) -> bool:
     """Return whether a model's files are small enough to be timed by the way."""
     where = locate(card)
     files = [file for file in where.rglob("*") if file.is_file()] if where.is_dir() else [where]

@@ -1,8 +1,13 @@
 """Which engine of a card is faster here: timed shortly, and said in one line."""
 
+from dataclasses import replace
+
 import pytest
 
-from harness.extensions.checkups import pace
+from harness.backends import cards
+from harness.backends.card import Dtype
+from harness.extensions.checkups import number_formats, pace
+from harness.extensions.checkups.number_formats import FormatPace, chosen_format, format_paces
 from harness.extensions.checkups.pace import Pace, advice, paces
 
 
@@ -50,3 +55,44 @@ def test_what_has_one_engine_or_large_weights_is_not_timed(monkeypatch: pytest.M
     monkeypatch.setattr(pace, "MOST_BYTES", 1000)
     monkeypatch.setattr(pace, "_pace", lambda card: pytest.fail("opened"))
     assert paces("swarm-tiny") == []
+
+
+def test_a_line_says_what_each_number_format_brings_and_which_is_taken() -> None:
+    measured = [
+        FormatPace("float32", 1234.5, 100.0, (0, 1, 2, None)),
+        FormatPace("bfloat16", 2500.0, 150.0, (0, 1, 1, None)),
+    ]
+    assert number_formats.advice(measured, "float32", "its card says so") == (
+        "float32 1234 tokens a CPU second in read-outs and 100 in text, bfloat16 2500 tokens a "
+        "CPU second in read-outs and 150 in text; 2 of 4 prompts read alike; float32 is taken: "
+        "its card says so"
+    )
+
+
+@pytest.mark.parametrize(
+    ("engine", "stated", "typed", "chosen"),
+    [
+        ("transformers", "float32", None, ("float32", "its card says so")),
+        ("transformers", "float32", "bfloat16", ("bfloat16", "it was typed")),
+        ("transformers", "float32", "auto",
+            ("float32", "this processor does not multiply in bfloat16")),
+        ("openvino", "auto", None, ("auto", "openvino chooses")),
+    ],
+)  # fmt: skip
+def test_the_number_format_is_typed_or_the_cards_or_chosen(
+    engine: str, stated: Dtype, typed: str | None, chosen: tuple[str, str]
+) -> None:
+    card = replace(cards.load("swarm-tiny:transformers"), engine=engine, dtype=stated)
+    assert chosen_format(card, typed) == chosen
+
+
+@pytest.mark.slow
+def test_small_weights_are_timed_in_both_number_formats_on_a_cpu() -> None:
+    pytest.importorskip("torch", reason="needs the transformers extra")
+    card = cards.load("swarm-tiny:transformers")
+    measured = format_paces(card, "cpu")
+    assert [each.dtype for each in measured] == ["float32", "bfloat16"]
+    assert all(each.readout_rate > 0 and each.text_rate > 0 for each in measured)
+    assert {len(each.actions) for each in measured} == {12}
+    assert None not in measured[0].actions
+    assert format_paces(card, "cuda") == format_paces(cards.load("swarm-tiny"), "cpu") == []
