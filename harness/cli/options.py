@@ -199,9 +199,7 @@ Verbose = Annotated[
         rich_help_panel=stated.OUTPUT,
     ),
 ]
-Pictures = Annotated[
-    bool, Option("--pictures", help="Also draw figures: in the page, and as SVG, PDF and PNG.")
-]
+Pictures = Annotated[bool, Option("--pictures", help="Also write the figures as SVG, PDF and PNG.")]
 
 
 def takes(

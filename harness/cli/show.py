@@ -35,7 +35,8 @@ def finish(
     """Write a study to a folder, and print it as JSON or as text.
 
     `out` is the folder to make. It is JSON if `as_json`, and nothing is printed as text if `quiet`;
-    `verbose` prints all tables and how the study was made. Figures are drawn with `pictures`.
+    `verbose` prints all tables and how the study was made. With `pictures`, figures are
+    also written as files.
     """
     from harness.studies.study import undrawn, write_study
 
@@ -46,8 +47,6 @@ def finish(
         echo_answer(study)
     elif not quiet:
         show(study, verbose)
-        if not pictures and study.figures is not dict:
-            typer.echo("figures: the same command with --pictures")
         typer.echo(f"wrote {printable(page)}")
 
 

@@ -1,13 +1,16 @@
-"""A page of sentences, figures and tables that runs no script:
-of a study, a suite, or runs by date.
+"""A page of sentences, figures and tables: of a study, a suite, or runs by date.
+
+It runs no script but, where it has charts, those that draw them.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from markupsafe import Markup
 
 from harness.core.figures import Bounded, number_or_none
+from harness.report import library
 from harness.report.templating import environment, visible
 
 # characters of a cell at the right of its column, such as a number with its interval
@@ -62,13 +65,22 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Chart:
+    """Hold a chart that a page draws: a Vega-Lite specification between its title and caption."""
+
+    title: str  # what is drawn over what
+    spec: Mapping[str, Any]  # a Vega-Lite specification
+    caption: str = ""  # how to read it
+
+
+@dataclass(frozen=True)
 class Section:
-    """Hold the text, tables and pictures of one part of a page: about a study, a suite or a run.
+    """Hold the text, tables and charts of one part of a page: about a study, a suite or a run.
 
     `headline` is the outcome, `about` how it was made, and `numbers` the key figures, each with
     `what`, `value`, `interval` and `n`. `warnings` say why there is no outcome, `caveats` what a
-    reader must know first. `pictures` has, by name, each one's address and its width in rem; `more`
-    is shown below the tables.
+    reader must know first. `charts` are by their names in the page; `more` is shown below the
+    tables.
     """
 
     title: str  # what was run
@@ -80,8 +92,7 @@ class Section:
     caveats: Sequence[str] = ()  # what a reader must know first
     # what is read first: dicts with `what`, `value`, `interval` and `n` as text
     numbers: Sequence[Mapping[str, str]] = ()
-    # by name: address (a URI), and width in rem
-    pictures: Mapping[str, tuple[str, int]] = field(default_factory=dict)
+    charts: Mapping[str, Chart] = field(default_factory=dict)  # by their names in the page
     more: Markup = field(default_factory=Markup)  # below the tables
 
 
@@ -90,7 +101,9 @@ def document(sections: Sequence[Section]) -> str:
 
     Its title is that of the first.
     """
-    return environment().get_template("sections.html.j2").render(sections=sections)
+    charts = {name: chart.spec for section in sections for name, chart in section.charts.items()}
+    template = environment().get_template("sections.html.j2")
+    return template.render(sections=sections, charts=charts, library=library)
 
 
 def strong(text: str, when: bool = True) -> str:

@@ -11,6 +11,7 @@ import base64
 import gzip
 import hashlib
 import re
+from collections.abc import Sequence
 from functools import cache
 from importlib.metadata import distribution, version
 from importlib.resources import files
@@ -39,6 +40,7 @@ SCRIPTS = (
     "replay",
     "main",
 )
+OF_CHARTS = ("dom", "tables", "charts", "drawn")  # of a page that has charts alone
 FOLDER = Path(__file__).parent / "scripts"
 PACKAGE = "django-js-lib-vega-embed"  # of which nothing needs Django
 BUNDLE = "static/js_lib_vega_embed/vega-embed-full.js"
@@ -79,9 +81,9 @@ def vega() -> str:
 
 
 @cache
-def script() -> Markup:
-    """Return the report page's own JavaScript, joined from the files `SCRIPTS`."""
-    parts = "\n".join(text_of(FOLDER / f"{name}.js") for name in SCRIPTS)
+def script(names: Sequence[str] = SCRIPTS) -> Markup:
+    """Return a page's own JavaScript, joined from the files `names`: by default the report's."""
+    parts = "\n".join(text_of(FOLDER / f"{name}.js") for name in names)
     return Markup(f'"use strict";\n(() => {{\n{parts}}})();\n')
 
 

@@ -21,18 +21,17 @@ from harness.core.files import appending, bytes_of, neutral, replacing, text_of,
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.seals import seal
 from harness.core.statistics import Estimate
-from harness.report.document import Section, Table, document, strong
-from harness.report.library import on_dark_too, picture
+from harness.report.document import Chart, Section, Table, document, strong
+from harness.studies.figures import charts
+from harness.studies.figures.described import Draws
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from harness.report.drawing.pictures import Format
 
 DRAWN: "tuple[Format, ...]" = ("svg", "pdf", "png")  # the kinds of picture in a study's folder
 ROWS_AT_ONCE = 1 << 14  # of a table that is written as JSON
-WIDEST_REM, REM_PER_INCH = 66, 10.5
 SOURCE = ("name", "latency", "dataset_sha256")  # of a source, what makes a study another one
 
 
@@ -45,8 +44,9 @@ class Study:
 
     `kind` names its manifest's file; `headline` is the outcome in sentences, `about` says how it
     was made, `caveats` what a reader must know first, and `verdicts` what it passed. `tables` are
-    to be shown, and `data` to be written, by file name. `answer` is what --json prints, and
-    `figures` draws the pictures by file name. `more` is HTML that its page shows below the tables.
+    to be shown, and `data` to be written, by file name. `answer` is what --json prints. `figures`
+    takes what draws, for the page or for files, and returns the figures by file name; None for
+    none. `more` is HTML that its page shows below the tables.
     """
 
     kind: str  # names its manifest, `<kind>.json`
@@ -59,8 +59,8 @@ class Study:
     data: "Mapping[str, pd.DataFrame]"
     manifest: Mapping[str, Any]  # what it was made of
     answer: Any  # what `--json` prints, a data frame or plain values
-    # draws them by file name, where matplotlib is installed
-    figures: "Callable[[], Mapping[str, Figure]]" = dict
+    # takes what draws, for the page or for files, and returns them by file name; None for none
+    figures: Callable[[Draws[Any]], Mapping[str, Any]] | None = None
     caveats: Sequence[str] = ()  # what a reader must know first
     verdicts: Sequence[str] = ()  # of the tests that it was to pass, a sentence each
     more: Markup = field(default_factory=Markup)  # what else the page shows, below the tables
@@ -96,28 +96,26 @@ def percent(row: Any, value: str, low: str, high: str) -> str:
     return PERCENT.interval(row[value], row[low], row[high])
 
 
-UNDRAWN = "The same command with --pictures draws figures into this page."
-
-
 def write_study(study: Study, out: Path, draws: bool = True) -> Path:
     """Write a study's figures, tables, page and manifest into a folder; return the page's path.
 
-    Figures are left out unless `draws`, and if matplotlib, whose import alone takes longer than
-    many a study, is not installed. Raises UserError if the folder holds something else.
+    The page draws its charts in a browser. Figures are also written as files if `draws`, unless
+    matplotlib, whose import alone takes longer than many a study, is not installed. Raises
+    UserError if the folder holds something else.
     """
     refuse_taken(out, study.kind)
     out.mkdir(parents=True, exist_ok=True)
-    pictures = _pictures(study, out) if draws and undrawn(study) is None else {}
+    if draws and undrawn(study) is None:
+        _draw(study, out)
     for stem, table in study.data.items():
         write_table(table, out / stem)
-    has_none = not draws and study.figures is not dict
     section = Section(
         study.title,
         [*study.headline, *study.verdicts],
-        [*study.about, UNDRAWN] if has_none else study.about,
+        study.about,
         study.tables,
         caveats=study.caveats,
-        pictures=pictures,
+        charts=_charts(study),
         more=study.more,
     )
     write_whole(out / "index.html", document([section]))
@@ -128,11 +126,11 @@ def write_study(study: Study, out: Path, draws: bool = True) -> Path:
 
 
 def undrawn(study: Study) -> UserError | None:
-    """Return the error for a study whose figures cannot be drawn; None if they can be.
+    """Return the error for a study whose figures cannot be written as files; None if they can be.
 
     Matplotlib, which draws them, is not installed then.
     """
-    if study.figures is dict:
+    if study.figures is None:
         return None
     try:
         extras.need("drawing figures", "matplotlib")
@@ -141,17 +139,27 @@ def undrawn(study: Study) -> UserError | None:
     return None
 
 
-def _pictures(study: Study, out: Path) -> dict[str, tuple[str, int]]:
-    """Draw the figures into a folder; return each as an address, with its width in rem."""
+def _draw(study: Study, out: Path) -> None:
+    """Draw the figures into a folder, each in all formats."""
+    if study.figures is None:
+        return
     from harness.report.drawing.pictures import save
+    from harness.studies.figures import pictures
 
-    pictures = {}
-    for stem, figure in study.figures().items():
+    for stem, figure in study.figures(pictures).items():
         for kind in DRAWN:
             save(figure, out / f"{stem}.{kind}", kind, dpi=300)
-        width_rem = round(min(WIDEST_REM, REM_PER_INCH * figure.get_size_inches()[0]))
-        pictures[stem] = picture(on_dark_too(bytes_of(out / f"{stem}.svg", "picture"))), width_rem
-    return pictures
+
+
+def _charts(study: Study) -> dict[str, Chart]:
+    """Return the charts of the study's page by name, a figure's panels one after the other."""
+    if study.figures is None:
+        return {}
+    named = {}
+    for stem, panels in study.figures(charts).items():
+        for n, chart in enumerate(panels, 1):
+            named[stem if len(panels) == 1 else f"{stem}-{n}"] = chart
+    return named
 
 
 def write_table(table: "pd.DataFrame", path: Path) -> None:

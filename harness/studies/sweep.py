@@ -29,13 +29,13 @@ from harness.studies.axes import (
     usual_at,
 )
 from harness.studies.figures.axes import interval_of, lead_in
+from harness.studies.figures.described import Draws
 from harness.studies.play import PanelResult, Source, joined, play
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, percent, refuse_other
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 ESTIMATE = ("mean", "ci_low", "ci_high")
 HEADS = {
@@ -243,33 +243,30 @@ def run_sweep(
         # Anew, since sources state what was left out.
         {**manifest, "sources": [s.manifest() for s in sources], "versions": versions()},
         summary,
-        lambda: _figures(summary, results),
+        lambda draws: _figures(draws, summary, results),
         [caveat for run in runs for caveat in run.caveats],
     )
 
 
 def _figures(
-    summary: "pd.DataFrame", results: Mapping[str, Sequence[PanelResult]]
-) -> "dict[str, Figure]":
+    draws: Draws[Any], summary: "pd.DataFrame", results: Mapping[str, Sequence[PanelResult]]
+) -> dict[str, Any]:
     """Draw lines of the axes that are varied alone, bars of the conditions,
     and maps of crossed axes.
     """
-    from harness.studies.figures.bars import operating_points
-    from harness.studies.figures.lines import along
-
     figures = {}
     varied_alone = [panel for panel in results if panel != CORE and CROSS not in panel]
     if varied_alone:
-        figures["sweep"] = along([summary[summary.panel == panel] for panel in varied_alone])
+        figures["sweep"] = draws.along([summary[summary.panel == panel] for panel in varied_alone])
     for n, part in enumerate(results.get(CORE, ()), 1):
-        figures[f"operating-points-{n}"] = operating_points(part.summary)
+        figures[f"operating-points-{n}"] = draws.operating_points(part.summary)
     crossed_panels = [panel for panel in results if CROSS in panel]
     maps = []
     for part in (part for panel in crossed_panels for part in results[panel]):
         for _, of_condition in part.summary.groupby("condition", sort=False):
             maps.append(of_condition)
     for n, of_condition in enumerate(maps, 1):
-        figures["sweep" if n == 1 else f"sweep-{n}"] = _map(of_condition)
+        figures["sweep" if n == 1 else f"sweep-{n}"] = _map(draws, of_condition)
     return figures
 
 
@@ -286,12 +283,10 @@ def counts(sources: Sequence[Source], seeds: Sequence[int]) -> str:
     return f"{'; '.join(of_sources)} (channel seeds {', '.join(map(str, seeds))})"
 
 
-def _map(part: "pd.DataFrame") -> "Figure":
+def _map(draws: Draws[Any], part: "pd.DataFrame") -> Any:
     """Draw success of crossed axes: the first down, the second across,
     a panel for each of the others.
     """
-    from harness.studies.figures.heat_map import heat_map
-
     down, across, *panel_axes = part.variable.iloc[0].split(CROSS)
     rows = part[(part.metric == lead_in(part)) & (part.interval == interval_of(part))]
     groups = rows.groupby(panel_axes, sort=False) if panel_axes else [((), rows)]
@@ -303,7 +298,7 @@ def _map(part: "pd.DataFrame") -> "Figure":
         panels[", ".join([str(group.condition.iloc[0]), *names])] = 100 * wide.to_numpy(dtype=float)
     rows_of_map = [_text(value) for value in wide.index]
     columns_of_map = [_text(value) for value in wide.columns]
-    return heat_map(panels, rows_of_map, columns_of_map, down, across)
+    return draws.heat_map(panels, rows_of_map, columns_of_map, down, across)
 
 
 def tables(summary: "pd.DataFrame") -> list[Table]:

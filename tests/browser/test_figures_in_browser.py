@@ -108,15 +108,21 @@ def test_every_name_of_a_reports_legends_lies_in_its_chart(opened, small, tmp_pa
 
 
 @pytest.mark.exhaustive
-def test_a_dark_page_has_no_white_figure(browser, studies):
+def test_a_dark_page_draws_every_chart_and_none_is_white(browser, studies):
     page = browser.new_page(viewport=WIDE, color_scheme="dark")
+    said = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
     for name, folder in studies.items():
         if not (folder / "index.html").exists():
             continue  # a radio's picture has no page
         page.goto((folder / "index.html").as_uri())
-        for place, figure in enumerate(page.locator("figure img").all()):
+        page.wait_for_selector("body[data-drawn]", state="attached")
+        assert page.locator(".chart").count() == page.locator(".chart svg").count() > 0
+        for place, figure in enumerate(page.locator(".chart svg").all()):
             shown = np.asarray(Image.open(BytesIO(figure.screenshot())).convert("L"))
             assert shown[12, 12] < DARK, (name, place)
             assert shown.max() > 200, "its axes are light"
         picture(page, f"study-{name}-dark")
+    assert said == []
     page.close()

@@ -6,7 +6,9 @@ from typing import Any
 import pytest
 
 from harness.core.statistics import Estimate
-from harness.studies.figures.points import Rows, intervals
+from harness.studies.figures import charts
+from harness.studies.figures.described import Rows
+from harness.studies.figures.points import intervals
 
 HALF, LOW = Estimate(0.5, 0.25, 0.875, 8, 0), Estimate(0.125, math.nan, math.nan, 1, 0)
 NONE = Estimate(math.nan, math.nan, math.nan, 0, 8)
@@ -37,6 +39,15 @@ def test_each_point_and_interval_is_where_its_estimate_says() -> None:
     assert low <= 0
     assert high >= 100
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["a", "b"]
+
+
+def test_a_chart_has_the_same_points_and_ends() -> None:
+    rows = Rows("share, %", ["one", "two"], {"a": [HALF, None], "b": [LOW, NONE]})
+    [chart] = charts.intervals([rows], COLOURS)
+    assert chart.spec["data"]["values"] == [
+        {"name": "one", "series": "a", "value": 50, "low": 25, "high": 87.5},
+        {"name": "one", "series": "b", "value": 12.5, "low": None, "high": None},
+    ]
 
 
 def test_a_series_of_which_nothing_is_known_is_in_the_legend_and_draws_nothing() -> None:

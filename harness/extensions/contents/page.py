@@ -35,14 +35,12 @@ from harness.runs.headline import SUCCESS
 from harness.runs.metric_names import LATENCY
 from harness.runs.metrics import entry
 from harness.studies.axes import Setting
+from harness.studies.figures.described import Draws, Steps
 from harness.studies.paper_numbers import paper_numbers
 from harness.studies.study import Study, p_cell, percent
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
-
-    from harness.studies.figures.points import Steps
 
 BESIDE = 3  # panels of a figure
 SPENDING = ("tau_nats", "max_helpers")  # axes that vary the bits
@@ -87,22 +85,20 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
         {"points": points, "groups": by_group},
         {**manifest, "versions": versions()},
         points,
-        lambda: _figures(results),
+        lambda draws: _figures(draws, results),
         [*_left_out(results), *(caveat for run in runs for caveat in run.caveats)],
     )
 
 
-def _figures(results: Sequence[Result]) -> "dict[str, Figure]":
-    from harness.studies.figures.lines import along
-    from harness.studies.figures.points import fronts
-
+def _figures(draws: Draws[Any], results: Sequence[Result]) -> dict[str, Any]:
     figures = {}
     for n, result in enumerate(results, 1):
-        figures[f"cost-{n}"] = fronts(list(_costs(result)), result.words)
+        figures[f"cost-{n}"] = draws.fronts(list(_costs(result)), result.words)
         curves, colours = _curves(result), dict(zip(result.model.contents, cycle(COLOURS)))
         for first in range(0, len(curves), BESIDE):
             beside = curves[first : first + BESIDE]
-            figures[f"along-{n}-{first // BESIDE + 1}"] = along(beside, _marks(beside), colours)
+            drawn = draws.along(beside, _marks(beside), colours)
+            figures[f"along-{n}-{first // BESIDE + 1}"] = drawn
     return figures
 
 
@@ -323,10 +319,8 @@ def _by_group(result: Result, rows: "pd.DataFrame") -> Table:
     return Table(title, heads, cells, "Episodes of all families together; n is their number.")
 
 
-def _costs(result: Result) -> "Iterator[tuple[str, str, list[Steps]]]":
+def _costs(result: Result) -> Iterator[tuple[str, str, list[Steps]]]:
     """Yield success against bits, and against age, of all points, a front a content."""
-    from harness.studies.figures.points import Steps
-
     costs = (("bits of an episode, kbit", _kbit), ("age when the ego acts, ms", _age))
     for title, cost in costs:
         steps = []
@@ -336,9 +330,8 @@ def _costs(result: Result) -> "Iterator[tuple[str, str, list[Steps]]]":
             places = sorted((cost(each), -100 * each.success.value) for each in outcomes)
             x, y = np.array(places).T * [[1], [-1]]
             best = y >= np.maximum.accumulate(y)
-            colour = {"color": COLOURS[n % len(COLOURS)]}
-            marker = {"marker": MARKERS[n % len(MARKERS)], "markersize": 4, "linestyle": ""}
-            steps.append(Steps(content, x, y, colour | marker))
+            colour, marker = COLOURS[n % len(COLOURS)], MARKERS[n % len(MARKERS)]
+            steps.append(Steps(content, x, y, colour, "", marker))
             steps.append(Steps("", x[best], y[best], colour))
         yield result.model.name, title, steps
 

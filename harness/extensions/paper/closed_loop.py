@@ -6,7 +6,7 @@ the same way (docs/decisions/0014), so a grid costs far less than its points one
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -20,13 +20,13 @@ from harness.evaluate.spec import Spec
 from harness.radio.constant import density_coupled_loss
 from harness.runs.records import ClosedLoop, Score
 from harness.studies.axes import AXES, CORE, Setting, Value, described, grid
+from harness.studies.figures.described import Draws
 from harness.studies.play import ENDS, PER_DECISION
 from harness.studies.study import Study
 from harness.studies.sweep import in_a_sentence, tables
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 SHOWN = (*ENDS, *PER_DECISION)
 VEHICLES = 4  # the ego and the scenario's three helpers
@@ -103,15 +103,14 @@ def run_closed_loop(
         {"conditions": summary},
         {"run": RUN, "panels": described(grids), "versions": m.versions},
         summary,
-        lambda: _figures(core, sweeps),
+        lambda draws: _figures(draws, core, sweeps),
     )
 
 
-def _figures(core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]") -> "dict[str, Figure]":
-    from harness.studies.figures.bars import operating_points
-    from harness.studies.figures.lines import along
-
-    return {"figure-a": operating_points(core), "figure-b": along(sweeps)}
+def _figures(
+    draws: Draws[Any], core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]"
+) -> dict[str, Any]:
+    return {"figure-a": draws.operating_points(core), "figure-b": draws.along(sweeps)}
 
 
 def _summary(done: Evaluated, grids: Mapping[str, Sequence[Setting]]) -> "pd.DataFrame":

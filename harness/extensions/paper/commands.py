@@ -33,7 +33,7 @@ def paper(
     """Compare the calibrated proxy with the paper's numbers.
 
     It plays the paper's study, and writes a page with both numbers.
-    With --pictures, it draws Figures A and B.
+    With --pictures, it writes Figures A and B as files, too.
     """
     from harness.extensions.paper.panels import panels, run_paper
     from harness.studies.study import refuse_other
@@ -80,7 +80,7 @@ def closed_loop(
 ) -> None:
     """Run the paper's panels with a model in closed loop.
 
-    With --pictures, it draws Figures A and B.
+    With --pictures, it writes Figures A and B as files, too.
     """
     from harness.backends import cards
     from harness.backends.cache import default_file

@@ -12,12 +12,12 @@ from harness.extensions.paper.calibrated import Calibrated
 from harness.extensions.paper.ledger import headline, ledger, marks, tables
 from harness.report.document import Table
 from harness.studies.axes import AXES, CORE, Axis, Setting, Value, axis_of, described, grid
+from harness.studies.figures.described import Draws
 from harness.studies.play import joined, play
 from harness.studies.study import Study, percent
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 WEIGHTS = "min_distance_m"  # the setting that flattens the weights of Equation 2
 EQUAL_M = 1000.0  # beyond every distance, so that all weights are equal
@@ -119,7 +119,7 @@ def run_paper(
             "versions": versions(),
         },
         numbers,
-        lambda: _figures(core, sweeps, paper_marks),
+        lambda draws: _figures(draws, core, sweeps, paper_marks),
     )
 
 
@@ -137,15 +137,15 @@ def _fitted(proxy: Mapping[str, Any]) -> Table:
 
 
 def _figures(
-    core: "pd.DataFrame", sweeps: "Sequence[pd.DataFrame]", paper_marks: "pd.DataFrame"
-) -> "dict[str, Figure]":
+    draws: Draws[Any],
+    core: "pd.DataFrame",
+    sweeps: "Sequence[pd.DataFrame]",
+    paper_marks: "pd.DataFrame",
+) -> dict[str, Any]:
     """Return both figures, with the paper's values as marks."""
-    from harness.studies.figures.bars import operating_points
-    from harness.studies.figures.lines import along
-
     return {
-        "figure-a": operating_points(core, paper_marks),
-        "figure-b": along(sweeps, paper_marks),
+        "figure-a": draws.operating_points(core, paper_marks),
+        "figure-b": draws.along(sweeps, paper_marks),
     }
 
 

@@ -32,15 +32,13 @@ from harness.report.drawing.colours import COLOURS, INK, MARKERS
 from harness.runs.alike import different, setup
 from harness.runs.headline import BALANCED
 from harness.runs.success import Success
+from harness.studies.figures.described import Draws, Line, Steps
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import Study, corrected, p_cell, refuse_other
 from harness.studies.sweep import point_of
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
-
-    from harness.studies.figures.points import Steps
 
 RESAMPLES = 2000
 # of decision points that ask nobody, at the thresholds that are tried
@@ -621,7 +619,7 @@ def schedule_study(
             "versions": versions(),
         },
         data["schedules"],
-        lambda: {"fronts": _fronts(compared)},
+        lambda draws: {"fronts": _fronts(draws, compared)},
         [caveat for run in runs for caveat in run.caveats],
     )
 
@@ -672,38 +670,42 @@ def headline(compared: Compared) -> list[str]:
     return sentences
 
 
-def _fronts(compared: Sequence[Compared]) -> "Figure":
-    from harness.studies.figures.points import fronts
-
+def _fronts(draws: Draws[Any], compared: Sequence[Compared]) -> Any:
     panels = [
         (f"{run.name}, {run.point.name}", BUDGETS[cost], list(_steps(run, cost)))
         for run in compared
         for cost in BUDGETS
         if cost == "messages" or run.energy
     ]
-    return fronts(panels, compared[0].success_rule.words)
+    return draws.fronts(panels, compared[0].success_rule.words)
 
 
-def _steps(run: Compared, cost: str) -> "Iterator[Steps]":
+def _steps(run: Compared, cost: str) -> Iterator[Steps]:
     """Yield the settings that are taken as the budget grows."""
-    from harness.studies.figures.points import Steps
 
-    def steps(label: str, plays: Sequence[Play], **look: Any) -> "Steps":
+    def steps(
+        label: str,
+        plays: Sequence[Play],
+        colour: str,
+        line: Line = "-",
+        marker: str = "",
+        size: float = 3.0,
+    ) -> Steps:
         success = [100 * play.rate for play in plays]
-        return Steps(label, [play.means[cost] for play in plays], success, look)
+        costs = [play.means[cost] for play in plays]
+        return Steps(label, costs, success, colour, line, marker, size)
 
     for n, name in enumerate(name for name in run.names if name != NEVER):
         yield steps(
             name,
             run.front(name, cost),
-            linestyle="-" if n < len(COLOURS) else ":",
-            markersize=3,
-            color=COLOURS[n % len(COLOURS)],
-            marker=MARKERS[n % len(MARKERS)],
+            COLOURS[n % len(COLOURS)],
+            "-" if n < len(COLOURS) else ":",
+            MARKERS[n % len(MARKERS)],
         )
-    yield steps("oracle, a bound", run.oracle_front(), linestyle="--", color=INK)
+    yield steps("oracle, a bound", run.oracle_front(), INK, "--")
     tau = f"entropy above {run.point.ask.tau_nats:g}"
-    yield steps(tau, [run.paper], linestyle="", marker="*", color=INK, markersize=9)
+    yield steps(tau, [run.paper], INK, "", "*", 9.0)
 
 
 def _table(run: Compared) -> Table:

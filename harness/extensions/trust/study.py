@@ -11,7 +11,7 @@ from fractions import Fraction
 from functools import cached_property, partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -38,13 +38,11 @@ from harness.runs.headline import SUCCESS
 from harness.runs.places import mean_by_place
 from harness.runs.success import Success
 from harness.studies.axes import NONE, Setting, axis_of, usual_at
+from harness.studies.figures.described import Draws
 from harness.studies.play import WalkResult
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Cells, Study, corrected, ends, refuse_other
 from harness.studies.sweep import point_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 RESAMPLES = 2000
 Key = tuple[str, str, float]  # rule, attack, share
@@ -522,7 +520,7 @@ def trust_study(bench: Bench) -> Study:
             "alone": as_mapping(bench.success_rule.estimate(bench.alone)),
             "means": means,
         },
-        lambda: {"heat-map": _heat_map(bench)},
+        lambda draws: {"heat-map": _heat_map(draws, bench)},
         bench.caveats,
     )
 
@@ -541,10 +539,8 @@ def _cell(bench: Bench, cell: Cell) -> dict[str, Any]:
     }
 
 
-def _heat_map(bench: Bench) -> "Figure":
+def _heat_map(draws: Draws[Any], bench: Bench) -> Any:
     """Draw success of each rule under each attack, a panel a share of attackers."""
-    from harness.studies.figures.heat_map import heat_map
-
     panels = {}
     for share in bench.shares:
         rows = []
@@ -553,7 +549,7 @@ def _heat_map(bench: Bench) -> "Figure":
             successes = [bench.success(rule, attack, of_attack) for rule in bench.rules]
             rows.append([100 * success.value for success in successes])
         panels[_title(share)] = np.array(rows)
-    return heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)
+    return draws.heat_map(panels, ["nobody attacks", *bench.attacks], bench.rules)
 
 
 def headline(bench: Bench) -> list[str]:

@@ -12,7 +12,7 @@ from harness.extensions.view.folder import own_file, whole
 from harness.extensions.view.pages import RUNS, suite_of, whole_text, with_way_back
 from harness.report import suite as suites
 from harness.report import words
-from harness.report.document import Section, Table, document, linked
+from harness.report.document import Chart, Section, Table, document, linked
 from harness.report.findings import Kind, findings
 from harness.report.page import render
 from harness.report.runs import gather
@@ -51,7 +51,7 @@ def export(folder: Path, out: Path, progress: Callable[[int], object]) -> list[s
 
     A suite is one model's runs on several scenarios. Every page of a run is drawn anew: what else
     lies in its folder is not published. A study's page is published as it is, if it begins as one
-    that may run no script.
+    that may run no script but those which draw its charts.
 
     Args:
         folder: the folder whose runs `harness view` lists.
@@ -124,12 +124,13 @@ def _page(folder: Path, run: Listed) -> tuple[str, Run | SuiteRun | None]:
 def _study(folder: Path, run: Listed) -> str:
     file = own_file(folder, run.name, INDEX)
     page = whole_text(file) if file else ""
-    # What stands there forbids scripts in all that follows, and only a `http-equiv` could lead
-    # elsewhere.
-    head = document([Section("")]).partition("<title>")[0]
-    if not page.startswith(head) or "http-equiv" in page.removeprefix(head).casefold():
-        raise UserError(f"a {run.kind} without a page that this version wrote; make it again")
-    return page
+    # What stands there forbids scripts in all that follows, or all but those of charts, and only a
+    # `http-equiv` could lead elsewhere.
+    for charts in ({}, {"": Chart("", {})}):
+        head = document([Section("", charts=charts)]).partition("<title>")[0]
+        if page.startswith(head) and "http-equiv" not in page.removeprefix(head).casefold():
+            return page
+    raise UserError(f"a {run.kind} without a page that this version wrote; make it again")
 
 
 def _near(path: Path, run: Run) -> str:

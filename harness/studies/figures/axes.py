@@ -1,18 +1,24 @@
 """What figures of studies share: plain axes, letters, intervals, and the paper's values."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.report.drawing.colours import INK, PALE
+from harness.report.drawing.colours import COLOURS, INK, PALE, conditions
 from harness.runs.headline import headline_metric
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+Curve = tuple[str, str]  # a source and a condition
 ROOM_IN = 0.5  # for names below a figure, in its height
+CLOUD_MS = 510.0  # the paper's cloud comparator, which it cites and nobody can run
+BEST_BAND = (0.65, 0.70)  # of tau, the paper's
+# of success
+BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "trigger rate")}
 
 
 def paper_values(
@@ -71,6 +77,22 @@ def interval_of(rows: "pd.DataFrame") -> str:
     `seed means`, over seeds of the radio channel's random draws.
     """
     return "episodes" if (rows.interval == "episodes").any() else "seed means"
+
+
+def curve_colours(
+    panels: "Sequence[pd.DataFrame]", given: Mapping[str, str] | None
+) -> dict[Curve, str]:
+    """Return the colour of each curve, by its source (such as a run) and its condition.
+
+    `panels` are parts of a study's summary, and `given` has colours of conditions; None for the
+    usual ones. If there are several sources, each curve has a colour of its own.
+    """
+    pairs = (zip(panel.source, panel.condition, strict=True) for panel in panels)
+    curves = list(dict.fromkeys(chain.from_iterable(pairs)))
+    if len({source for source, _ in curves}) > 1:
+        return dict(zip(curves, cycle(COLOURS)))
+    named = given or conditions(condition for _, condition in curves)
+    return {curve: named[curve[1]] for curve in curves}
 
 
 def plain(axes: Any, lines: str) -> None:

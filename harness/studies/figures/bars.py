@@ -12,6 +12,7 @@ from harness.report.drawing.pictures import styled
 from harness.runs.headline import IN_WORDS, SUCCESS
 from harness.studies.axes import CORE
 from harness.studies.figures.axes import (
+    CLOUD_MS,
     cross,
     interval_of,
     key,
@@ -24,7 +25,6 @@ from harness.studies.figures.axes import (
 if TYPE_CHECKING:
     import pandas as pd
 
-CLOUD_MS = 510.0  # the paper's cloud comparator, which it cites and nobody can run
 SHORT = 13  # characters of a name that fit under a bar
 
 

@@ -1,18 +1,21 @@
 """Lines: success along an axis."""
 
 from collections.abc import Mapping, Sequence
-from itertools import chain, cycle
 from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from harness.report.drawing.colours import COLOURS, FAINT, GREY, MARKERS, conditions
+from harness.report.drawing.colours import FAINT, GREY, MARKERS
 from harness.report.drawing.pictures import styled
 from harness.runs.headline import IN_WORDS, SUCCESS
 from harness.studies.axes import axis_of
 from harness.studies.figures.axes import (
+    BESIDE,
+    BEST_BAND,
+    Curve,
     cross,
+    curve_colours,
     interval_of,
     key,
     lead_in,
@@ -24,12 +27,7 @@ from harness.studies.figures.axes import (
 if TYPE_CHECKING:
     import pandas as pd
 
-
-Curve = tuple[str, str]  # a source and a condition
 LEAST_IN = 3.6  # width of a figure
-BEST_BAND = (0.65, 0.70)  # of tau, the paper's
-# of success
-BESIDE = {"size": ("effective_loss", "packet loss"), "tau": ("trigger_rate", "trigger rate")}
 
 
 @styled
@@ -50,7 +48,7 @@ def along(
     width = max(2.5 * len(panels) + 0.2, LEAST_IN)
     figure = Figure(figsize=(width, 2.7), layout=ConstrainedLayoutEngine(w_pad=0.1))
     drawn = figure.subplots(1, len(panels), squeeze=False)[0]
-    of_curves = _colours(panels, colours)
+    of_curves = curve_colours(panels, colours)
     for axes, panel in zip(drawn, panels, strict=True):
         _along(axes, panel, paper, of_curves)
     lettered(drawn)
@@ -61,15 +59,6 @@ def along(
         }
     key(figure, named, most=3)
     return figure
-
-
-def _colours(panels: "Sequence[pd.DataFrame]", given: Mapping[str, str] | None) -> dict[Curve, str]:
-    pairs = (zip(panel.source, panel.condition, strict=True) for panel in panels)
-    curves = list(dict.fromkeys(chain.from_iterable(pairs)))
-    if len({source for source, _ in curves}) > 1:
-        return dict(zip(curves, cycle(COLOURS)))
-    named = given or conditions(condition for _, condition in curves)
-    return {curve: named[curve[1]] for curve in curves}
 
 
 def _along(

@@ -3,49 +3,15 @@ what one costs in another.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from harness.core.statistics import Estimate
 from harness.report.drawing.colours import INK, MARKERS
 from harness.report.drawing.pictures import styled
 from harness.studies.figures.axes import key, lettered, plain
-
-
-@dataclass(frozen=True)
-class Steps:
-    """Describe a step curve of a figure, whose points ascend in x and y.
-
-    `x` is where each step begins, in the axis's unit, and `y` its height. `label` is the curve's
-    name in the legend, `look` has Matplotlib's arguments for how the line is drawn, and `name` is
-    written beside its last point.
-    """
-
-    label: str  # the curve's name in the legend; empty for none
-    x: Sequence[float]  # where each step begins, ascending, in the axis's unit
-    y: Sequence[float]  # the height of each step, ascending
-    # how it is drawn: keyword arguments of Matplotlib's `Axes.plot`
-    look: Mapping[str, Any] = field(default_factory=dict)
-    name: str = ""  # beside the last place
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Describe a panel of estimates: a row for each of `names`, and in it one of each series.
-
-    A series is such as the estimates of one model: `series` has them by its name, in the order of
-    the rows. An unknown one is None; each is drawn times `scale`, 100 for percent; `quantity` is
-    what it is, with its unit.
-    """
-
-    quantity: str  # along the panel, with its unit
-    names: Sequence[str]  # of the rows, from top to bottom
-    series: Mapping[str, Sequence[Estimate | None]]  # by its name, an estimate for each row
-    scale: float = 100.0  # what an estimate is multiplied with: 100 for percent
+from harness.studies.figures.described import Rows, Steps
 
 
 @styled
@@ -107,7 +73,15 @@ def fronts(panels: Sequence[tuple[str, str, Sequence[Steps]]], success: str) -> 
     ):
         for line in lines:
             axes.plot(
-                line.x, line.y, drawstyle="steps-post", linewidth=1, label=line.label, **line.look
+                line.x,
+                line.y,
+                drawstyle="steps-post",
+                linewidth=1,
+                linestyle=line.line,
+                color=line.colour,
+                marker=line.marker,
+                markersize=line.size,
+                label=line.label,
             )
         axes.set(xlabel=cost, ylabel=f"{success}, %" if axes is figure.axes[0] else "")
         axes.set_title(title, fontsize=8)

@@ -31,10 +31,12 @@ from harness.extensions.mixed_helpers.grid.study import (
     run_cells,
 )
 from harness.prompts import versions
+from harness.report.drawing.colours import INK
 from harness.runs.headline import BALANCED, SUCCESS
 from harness.runs.metric_names import LATENCY
 from harness.runs.settings import Settings
 from harness.runs.success import Success
+from harness.studies.figures.described import Steps
 from harness.studies.study import write_study
 
 pytestmark = pytest.mark.usefixtures("svg_alone")
@@ -224,11 +226,9 @@ def test_a_grid_s_folder_has_page_tables_and_pictures(grid: Grid, small: Dataset
 
 
 def test_names_in_the_figure_stay_inside_of_its_axes() -> None:
-    figures = pytest.importorskip("harness.studies.figures.points", reason="needs the report extra")
-    steps = [
-        figures.Steps("", [x], [x], name=letter * 30) for x, letter in ((0.0, "a"), (100.0, "b"))
-    ]
-    figure = figures.fronts([("", "latency of a decision, ms", steps)], "success")
+    drawing = pytest.importorskip("harness.studies.figures.points", reason="needs the report extra")
+    steps = [Steps("", [x], [x], INK, name=letter * 30) for x, letter in ((0.0, "a"), (100.0, "b"))]
+    figure = drawing.fronts([("", "latency of a decision, ms", steps)], "success")
     figure.draw_without_rendering()
     [axes] = figure.axes
     for name in axes.texts:

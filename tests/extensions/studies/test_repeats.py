@@ -278,7 +278,7 @@ def test_the_folder_has_a_page_and_all_figures(
     assert page.index("decides differently in 55.6 [") < page.index("<table")
     assert "pass^3" in page
     assert "2 × SLOWER, 2 × IDLE" in page
-    assert page.index("<img") < page.index("<table")
+    assert page.index("data-chart") < page.index("<table")
     drawn = (of.path / "repeats.svg").read_text()
     assert all(
         f">{row}<" in drawn

@@ -18,7 +18,7 @@ import pytest
 import uvicorn
 
 from harness.extensions.view.access import cookie
-from harness.report.document import Section, document
+from harness.report.document import Chart, Section, document
 from harness.report.words import cell
 from harness.runs.folder import read
 from harness.runs.headline import headline_of
@@ -175,10 +175,16 @@ def test_a_run_that_has_the_name_of_a_page_is_left_out_and_all_others_are_export
         ("<title>", "<meta\nhttp-equiv\n=\nrefresh content=0><title>"),
     ],
 )
-def test_an_exported_folder_has_studies_whose_page_can_run_no_script_and_leads_nowhere(
-    old: str, new: str, reports: Path, harness: Callable[..., Said], tmp_path: Path
+@pytest.mark.parametrize("charts", [{}, {"loss": Chart("Success over loss", {})}])
+def test_an_exported_folder_has_studies_whose_page_runs_no_other_script_and_leads_nowhere(
+    old: str,
+    new: str,
+    charts: dict[str, Chart],
+    reports: Path,
+    harness: Callable[..., Said],
+    tmp_path: Path,
 ) -> None:
-    page = document([Section("A sweep of many points")])
+    page = document([Section("A sweep of many points", charts=charts)])
     (reports / "first/sweep-tau/index.html").write_text(page)
     spy = reports / "second/sweep-tau"
     spy.mkdir()

@@ -41,11 +41,11 @@ from harness.runs.metrics import METRICS
 from harness.runs.places import mean_by_place
 from harness.runs.records import Answer, is_helper
 from harness.runs.success import Success
+from harness.studies.figures.described import Draws, Steps
 from harness.studies.study import Study, corrected, ends, p_cell
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 RESAMPLES = 4000
 FIELDS = ("model", "prompt", "answer")
@@ -435,14 +435,12 @@ def grid_study(grid: Grid, spec: Spec, out: Path) -> Study:
             "versions": versions(),
         },
         data,
-        lambda: _figures(grid),
+        lambda draws: _figures(draws, grid),
     )
 
 
-def _figures(grid: Grid) -> "dict[str, Figure]":
+def _figures(draws: Draws[Any], grid: Grid) -> dict[str, Any]:
     """Draw success of every combination, and against its latency, where the best are joined."""
-    from harness.studies.figures.heat_map import heat_map
-    from harness.studies.figures.points import Steps, fronts
 
     def latencies_ms(cells: Sequence[Cell], condition: str) -> list[float]:
         return [cell.estimate(LATENCY, condition).value for cell in cells]
@@ -454,16 +452,14 @@ def _figures(grid: Grid) -> "dict[str, Figure]":
     for name, colour in conditions(grid.conditions).items():
         rates, best = percents(grid.cells, name), front(grid, name)
         panels[name] = np.array(rates).reshape(grid.rows, grid.columns)
-        marker: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 4}
-        points = marker | {"linestyle": ""}
-        steps.append(Steps(name, latencies_ms(grid.cells, name), rates, points))
+        steps.append(Steps(name, latencies_ms(grid.cells, name), rates, colour, "", "o"))
         x, y = latencies_ms(best, name), percents(best, name)
-        steps.append(Steps("", x, y, marker, pair(grid, best[-1])))
+        steps.append(Steps("", x, y, colour, marker="o", name=pair(grid, best[-1])))
     egos = [grid.name(cell.ego, "ego") for cell in grid.cells[:: grid.columns]]
     helpers = [grid.name(cell.helper, "helper") for cell in grid.cells[: grid.columns]]
     return {
-        "heat-map": heat_map(panels, egos, helpers, "ego", "helpers"),
-        "pareto": fronts([("", "latency of a decision, ms", steps)], grid.success_rule.words),
+        "heat-map": draws.heat_map(panels, egos, helpers, "ego", "helpers"),
+        "pareto": draws.fronts([("", "latency of a decision, ms", steps)], grid.success_rule.words),
     }
 
 

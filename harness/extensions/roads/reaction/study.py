@@ -13,23 +13,25 @@ import numpy as np
 from harness.core.arrays import Bools, Ints, Texts
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
-from harness.core.statistics import rate_interval
+from harness.core.statistics import Estimate, rate_interval
 from harness.core.versions import versions
 from harness.dataset.load import Dataset
 from harness.extensions.roads.family import PREFIX
 from harness.extensions.roads.reaction.stopping import could_stop
 from harness.extensions.roads.replay import HARDEST_MPS2
 from harness.report.document import Table
+from harness.report.drawing.colours import COLOURS
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
+    from harness.studies.figures.described import Draws
     from harness.studies.study import Study
 
 REACT = "react"  # the parameter in which the two datasets differ
 CAREFUL = "SLOWER"
 WORLDS = ("replay", "react")  # columns of a table end so
+LABELS = {"replay": "others only replay", "react": "others react"}
 COUNTED = ("collisions", "struck", "other_crashes")  # of each world
 HEADS = ("crashes", "struck by another", "who could stop", "crashes of others")
 AVOIDABLE = "could_stop_react"  # column of strikes with reaction that braking avoids
@@ -295,11 +297,21 @@ def reaction_study(result: Reaction, manifest: Mapping[str, Any]) -> "Study":
         {"courses": result.courses, "drivers": result.drivers},
         manifest,
         {"courses": result.courses, "drivers": result.drivers},
-        lambda: {"reaction": _bars(result)},
+        lambda draws: {"reaction": _struck(draws, result)},
     )
 
 
-def _bars(result: Reaction) -> "Figure":
-    from harness.extensions.roads.reaction.figure import bars
+def _struck(draws: "Draws[Any]", result: Reaction) -> Any:
+    """Draw how often others strike the ego, by how often it slows down."""
+    from harness.studies.figures.described import Rows
 
-    return bars(result.courses.iloc[:-1])
+    rows = result.courses.iloc[:-1].to_dict("records")
+    series: dict[str, list[Estimate | None]] = {}
+    for world, label in LABELS.items():
+        series[label] = []
+        for row in rows:
+            value, low, high = (row[f"struck_rate_{world}{end}"] for end in ("", "_low", "_high"))
+            series[label].append(Estimate(value, low, high, row["n"], 0))
+    names = [str(row["slower"]) for row in rows]
+    panel = Rows("courses struck by another, %, by decisions that slow down", names, series)
+    return draws.intervals([panel], dict(zip(series, COLOURS, strict=False)))

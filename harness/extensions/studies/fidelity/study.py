@@ -16,7 +16,8 @@ from msgspec.structs import asdict
 from harness.core.errors import UserError, printable
 from harness.core.statistics import joined_clusters
 from harness.core.versions import versions
-from harness.report.document import Table
+from harness.extensions.studies.fidelity.chart import chart
+from harness.report.document import Chart, Table
 from harness.runs.alike import different, setup
 from harness.runs.contradictions import sound
 from harness.runs.folder import Run
@@ -29,11 +30,13 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from harness.studies.figures.described import Draws
     from harness.studies.study import Study
 
 WHO = Variant.__struct_fields__
 KEY = (*WHO, "condition", "seed", "layout_seed")
 ENDS = ("", "_low", "_high")  # of the columns of an estimate
+DRAWN = [f"{world}{end}" for world in ("frozen", "closed") for end in ENDS]
 LEAST_RANKED = 5  # four in the same order are chance in 1 of 12, five in 1 of 60, both ways round
 PLACE = "model · prompt · answers, condition"
 SHOWN = 20  # ways to disagree that the page lists
@@ -233,14 +236,26 @@ def fidelity_study(result: Fidelity, runs: Sequence[Path]) -> "Study":
         {"fidelity": result.table, "episodes": result.episodes},
         {"sources": [{"name": str(run)} for run in runs], "versions": versions()},
         result.table,
-        lambda: {"fidelity": _scatter(result)},
+        lambda draws: {"fidelity": _scatter(draws, result)},
     )
 
 
-def _scatter(result: Fidelity) -> "Figure":
-    from harness.extensions.studies.fidelity.figure import scatter
+def _scatter(draws: "Draws[Any]", result: Fidelity) -> Any:
+    models = [_who(row) for row in result.table.to_dict("records")]
 
-    return scatter(result.table, [_who(row) for row in result.table.to_dict("records")])
+    def picture() -> "Figure":
+        from harness.extensions.studies.fidelity.figure import scatter
+
+        return scatter(result.table, models)
+
+    def points() -> list[Chart]:
+        rows = []
+        for model, row in zip(models, result.table.to_dict("records"), strict=True):
+            percents = {name: 100 * row[name] for name in DRAWN}
+            rows.append({"model": model, "condition": row["condition"], **percents})
+        return [chart(rows)]
+
+    return draws.either(picture, points)
 
 
 def headline(result: Fidelity) -> list[str]:

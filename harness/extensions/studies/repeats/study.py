@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -47,10 +47,8 @@ from harness.runs.metric_names import ALL
 from harness.runs.metric_values import by_episode
 from harness.runs.metrics import METRICS
 from harness.runs.records import Score
+from harness.studies.figures.described import Draws, Rows
 from harness.studies.study import DRAWN, Study
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 RESAMPLES = 4000
 FLIPS, STABLE, BETWEEN = "flip_rate", "stable_rate", "between_episodes_share"
@@ -403,14 +401,12 @@ def repeats_study(repeats: Repeats) -> Study:
         },
         caveats=[*repeats.copies(), *(finding.sentence for finding in warnings)],
         more=Markup("\n").join(links),
-        figures=lambda: {"repeats": _figure(repeats)},
+        figures=lambda draws: {"repeats": _figure(draws, repeats)},
     )
 
 
-def _figure(repeats: Repeats) -> "Figure":
+def _figure(draws: Draws[Any], repeats: Repeats) -> Any:
     """Draw how often decisions stay the same, and what is left of success over several repeats."""
-    from harness.studies.figures.points import Rows, intervals
-
     drawn = [j for j in range(2, repeats.k + 1) if j <= MOST_DRAWN or j == repeats.k]
     shares = {"decisions flip": FLIPS, "same in all": STABLE, "variance between": BETWEEN}
     successes = {f"any@{j}": f"any@{j}" for j in reversed(drawn)}
@@ -422,7 +418,7 @@ def _figure(repeats: Repeats) -> "Figure":
         for name in repeats.conditions:
             estimates[name] = [repeats.estimate(name, metric) for metric in metrics.values()]
         panels.append(Rows(quantity, list(metrics), estimates))
-    return intervals(panels, conditions(repeats.conditions))
+    return draws.intervals(panels, conditions(repeats.conditions))
 
 
 def _tables(repeats: Repeats) -> Iterator[Table]:

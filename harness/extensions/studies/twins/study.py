@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from difflib import SequenceMatcher
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 from markupsafe import Markup, escape
@@ -21,10 +21,8 @@ from harness.report.compare.words import judged
 from harness.report.document import Table
 from harness.report.drawing.colours import ROLES as COLOUR_OF_ROLE
 from harness.report.templating import environment, visible
+from harness.studies.figures.described import Draws, Rows
 from harness.studies.study import Study
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 EXAMPLES = 3  # of each row
 DISTANCE = Unit(decimals=2)
@@ -97,15 +95,13 @@ def twins_study(
         answer,
         caveats=notes(questions, rows, unanswered),
         more=_examples(spec.actions, rows),
-        figures=lambda: {"twins": _figure(rows)},
+        figures=lambda draws: {"twins": _figure(draws, rows)},
         verdicts=[judged(verdict, "-") for verdict in verdicts],
     )
 
 
-def _figure(rows: Sequence[Row]) -> "Figure":
+def _figure(draws: Draws[Any], rows: Sequence[Row]) -> Any:
     """Draw how often each twin holds, and how far apart both answers are, by who was asked."""
-    from harness.studies.figures.points import Rows, intervals
-
     names = list(dict.fromkeys(row.twin.name for row in rows))
     invariance: dict[str, list[Estimate | None]] = {}  # by role, of each name
     distance: dict[str, list[Estimate | None]] = {}
@@ -121,7 +117,7 @@ def _figure(rows: Sequence[Row]) -> "Figure":
         Rows("invariant, %", names, invariance, 100.0),
         Rows("TV distance", names, distance, 1.0),
     ]
-    return intervals(panels, COLOUR_OF_ROLE)
+    return draws.intervals(panels, COLOUR_OF_ROLE)
 
 
 def _cells(questions: Questions, row: Row) -> list[str]:
