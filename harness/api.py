@@ -408,7 +408,7 @@ def sweep(
         progress.more(sum(map(len, panels.values())))
         folder = folder_of(path, panels) if out is None else _path("out", out)
         draws = parse_seeds(seeds) if seeds else replayed.seeds
-        study = run_sweep([replayed], panels, draws, folder, progress)
+        study = run_sweep([replayed], panels, draws, folder, progress, progress.say)
     return Study(write_study(study, folder).parent, study.headline, study.about, study.data)
 
 

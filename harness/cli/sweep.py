@@ -80,5 +80,5 @@ def command(
         where = out or folder_of(runs[0], panels)
         sources: list[Source] = [*replayed, *([SOURCES[PROXY]] if proxy else [])]
         progress.more(len(sources) * sum(map(len, panels.values())))
-        study = run_sweep(sources, panels, draws, where, progress)
+        study = run_sweep(sources, panels, draws, where, progress, progress.say)
     finish(study, where, as_json, quiet, verbose, pictures)

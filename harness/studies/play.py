@@ -54,6 +54,7 @@ COLUMNS = (
     "observed_loss",
 )
 Read = Callable[[Decided[Any]], dict[str, Floats]]  # columns of decisions, (n, ...)
+Rows = Sequence[Mapping[str, Any]]  # of a summary
 
 
 @dataclass(frozen=True)
@@ -195,16 +196,15 @@ def play(
     settings: Sequence[Setting],
     seeds: Sequence[int],
     progress: Callable[[int], None],
+    tell: Callable[[Rows], object] = lambda rows: None,
 ) -> PanelResult:
     """Score a source of answers at every point of a grid, with every channel seed.
 
     A source is such as a run, and each of `settings` a point: an operating point (set of settings)
     with a number of vehicles. The same seed gives the same random draws of the radio channel at all
     of them. `panel` is the name of this set of points in tables; `progress` is called with 1 after
-    each. Returns tables of means and of episodes.
+    each, and `tell` with the rows of its summary. Returns tables of means and of episodes.
     """
-    import pandas as pd
-
     rows, places, episodes = list[dict[str, Any]](), list[dict[str, Any]](), list[dict[str, Any]]()
     for setting, walks in zip(settings, source.walked(settings, seeds), strict=True):
         parts = [_part(walk, len(seeds)) for walk in walks]
@@ -220,6 +220,7 @@ def play(
         place = {"source": source.name, "panel": panel, **setting.place}
         first = {name: place.pop(name) for name in FIRST}
         places.append({**first, **place})
+        first_row = len(rows)
         for metric, estimate, interval in _estimates(source, metrics, latency_ms):
             row = {
                 **first,
@@ -240,7 +241,10 @@ def play(
         }
         is_known = ~np.isnan(played["success"])
         episodes.append({name: values[is_known] for name, values in played.items()})
+        tell(rows[first_row:])
         progress(1)
+    import pandas as pd  # after what people wait for
+
     # One frame of all points, since one of each takes longer than to play it.
     counts = [len(played["episode"]) for played in episodes]
     whole = pd.DataFrame(places).loc[np.repeat(np.arange(len(counts)), counts)]

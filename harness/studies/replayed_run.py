@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,7 @@ from harness.studies.play import Read, WalkResult, metric_columns, walk_through
 
 SILENT = Progress()
 WALKS = 1 << 15  # most that are walked together, unless one grid point has more: some 30 MB
+FEW = 8  # share of them that is walked first, so that who waits sees results soon
 _GIVE_IT = (
     "to ask it, give --model with its folder, .gguf file or hub id, or write a card "
     "models/NAME.toml"
@@ -204,15 +205,17 @@ class ReplayedRun:
             UserError: an operating point needs a fusion call, in which the ego's model reads
                 messages, and the run's model cannot make it.
         """
-        for setting in settings:
-            # which checks that they go together
-            spec = replace(self._asker.spec, points=(setting.point,))
-            spec.check_models(self.run.manifest.identity)
+        every_point = tuple(dict.fromkeys(setting.point for setting in settings))
+        # which checks that they go together
+        spec = replace(self._asker.spec, points=every_point)
+        spec.check_models(self.run.manifest.identity)
         at_once = max(1, WALKS // (len(seeds) * len(self.dataset.episodes)))
         for vehicles, same in groupby(settings, lambda setting: setting.vehicles):
             points = [setting.point for setting in same]
-            for first in range(0, len(points), at_once):
-                yield from self._walked(points[first : first + at_once], vehicles, seeds, read)
+            few = max(1, at_once // FEW)
+            starts = (0, *range(few, len(points), at_once))
+            for first, after in pairwise((*starts, len(points))):
+                yield from self._walked(points[first:after], vehicles, seeds, read)
 
     def _walked(
         self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int], read: Read

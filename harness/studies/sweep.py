@@ -30,7 +30,7 @@ from harness.studies.axes import (
 )
 from harness.studies.figures.axes import interval_of, lead_in
 from harness.studies.figures.described import Draws
-from harness.studies.play import PanelResult, Source, joined, play
+from harness.studies.play import PanelResult, Rows, Source, joined, play
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, percent, refuse_other
 
@@ -200,12 +200,14 @@ def run_sweep(
     seeds: Sequence[int],
     out: Path,
     progress: Callable[[int], None],
+    say: Callable[[str], None] = lambda line: None,
 ) -> Study:
     """Score every source at every grid point of all panels, and return the study.
 
     A source is a run's answers, or what an extension draws; a panel is a named set of grid points,
     operating points with a number of vehicles. All share the channel's random numbers, keyed by
-    `seeds`. `out` is the study's folder; `progress` is called with 1 after each grid point.
+    `seeds`. `out` is the study's folder; `progress` is called with 1 after each grid point, and
+    `say` with a line that has its success.
 
     Raises:
         UserError: the folder holds another sweep.
@@ -227,7 +229,8 @@ def run_sweep(
         for source in sources:
             playable = [setting for setting in points if able(source, setting.point)]
             if playable:
-                results[panel].append(play(source, panel, playable, seeds, progress))
+                tell = _Told(say)
+                results[panel].append(play(source, panel, playable, seeds, progress, tell))
     for run in runs:
         run.settle()
     whole = joined([part for parts in results.values() for part in parts])
@@ -246,6 +249,21 @@ def run_sweep(
         lambda draws: _figures(draws, summary, results),
         [caveat for run in runs for caveat in run.caveats],
     )
+
+
+class _Told:
+    """Say each grid point's success when it is known, below a line that says of what it is."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._title = say, ""
+
+    def __call__(self, rows: Rows) -> None:
+        [table] = _tables(rows)
+        [(place, success, *_)] = table.rows
+        if table.title != self._title:
+            self._say(f"{printable(table.title)}: {table.heads[1]}")
+            self._title = table.title
+        self._say(f"  {printable(place)}  {success}")
 
 
 def _figures(
@@ -307,9 +325,13 @@ def tables(summary: "pd.DataFrame") -> list[Table]:
     `summary` has a row for each grid point, metric and kind of interval. A curve is an operating
     point varied over an axis; the operating points themselves share a table.
     """
+    return _tables(summary.to_dict("records"))
+
+
+def _tables(scores: Sequence[Mapping[Any, Any]]) -> list[Table]:
     heads, rows = dict[str, tuple[str, str]](), dict[str, list[Sequence[str]]]()
     of_places: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for score in summary.to_dict("records"):
+    for score in scores:
         value = None if score["panel"] == CORE else score["value"]
         place = score["source"], score["panel"], score["condition"], value
         metrics = of_places.setdefault(place, {})

@@ -198,6 +198,29 @@ def test_many_points_are_walked_in_parts(
 
 
 @pytest.mark.slow
+def test_a_points_success_is_said_before_later_ones_are_walked(
+    source: ReplayedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    events = list[str]()
+    walked = ReplayedRun._walked
+
+    def noted(self: ReplayedRun, points: Any, *rest: Any) -> Any:
+        events.append(f"{len(points)} walked")
+        yield from walked(self, points, *rest)
+
+    monkeypatch.setattr(ReplayedRun, "_walked", noted)
+    monkeypatch.setattr(replayed_run, "WALKS", 5 * 8)  # of four episodes with two seeds
+    points = settings([source], [AXES["loss"]], [(0.0, 0.25, 0.5)], ["6g"])
+    study = run_sweep(
+        [source], {"loss": points}, source.seeds, tmp_path, lambda n: None, events.append
+    )
+    [table] = study.tables
+    rows = [f"  {place}  {success}" for place, success, *_ in table.rows]
+    title = f"{table.title}: {table.heads[1]}"
+    assert events == ["1 walked", title, rows[0], "2 walked", *rows[1:]]
+
+
+@pytest.mark.slow
 def test_runs_are_paired(source: ReplayedRun, small: Dataset, tmp_path: Path) -> None:
     """The same answers under another prompt's name see the same luck."""
     other = ReplayedRun(run(spec_of(small, prompt="v1"), tmp_path / "v1").out)
