@@ -31,6 +31,20 @@ def test_texts_are_no_formulas_in_csv_and_whole_in_json(tmp_path: Path) -> None:
     assert rows[2]["number"] is None
 
 
+def test_a_table_is_written_as_pandas_writes_it(tmp_path: Path) -> None:
+    table = pd.DataFrame({
+        "real": [0.0, -0.0, 1 / 3, 1e20, float("inf"), float("nan")], "whole": range(6),
+        "same": pd.Series([1, True, 1.0, "1", None, "/"], dtype=object), "flag": [True, False] * 3,
+        "text": ["a", "", "l\nm", "ü\u2028", "q\"", None],
+    })  # fmt: skip
+    for names in (list(table), ["text"]):
+        write_table(table[names], tmp_path / "table")
+        lines = table[names].to_json(orient="records", lines=True)
+        assert (tmp_path / "table.jsonl").read_text() == lines
+        cells = table[names].to_csv(index=False)
+        assert (tmp_path / "table.csv").read_text() == cells
+
+
 def test_a_table_without_rows_has_its_names(tmp_path: Path) -> None:
     write_table(pd.DataFrame({"a": [], "b": []}), tmp_path / "table")
     assert (tmp_path / "table.csv").read_text() == "a,b\n"
