@@ -195,14 +195,13 @@ def _texts(column: "pd.Series[Any]") -> tuple[list[str], list[str]]:
     """
     import pandas as pd
 
-    bits = column
+    codes, values = np.arange(len(column)), column
     if column.dtype == float:
-        bits = pd.Series(column.to_numpy().view(np.int64))  # 0.0 and -0.0 differ
-    codes, places = np.arange(len(column)), np.arange(len(column))
-    if column.dtype != object:  # in which 1, 1.0 and True would be one
-        codes, _ = pd.factorize(bits, use_na_sentinel=False)
-        _, places = np.unique(codes, return_index=True)
-    values = column.iloc[places]
+        codes, bits = pd.factorize(column.to_numpy().view(np.int64))  # 0.0 and -0.0 differ
+        values = pd.Series(bits.view(float), name=column.name)
+    elif column.dtype != object:  # in which 1, 1.0 and True would be one
+        codes, different = pd.factorize(column, use_na_sentinel=False)
+        values = pd.Series(different, name=column.name)
     objects = values.to_frame().to_json(orient="records", lines=True).splitlines()
     if values.hasnans:
         values = values.astype(object).where(values.notna(), None)

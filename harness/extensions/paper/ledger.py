@@ -36,6 +36,8 @@ ASSUMED = {
     "A6": "no roadside edge: the paper calls it optional",
 }
 
+PLACE = ("panel", "condition", "metric", "interval")
+
 
 def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
     """Compare each number of the SwarmDrive paper with ours: a table with a row for each.
@@ -54,6 +56,7 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
     import pandas as pd
 
     fitted = {row for rows in FITTED_ON.values() for row in rows}
+    ours = summary.to_dict("records")
     rows: list[dict[str, Any]] = []
     for row in paper_numbers():
         low = float(row["paper_value"] or row["paper_low"])
@@ -67,7 +70,7 @@ def ledger(summary: "pd.DataFrame") -> "pd.DataFrame":
             continue
         metric, scale, allowed = METRICS[row["metric"]]
         allowed *= low if row["metric"] == "latency" else 1.0
-        for our_row in _our_rows(summary, row, metric):
+        for our_row in _our_rows(ours, row, metric):
             mean = float(our_row["mean"]) * scale
             ci_low, ci_high = float(our_row["ci_low"]) * scale, float(our_row["ci_high"]) * scale
             compared = {
@@ -99,27 +102,28 @@ def verdict(mean: float, ci_low: float, ci_high: float, least: float, most: floa
     return "misses" if ci_low > most or ci_high < least else "unclear"
 
 
-def _our_rows(summary: "pd.DataFrame", row: Mapping[str, str], metric: str) -> list[dict[str, Any]]:
+def _our_rows(
+    summary: Sequence[Mapping[Any, Any]], row: Mapping[str, str], metric: str
+) -> list[Mapping[Any, Any]]:
     """Return our rows for one of the paper's: one,
     or those of the grid points that it speaks of.
     """
-    s = summary[
-        (summary.panel == row["panel"])
-        & (summary.condition == CONDITIONS[row["condition"]])
-        & (summary.metric == metric)
-        & (summary.interval == "seed means")
-    ]
-    value = row["value"]
-    if value.startswith(BELOW):
-        s = s[s.value.astype(float) < float(value.removeprefix(BELOW)) - 1e-9]
-    elif value.startswith(FROM):
-        s = s[s.value.astype(float) >= float(value.removeprefix(FROM)) - 1e-9]
-    elif value:
-        s = s[abs(s.value.astype(float) - float(value)) < 1e-9]
+    place = (row["panel"], CONDITIONS[row["condition"]], metric, "seed means")
     rows = []
-    for record in s.to_dict("records"):
-        rows.append({str(column): value for column, value in record.items()})
+    for each in summary:
+        is_there = tuple(each[name] for name in PLACE) == place
+        if is_there and _at(row["value"], each["value"]):
+            rows.append(each)
     return rows
+
+
+def _at(paper_value: str, value: Any) -> bool:
+    """Return whether a grid point is one that a row of the paper speaks of."""
+    if paper_value.startswith(BELOW):
+        return float(value) < float(paper_value.removeprefix(BELOW)) - 1e-9
+    if paper_value.startswith(FROM):
+        return float(value) >= float(paper_value.removeprefix(FROM)) - 1e-9
+    return not paper_value or abs(float(value) - float(paper_value)) < 1e-9
 
 
 def marks(ledger: "pd.DataFrame") -> "pd.DataFrame":
