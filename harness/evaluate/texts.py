@@ -74,16 +74,16 @@ def refuse_other_kept(
         divides = agent.sums == "divide"
         readers.append(_Reader(agent.prompt, actions, agent.answer, agent.thinking, divides))
     for answer in answers:
-        prefix = f"{printable(file)}: answer {printable(answer.id)} states"
-        if not any(answer.may_take_longer(agent.card.slow_s) for agent in agents):
-            raise UserError(
-                f"{prefix} a delay of {answer.slow_s:g} s, which no card of this run declares; "
-                f"{ASKED_AGAIN}"
-            )
+        fault = None
         # Which vehicle of its scene answered only the dataset knows.
         others = [_other(answer, reader.read(answer)) for reader in readers]
-        if all(others):
-            raise UserError(f"{prefix} another {others[0]} than its text says; {ASKED_AGAIN}")
+        if not any(answer.may_take_longer(agent.card.slow_s) for agent in agents):
+            fault = f"a delay of {answer.slow_s:g} s, which no card of this run declares"
+        elif all(others):
+            fault = f"another {others[0]} than its text says"
+        if fault:
+            where = f"{printable(file)}: answer {printable(answer.id)}"
+            raise UserError(f"{where} states {fault}; {ASKED_AGAIN}")
 
 
 def same(name: str, stated_answer: Answer, here: Answer | Parsed) -> bool:
