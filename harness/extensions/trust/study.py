@@ -8,7 +8,7 @@ have the same episodes, channel draws and attackers, so differences are paired b
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,10 @@ class Cell:
         if self.flagged is None:
             return {}
         n = self.flagged.shape[1]
-        times = resampled(noise.generator("trust", "detection"), n, RESAMPLES, clusters)
+        if clusters is None:
+            times = _resamples(n)
+        else:
+            times = _resamples(int(clusters.max()) + 1)[:, clusters]
         hits, misses, wrongs, rights = (times @ counts for counts in self.flagged)
         with np.errstate(invalid="ignore", divide="ignore"):
             shares = {
@@ -117,6 +120,15 @@ class Cell:
         Messages are counted for each attacker, episode and channel seed.
         """
         return float(np.median(self.caught)) if self.caught else np.nan
+
+
+@lru_cache(maxsize=1)
+def _resamples(n: int) -> Ints:
+    """Return how often each of n units is in each resample, (1 + `RESAMPLES`, n): of all cells.
+
+    Shared: do not write to it.
+    """
+    return resampled(noise.generator("trust", "detection"), n, RESAMPLES)
 
 
 def under(point: OperatingPoint, rule: str, attack: str, share: float) -> OperatingPoint:
