@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -60,6 +61,7 @@ def main() -> None:
     written = {each: of_format(each, asked, given) for each in given.formats}
     reference = written[REFERENCE]
     expected = actions(asked, reference.texts)
+    print(f"{len(asked)} answers, {len(set(reference.texts))} different ones in {REFERENCE}")
     print("| format | answers a CPU s | same text | same likeliest action | read |")
     print("|---|--:|--:|--:|--:|")
     for name, done in written.items():
@@ -71,12 +73,16 @@ def main() -> None:
 
 
 def questions(model: str, dataset: str, count: int) -> list[Request]:
-    """Return as many questions, spread over the scenes of a dataset."""
+    """Return as many questions, to all that are asked in scenes spread over a dataset."""
     data = load(find(dataset))
     agent = Agent(cards.resolve(model), versions.load("v10"), "json")
     spec = Spec(agent, FrozenSource(data), (), (0,))
     every = list(requests(spec, data.scenes(data.courses())))
-    return every[:: max(1, len(every) // count)][:count]
+    by_scene = groupby(every, lambda request: request.id.partition("/")[0])
+    scenes = [list(of_scene) for _, of_scene in by_scene]
+    step = max(1, len(scenes) * len(scenes[0]) // count)
+    # whole scenes: a fixed step through requests may meet egos alone, whose answers are all one
+    return list(chain.from_iterable(scenes[::step]))[:count]
 
 
 def of_format(name: str, asked: list[Request], given: argparse.Namespace) -> Written:
