@@ -73,7 +73,7 @@ def test_a_spreadsheet_finds_no_formula(tmp_path: Path, harness: Callable[..., S
     written = [row["raw"] for row in rows[: len(texts)]]
     assert written == [f"'{text}" if n < 6 else text for n, text in enumerate(texts)]
     assert (run / "answers.jsonl").read_bytes() == before
-    made: Any = SimpleNamespace(table=pa.table({"a": ["=1", "1", None], "b": [-1.5, 2.0, None]}))
+    made: Any = SimpleNamespace(rows=pa.table({"a": ["=1", "1", None], "b": [-1.5, 2.0, None]}))
     exported = export.decisions_csv(made, tmp_path / "decisions.csv")
     assert exported.read_text().splitlines()[1:] == ['"\'=1",-1.5', '"1",2', ","]
 
