@@ -375,6 +375,14 @@ def test_an_adapter_changes_the_weights_on_every_engine_that_can_take_one(shelf:
         ),
         (('revision = "v1"', 'sha256 = "abc"'), ["sha256 = 'abc'", "64 digits"]),
         (('revision = "v1"', "gated = 1"), ["gated", "true or false"]),
+        (
+            (
+                "[latency]",
+                'adapter = "taught"\n[engines.openai]\nweights = "b"\n'
+                'server = {base_url = "https://a.example/v1"}\n[latency]',
+            ),
+            ["[engines.openai]: adapter goes with engine = transformers or llama-cpp"],
+        ),
     ],
 )
 def test_a_mistake_about_engines_is_one_line_that_names_it(

@@ -269,8 +269,9 @@ def read_cards(path: Path) -> list[Card]:
         for key in settings:
             if key not in _PER_ENGINE:
                 raise unknown(f"key in {at}", key, _PER_ENGINE)
-        # An adapter changes the same weights here, too: without it this would be another model.
-        adapter = {key: table[key] for key in table.keys() & registered.allowed_keys & {"adapter"}}
+        # An adapter changes the same weights here, too: without it this would be another model, so
+        # an engine that takes none is refused.
+        adapter = {key: table[key] for key in table.keys() & {"adapter"}}
         whole = _with_latency({**shared, **adapter, **settings, "engine": engine})
         cards.append(_card(whole, at, f"{path.stem}:{engine}"))
     return cards
