@@ -62,7 +62,7 @@ def drawn(
             net.lanes,
             net.houses,
         )
-        chooser = Chooser(window_m, horizon_s, GAP_S)
+        chooser = Chooser(window_m, horizon_s, GAP_S, by_file=True)  # which the seed gives
         chooser.look(scene)
         moments = [m for m in chooser.moments if m.time_s <= warm_up_s + LATEST_S]
         wanted = [m for m in moments if (m.hidden is not None) == (seed % 2 == 0)]

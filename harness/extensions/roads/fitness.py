@@ -34,7 +34,7 @@ def choose_fit(
     that an episode needs. The recording has the window, the target speeds and the period.
     `progress` is told of each moment that is driven; those of `mastered_keys` are not.
     """
-    chooser = Chooser(recording.window_m, until_s)
+    chooser = Chooser(recording.window_m, until_s, by_file=recording.is_former)
     for scene in scenes:
         chooser.look(scene)
     passed = set(mastered_keys)

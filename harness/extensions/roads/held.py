@@ -1,5 +1,6 @@
 """Hold what a recording states against its tables: nothing that can be computed is taken."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -8,11 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of, sha256_bytes
+from harness.core.resources import folder
+from harness.dataset.load import released
 from harness.extensions.environments.place import AFTER
 from harness.extensions.roads.moments import conflicts_at
 from harness.extensions.roads.scene import EARLY_S, SLACK_M, Scene
 from harness.extensions.roads.sessions import Sessions, Traffic
-from harness.extensions.roads.tables import FACTS, Facts, Moment, Recording
+from harness.extensions.roads.tables import FACTS, FORMER, Facts, Moment, Recording
 
 EVERY = 10  # rows of a track from one speed to the next that counts
 
@@ -80,7 +84,14 @@ def hold(recording: Recording) -> None:
 
     Such are target speeds, purposes of moments, moments of somebody who is not there so long, and
     those of a scene that is another one again; and who is hidden at a moment, and when both meet.
+    Moments that were drawn by what it states of its files are those of released recordings alone.
     """
+    if recording.is_former and recording.digest not in _released():
+        raise UserError(
+            f"recording {printable(recording.folder / FACTS)} has the format {FORMER}, whose draw "
+            "of moments went by what it states of its files; import these again: "
+            "`harness dataset import`"
+        )
     computed, until_s = _computed(recording), horizon_s(recording.facts)
     problem = computed.problem
     if recording.speeds_mps != computed.speeds_mps:
@@ -103,6 +114,18 @@ def hold(recording: Recording) -> None:
             f"recording {printable(recording.folder / FACTS)} states {problem}; make the recording "
             "again: `harness dataset import`"
         )
+
+
+@lru_cache(maxsize=1)
+def _released() -> frozenset[str]:
+    """Return the digests of the recordings that released datasets have."""
+    digests = set[str]()
+    for name, pin in released().items():
+        path = folder("datasets") / name / "manifest.json"
+        data = bytes_of(path, "record") if (path.parent / FACTS).is_file() else b""
+        if sha256_bytes(data) == pin:
+            digests.add(json.loads(data)["files"][FACTS])
+    return frozenset(digests)
 
 
 def _problems(scene: Scene, moment: Moment, facts: Facts) -> Iterator[str]:

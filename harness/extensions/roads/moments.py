@@ -23,7 +23,7 @@ from msgspec import structs
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.seeds import FIRST
 from harness.extensions.roads.scene import STILL_M, Scene, Track
-from harness.extensions.roads.sessions import APART, FEW, SHARED, Sessions, Traffic
+from harness.extensions.roads.sessions import APART, FEW, SHARED, Sessions, Traffic, digest_of
 from harness.extensions.roads.tables import Moment
 from harness.world.conflict_measures import MOMENTS_HZ, SHORT_PET_S
 from harness.world.state import separation_m
@@ -102,12 +102,15 @@ class Chooser:
         horizon_s: length of an episode, s.
         gap_s: greatest post-encroachment time of a conflict, s.
         most: how many moments of a purpose are chosen; None for all that can be.
+        by_file: whether the draw goes by the digest that scenes state of their files, else by how
+            each candidate drives.
     """
 
     window_m: float
     horizon_s: float
     gap_s: float = SHORT_PET_S
     most: int | None = None
+    by_file: bool = False
     candidates: int = 0
     left_out: Counter[str] = field(default_factory=Counter)
     _fit: list[_Fit] = field(default_factory=list)
@@ -115,7 +118,7 @@ class Chooser:
 
     def look(self, scene: Scene) -> None:
         """Count a scene's candidates, and note those at which an episode may begin."""
-        self._traffic[scene.name] = Traffic.of(scene)
+        traffic = self._traffic[scene.name] = Traffic.of(scene)
         frames = _Frames.of(scene)
         egos = np.array([track.kind in EGOS for track in frames.tracks], dtype=bool)
         rows = np.flatnonzero((frames.frame % EVERY == 0) & egos[frames.track])
@@ -131,12 +134,15 @@ class Chooser:
         conflicts = _hidden_conflicts(scene, frames, rows, self.window_m, horizon, gap)
         fit = []
         for row in rows.tolist():
-            who = frames.tracks[int(frames.track[row])].id
+            track = frames.tracks[int(frames.track[row])]
             hidden, conflict_s = conflicts.get(row, (None, None))
             moment = Moment(
-                scene.name, who, float(frames.frame[row] / MOMENTS_HZ), hidden, conflict_s, ""
+                scene.name, track.id, float(frames.frame[row] / MOMENTS_HZ), hidden, conflict_s, ""
             )
-            draw = _digest(scene.sha256, who, f"{moment.time_s:.3f}")
+            if self.by_file:
+                draw = _digest(scene.sha256, track.id, f"{moment.time_s:.3f}")
+            else:
+                draw = _draw(track, moment.time_s) + traffic.content
             fit.append(_Fit(draw, scene.name, moment))
         self._fit += self._apart(fit)
 
@@ -242,6 +248,15 @@ class Chooser:
         for pair in zip(decisive, others, strict=False):
             drawn += pair
         return drawn[: self.most]
+
+
+def _draw(track: Track, time_s: float) -> str:
+    """Return what orders a moment of a track, whatever it and its file are called.
+
+    Whoever is far away does not move it, either.
+    """
+    driven = digest_of(track, track.begin_s).hex()
+    return _digest(driven, f"{time_s - track.begin_s:.3f}")
 
 
 def _digest(*texts: str) -> str:

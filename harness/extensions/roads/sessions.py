@@ -49,12 +49,13 @@ def _content(scene: Scene) -> str:
     """Return the digest of a scene's tracks, in no order and without their ids."""
     begin_s = scene.begin_s
     whole = hashlib.sha256()
-    for digest in sorted(_digest(track, begin_s) for track in scene.tracks.values()):
+    for digest in sorted(digest_of(track, begin_s) for track in scene.tracks.values()):
         whole.update(digest)
     return whole.hexdigest()
 
 
-def _digest(track: Track, begin_s: float) -> bytes:
+def digest_of(track: Track, begin_s: float) -> bytes:
+    """Return the digest of a track's kind, size, times since one, and poses."""
     poses = _turned(track.poses)
     numbers = [track.length_m, track.width_m, *(track.time_s - begin_s), *poses.flat]
     fine = np.round(np.array(numbers) * FINE).astype("<i8")

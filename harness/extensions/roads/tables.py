@@ -43,7 +43,8 @@ from harness.extensions.roads.scene import (
     checked,
 )
 
-FORMAT: Literal["swarmdrive-recording/1"] = "swarmdrive-recording/1"
+FORMAT: Literal["swarmdrive-recording/2"] = "swarmdrive-recording/2"
+FORMER: Literal["swarmdrive-recording/1"] = "swarmdrive-recording/1"  # drew by digests of files
 FACTS = "recording.json"
 MOST_SCENES, MOST_MOMENTS = 10_000, 1_000_000
 LONGEST_TEXT = 1000  # characters of a licence and a source
@@ -80,7 +81,7 @@ class SceneFacts(msgspec.Struct, frozen=True):
 class Facts(msgspec.Struct, frozen=True):
     """Hold what `recording.json` has."""
 
-    format: Literal["swarmdrive-recording/1"]
+    format: Literal["swarmdrive-recording/1", "swarmdrive-recording/2"]
     name: str
     source: str  # where the traffic is from, in words
     licence: str  # under which it may be used, in words
@@ -141,6 +142,11 @@ class Recording:
     @property
     def name(self) -> str:
         return self.facts.name
+
+    @property
+    def is_former(self) -> bool:
+        """Return whether its moments were drawn by what it states of its files."""
+        return self.facts.format == FORMER
 
     @property
     def source(self) -> str:

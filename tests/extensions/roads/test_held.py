@@ -59,6 +59,7 @@ EDITS: dict[str, Edit | None] = {
     ),
     "source has 3000 characters; allowed: 1000": lambda facts: facts.update(source="s" * 3000),
     "licence has 8 characters": lambda facts: facts.update(licence="MIT\n\n# x"),
+    "import these again": lambda facts: facts.update(format=tables.FORMER),
     "that scene is s again": of_moment(scene="t"),
     "recording:column@": lambda facts: None,
 }

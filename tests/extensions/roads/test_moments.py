@@ -220,6 +220,13 @@ def test_scenes_are_dealt_whole_and_few_are_cut_by_time() -> None:
     assert fewer < {(m.scene, m.vehicle, m.time_s, m.purpose) for m in choice.moments}
     alone = of(scenes[0])
     renamed = {f"{key}x": replace(track, id=f"{key}x") for key, track in scenes[0].tracks.items()}
+    # Whom nobody meets, and what a file and those in it are called, draws nothing else.
+    far = steady("z", (-40.0, 5000.0), EAST)
+    other_names = {**renamed, "z": replace(far, time_s=far.time_s + 10)}
+    others = of(replace(scenes[0], sha256="9" * 64, tracks=other_names)).moments
+    assert [(m.vehicle[:-1], m.time_s) for m in others] == [
+        (m.vehicle, m.time_s) for m in alone.moments
+    ]
     twice = of(replace(scenes[0], name="copy", sha256="9" * 64, tracks=renamed), scenes[0])
     assert twice.moments == alone.moments, "one content under several names is one scene"
     assert twice.left_out[TWICE] == (alone.candidates - alone.left_out[LEAVES]

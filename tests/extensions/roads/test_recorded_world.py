@@ -367,7 +367,7 @@ def with_another(facts: dict[str, Any]) -> None:
 
 CHOICES: dict[str, Callable[[dict[str, Any]], object]] = {
     "": lambda facts: None,
-    "no moment of s, e1 at 2 s, which its rule chooses": without_the_first,
+    "no moment of s, e0 at 4 s, which its rule chooses": without_the_first,
     "a moment of s, e0 at 2 s, which its rule does not choose": with_another,
     "its moments in another order": lambda facts: facts["moments"].reverse(),
     "another rule of its choice": lambda facts: facts["choice"].update(rule="All were taken."),
