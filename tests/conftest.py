@@ -30,6 +30,7 @@ from harness.core import cores, extensions, resources
 from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.dataset.rebuilt import Start
 from harness.radio import profiles
 from harness.runs import formats, role_agents
 from harness.studies import axes
@@ -289,7 +290,7 @@ def _own_cache(workers_folder: Path) -> None:
 def _shipped_once() -> Generator[None, None, None]:
     """What ships, which layouts are held against, is read once by each worker."""
     reported, starts = rebuilt._reported, rebuilt._starts
-    known, begun = dict[tuple[Path, str], list[Dataset]](), dict[tuple[str, int], dict[str, str]]()
+    known, begun = dict[tuple[Path, str], list[Dataset]](), dict[tuple[str, int], list[Start]]()
 
     def reported_once(scenario: str) -> list[Dataset]:
         place = resources.folder("datasets"), scenario
@@ -297,7 +298,7 @@ def _shipped_once() -> Generator[None, None, None]:
             known[place] = list(reported(scenario))
         return known[place]
 
-    def starts_once(dataset: Dataset) -> dict[str, str]:
+    def starts_once(dataset: Dataset) -> list[Start]:
         key = dataset.sha256, len(dataset.episodes)
         if not dataset.trusted:
             return starts(dataset)

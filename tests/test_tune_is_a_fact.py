@@ -18,6 +18,7 @@ from harness.dataset import rebuilt
 from harness.dataset.build import build
 from harness.dataset.freeze import freeze
 from harness.dataset.load import find, load
+from harness.dataset.rebuilt import Start
 from harness.world import scenarios
 from harness.world.world import World
 
@@ -194,6 +195,25 @@ def test_a_check_without_the_simulator_says_that_nothing_was_built(
     assert code == 0
     assert "no layout was built again from its seed, since highway-env is not installed" in out
     assert json.loads(harness("dataset", "check", small_path, "--json")[1])["built_again"] is False
+
+
+def test_a_start_is_that_of_another_scenario_wherever_it_lies_and_whoever_it_shows() -> None:
+    state = World.start(scenarios.get(NAME), SEED).state()
+    start = Start.of("one", state)
+
+    def other(count: int, faster_mps: float = 0.0) -> Start:
+        """Return what another recording has of it, elsewhere, of so many of its vehicles."""
+        ego, *others = state.vehicles[:count]
+        vehicles = [replace(ego, speed_mps=ego.speed_mps + faster_mps), *others]
+        moved = tuple(replace(v, id=f"{v.id}0", x_m=v.x_m + 7, y_m=v.y_m - 9) for v in vehicles)
+        return Start.of("other", replace(state, vehicles=moved))
+
+    count = len(state.vehicles)
+    assert count > 2
+    assert start.is_part(other(count))
+    assert other(2).is_part(start)
+    assert not start.is_part(other(count, 0.1))
+    assert not start.is_part(other(1)), "an ego alone says nothing"
 
 
 def test_a_difference_of_a_rounding_makes_no_other_layout() -> None:

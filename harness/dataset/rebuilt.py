@@ -11,6 +11,7 @@ machine: typing a command again draws no others, and who made the dataset does n
 
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
+from typing import NamedTuple
 
 from msgspec import UNSET, to_builtins
 from msgspec.structs import replace
@@ -22,7 +23,8 @@ from harness.dataset.load import Dataset, load, released
 from harness.dataset.schema import Branching, Record, Tree, scene_id
 from harness.dataset.select import spot_check
 from harness.dataset.verify import read_manifest
-from harness.world.state import VehicleState
+from harness.world.scenario import Scenario
+from harness.world.state import VehicleState, WorldState
 
 BEGUN, REBUILT = 1000, 3  # layouts of which the first scene is built, and the whole tree
 
@@ -48,18 +50,41 @@ def refuse_reported(dataset: Dataset, others: Iterable[Dataset]) -> None:
     """Raise UserError if a dataset to learn from shares a start with data to report results on.
 
     `others` are the datasets to report on. Starts, first scenes of episodes, are equal if all
-    numbers of their vehicles, rounded to 0.01, are, whatever their seeds.
+    numbers of their vehicles, rounded to 0.01, are, whatever their seeds. Those of two scenarios,
+    such as two recordings, are equal if `Start.is_part` says so.
     """
     starts = _starts(dataset)
     for other in others:
-        other_starts = _starts(other)
-        for start in starts.keys() & other_starts.keys():
-            raise UserError(
-                f"dataset {printable(dataset.path)} has scene {starts[start]}, which is "
-                f"{other_starts[start]} of {printable(other.name)}, and numbers are reported of "
-                "that; "
-                "build one of other seeds"
-            )
+        is_other = other.scenario.name != dataset.scenario.name
+        _refuse_shared(f"dataset {printable(dataset.path)}", starts, other, is_other)
+
+
+def refuse_drawn(scenario: Scenario, seeds: Iterable[int]) -> None:
+    """Raise UserError if a layout to learn from begins as one of a released report dataset does.
+
+    Seeds tell layouts of one scenario apart; of another, such as a recording of the same traffic,
+    they say nothing.
+    """
+    reported = [each for each in _reported(scenario.name) if each.scenario.name != scenario.name]
+    if not reported:
+        return
+    starts = [Start.of(f"layout {seed}", _first_state(scenario, seed)) for seed in seeds]
+    for other in reported:
+        _refuse_shared(f"scenario {printable(scenario.name)}", starts, other, True)
+
+
+def _refuse_shared(what: str, starts: Sequence["Start"], other: Dataset, is_other: bool) -> None:
+    """Raise UserError at a start that a dataset, `is_other` of another scenario, has, too."""
+    other_starts: dict[str, list[Start]] = {}
+    for start in _starts(other):
+        other_starts.setdefault(start.ego if is_other else start.whole, []).append(start)
+    for start in starts:
+        for same in other_starts.get(start.ego if is_other else start.whole, ()):
+            if not is_other or start.is_part(same):
+                raise UserError(
+                    f"{what} has {start.name}, which is {same.name} of {printable(other.name)}, "
+                    "and numbers are reported of that; build one of other seeds"
+                )
 
 
 def differences(dataset: Dataset) -> Iterator[str]:
@@ -93,16 +118,13 @@ def drawn(dataset: Dataset, count: int) -> list[int]:
 
 def _other_starts(dataset: Dataset, numbers: Sequence[int]) -> list[int]:
     """Return which of these layouts have another first scene than the simulator gives."""
-    from harness.world.world import World
-
     forest, scenario, seed = dataset.forest, dataset.scenario, dataset.manifest.seed
     ids = [forest.ids[root] for root in forest.root.tolist()]
     first = dict(zip(dataset.episodes, ids, strict=True))
     dataset.scenes([first[number] for number in numbers])  # checks their content
     differing = []
     for number in sorted(numbers):
-        start = World.start(scenario, seed + number).state()
-        if scene_id(number, start) != first[number]:
+        if scene_id(number, _first_state(scenario, seed + number)) != first[number]:
             differing.append(number)
     return differing
 
@@ -152,25 +174,62 @@ def _seen(record: Record) -> tuple[object, ...]:
 
 
 def _reported(scenario: str) -> Iterator[Dataset]:
-    """Yield the released datasets of a scenario, all of which are of report seeds."""
-    pinned = released().values()
+    """Yield the released datasets of a scenario, all of which are of report seeds.
+
+    Of a family, such as that of recordings, those of all its scenarios are.
+    """
+    pinned, family = released().values(), scenario.partition(":")[0]
     for path in sorted(folder("datasets").glob("*/manifest.json")):
         manifest, sha256 = read_manifest(path.parent)
-        of_scenario = manifest.scenario == scenario and manifest.purpose == "report"
-        if sha256 in pinned and of_scenario:
+        of_family = manifest.scenario.partition(":")[0] == family and manifest.purpose == "report"
+        if sha256 in pinned and of_family:
             yield load(path.parent)
 
 
-def _starts(dataset: Dataset) -> dict[str, str]:
-    """Return the ids of all first scenes by the digest of what is there, to 1 cm,
-    whatever the seeds are.
-    """
+class Start(NamedTuple):
+    """Hold what is there as an episode begins, by digests of numbers to 1 cm or 0.01."""
+
+    name: str  # the first scene's id, or which layout it is
+    whole: str  # of all vehicles
+    ego: str  # of how the ego drives, wherever it is
+    others: frozenset[str]  # of each other: where it is from the ego, and how it drives
+
+    @classmethod
+    def of(cls, name: str, state: WorldState) -> "Start":
+        """Return the start that a state is."""
+        ego, *others = state.vehicles
+        whole = digest([_coarse(vehicle) for vehicle in state.vehicles])
+        return cls(name, whole, _moves(ego, ego), frozenset(_moves(each, ego) for each in others))
+
+    def is_part(self, other: "Start") -> bool:
+        """Return whether both egos drive alike, half of whom one has at least beside the same.
+
+        So it is of two recordings of one traffic, whatever they call it, and how much of it they
+        show.
+        """
+        fewer = min(len(self.others), len(other.others))
+        return self.ego == other.ego and 0 < fewer <= 2 * len(self.others & other.others)
+
+
+def _moves(vehicle: VehicleState, ego: VehicleState) -> str:
+    """Return the digest of where a vehicle is from the ego, and how it drives, to 0.01."""
+    place = vehicle.x_m - ego.x_m, vehicle.y_m - ego.y_m
+    numbers = (*place, vehicle.heading_rad, vehicle.speed_mps)
+    return digest([vehicle.kind, *(round(number, 2) + 0.0 for number in numbers)])
+
+
+def _starts(dataset: Dataset) -> list[Start]:
+    """Return the starts of all episodes of a dataset, whatever the seeds are."""
     forest = dataset.forest
-    ids = {}
-    for scene in dataset.scenes([forest.ids[root] for root in forest.root.tolist()]):
-        vehicles = [_coarse(vehicle) for vehicle in scene.state.vehicles]
-        ids[digest(vehicles)] = scene.id
-    return ids
+    scenes = dataset.scenes([forest.ids[root] for root in forest.root.tolist()])
+    return [Start.of(f"scene {scene.id}", scene.state) for scene in scenes]
+
+
+def _first_state(scenario: Scenario, seed: int) -> WorldState:
+    """Return the state in which the layout of a seed begins."""
+    from harness.world.world import World
+
+    return World.start(scenario, seed).state()
 
 
 def _coarse(vehicle: VehicleState) -> dict[str, object]:

@@ -86,6 +86,7 @@ def built(
     for scenario in scenarios:
         out = place / f"tune-{scenario.name}"
         if not (out / "manifest.json").is_file() or (out / WORK).is_dir():
+            rebuilt.refuse_drawn(scenario, range(first_seed, first_seed + layouts))
             progress.more(layouts)
             build(scenario, out, layouts, first_seed, workers, progress, audits=False)
             dataset = load.load(out)

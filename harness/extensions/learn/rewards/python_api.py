@@ -60,6 +60,7 @@ def environment(
 
     extras.need("an environment", "highway_env")
     from harness.cli.progress import bar
+    from harness.dataset import rebuilt
     from harness.evaluate.chats import Asking
     from harness.extensions.learn.rewards import layouts as allowed
     from harness.extensions.learn.rewards.environment import Driving
@@ -77,6 +78,7 @@ def environment(
     else:
         played = scenarios.get(scenario or scenarios.DEFAULT)
         of = allowed.seeds(seeds, layouts)
+        rebuilt.refuse_drawn(played, of)
         if driven:
             source = Roads(played, of, then)
         else:

@@ -89,6 +89,7 @@ def distill(
     With an image prompt the small one is a Qwen3-VL, which takes pictures and text.
     If the training is stopped, the same command continues it.
     """
+    from harness.dataset import rebuilt
     from harness.prompts import versions as prompts
 
     extras.need("harness model distill", "torch", "transformers", "highway_env")
@@ -109,6 +110,8 @@ def distill(
             f"--first-seed {first_seed}: {seeds_text(first_seed, layouts)}; a model learns from "
             f"train seeds alone, {FIRST['train']} to {FIRST['report'] - 1}"
         )
+    for each in driven:
+        rebuilt.refuse_drawn(each, range(first_seed, first_seed + layouts))
     learnt = {}
     for each in driven:
         learnt[each] = tuple(v for v in versions if not prompts.unfit(v, each))

@@ -10,6 +10,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.core.seeds import FIRST, purposes
+from harness.dataset import rebuilt
 from harness.extensions.learn.training.answers import answer
 from harness.extensions.learn.training.lessons import Point, decision_points
 from harness.prompts.examples import Example, Examples
@@ -42,6 +43,7 @@ def examples(
                 f"--first-seed {first_seed}: layout seed {seed} is no train seed; give "
                 f"{FIRST['train']} to {FIRST['report'] - 1}"
             )
+        rebuilt.refuse_drawn(scenario, [seed])
         if points := decision_points(scenario, seed, 0):
             candidates: dict[str, Candidate] = {}
             for role in ROLES:
