@@ -22,7 +22,7 @@ from msgspec import structs
 
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.seeds import FIRST
-from harness.extensions.roads.scene import STILL_M, Scene, Track
+from harness.extensions.roads.scene import BASE_M, HEADING_SLACK, STILL_M, Scene, Track
 from harness.extensions.roads.sessions import APART, FEW, SHARED, Sessions, Traffic, digest_of
 from harness.extensions.roads.tables import Moment
 from harness.world.conflict_measures import MOMENTS_HZ, SHORT_PET_S
@@ -37,6 +37,10 @@ HARD_MPS2 = 4.0  # mean deceleration over a second that is hard braking, as metr
 ALIKE_RAD = math.pi / 4  # headings that differ by less are of one direction
 CALM = 20  # most moments of a purpose in which nobody hidden comes into conflict
 EVERY = round(EVERY_S * MOMENTS_HZ)  # frames from one candidate to the next
+# By how much a speed may differ from its movement, m/s and of what it moves at, within so many
+# frames of a moment: twice by how much one of SUMO's does, that of a truck that turns.
+SPEED_SLACK_MPS, SPEED_SLACK, HELD = 2.0, 0.1, MOMENTS_HZ
+BESIDE = 3  # frames from a pose to those between which it moves
 NEVER = np.iinfo(np.int64).max  # a frame that does not come
 LAYERS = 64  # stretches of time in which those who come near each other are looked for at once
 STRETCHES = 2000  # pairs of road users whose places are compared at once, all of a stretch
@@ -47,6 +51,7 @@ LIGHTS = "its scene has a traffic light"
 STILL = "it stands still"
 LEAVES = "it leaves the recording within the horizon"
 OFF_LANE = "it is on no lane"
+STRAYS = "it, or who is hidden, has another speed or heading there than it moves with"
 NEAR = "another moment of it is too near in time"
 GAP = "it is in a gap between two purposes"
 NOT_REACHED = "its recorded driver does not reach the goal"  # of who looks for it, and drops it
@@ -130,12 +135,16 @@ class Chooser:
         rows = self._without(rows, frames.leaves(rows, horizon), LEAVES)
         rows = self._without(rows, frames.stands(rows, horizon), STILL)
         rows = self._without(rows, ~_on_lane(scene, frames.poses[rows]), OFF_LANE)
+        rows = self._without(rows, frames.strays[rows], STRAYS)
         gap = round(self.gap_s * MOMENTS_HZ)
         conflicts = _hidden_conflicts(scene, frames, rows, self.window_m, horizon, gap)
         fit = []
         for row in rows.tolist():
             track = frames.tracks[int(frames.track[row])]
             hidden, conflict_s = conflicts.get(row, (None, None))
+            if hidden is not None and frames.strays_at(hidden, int(frames.frame[row])):
+                self.left_out[STRAYS] += 1
+                continue
             moment = Moment(
                 scene.name, track.id, float(frames.frame[row] / MOMENTS_HZ), hidden, conflict_s, ""
             )
@@ -326,6 +335,37 @@ class _Frames:
             farthest_m = np.maximum(farthest_m, np.hypot(way[:, 0], way[:, 1]))
         return farthest_m < STILL_M
 
+    @cached_property
+    def strays(self) -> Bools:
+        """Return near which rows a speed or heading is not that of the movement there, (P,)."""
+        before, after = self._beside(BESIDE)
+        way = self.poses[after, :2] - self.poses[before, :2]
+        way_m = np.hypot(way[:, 0], way[:, 1])
+        moved_mps = way_m / np.maximum(after - before, 1) * MOMENTS_HZ
+        speed_mps, heading = self.poses[:, 3], self.poses[:, 2]
+        off_mps = np.abs(np.abs(speed_mps) - moved_mps)
+        course = np.arctan2(way[:, 1], way[:, 0]) + np.pi * (speed_mps < 0)
+        off = off_mps > SPEED_SLACK_MPS + SPEED_SLACK * moved_mps
+        off |= (way_m > BASE_M) & (_turn_rad(course, heading) > HEADING_SLACK)
+        before, after = self._beside(HELD)
+        many = np.append(0, np.cumsum(off & (self.first[self.track] < self.last[self.track])))
+        return np.asarray(many[after + 1] > many[before])
+
+    def _beside(self, frames: int) -> tuple[Ints, Ints]:
+        """Return the rows of each one's track so many frames before and after, or its ends."""
+        rows, start = np.arange(len(self.frame)), self.start[self.track]
+        end = start + self.last[self.track] - self.first[self.track]
+        return np.maximum(rows - frames, start), np.minimum(rows + frames, end)
+
+    def strays_at(self, track_id: str, frame: int) -> bool:
+        """Return `strays` of somebody who is there in a frame."""
+        track = self.numbers[track_id]
+        return bool(self.strays[self.start[track] + frame - self.first[track]])
+
+    @cached_property
+    def numbers(self) -> dict[str, int]:
+        return {track.id: number for number, track in enumerate(self.tracks)}
+
     def brakings(self, track: int) -> Ints:
         """Return the frames at which a track begins to slow down by `HARD_MPS2` in a second."""
         start, count = self.start[track], self.last[track] - self.first[track] + 1
@@ -493,8 +533,7 @@ def conflicts_at(
     Their vehicles must be there then.
     """
     frames = _Frames.of(scene)
-    numbers = {track.id: number for number, track in enumerate(frames.tracks)}
-    track = np.array([numbers[moment.vehicle] for moment in moments], dtype=np.int64)
+    track = np.array([frames.numbers[moment.vehicle] for moment in moments], dtype=np.int64)
     frame = np.array([round(moment.time_s * MOMENTS_HZ) for moment in moments], dtype=np.int64)
     rows = frames.rows(track, frame)
     horizon, gap = round(horizon_s * MOMENTS_HZ), round(SHORT_PET_S * MOMENTS_HZ)

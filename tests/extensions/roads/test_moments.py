@@ -22,6 +22,7 @@ from harness.extensions.roads.moments import (
     NOT_REACHED,
     OFF_LANE,
     STILL,
+    STRAYS,
     TWICE,
     Choice,
     Chooser,
@@ -166,6 +167,28 @@ def test_each_candidate_that_falls_has_its_reason() -> None:
     assert (alone.candidates, alone.moments, alone.left_out) == (0, (), {})
     brief = replace(EGO, time_s=EGO.time_s[:2] + 0.01, poses=EGO.poses[:2])
     assert of(crossing(brief)).candidates == 0
+
+
+def odd(track: Track, time_s: float, column: int, value: float) -> Track:
+    """Return a track whose pose at one time states another speed or heading."""
+    poses = np.array(track.poses)
+    poses[round(time_s * 10), column] = value
+    return replace(track, poses=poses)
+
+
+@pytest.mark.parametrize(("column", "value"), [(3, 20.0), (3, 0.0), (3, 6.9), (2, 3.0)])
+def test_no_moment_begins_with_a_speed_or_heading_that_is_not_of_its_movement(
+    column: int, value: float
+) -> None:
+    """The ego's nor that of who is hidden, within a second: the median of a track is another."""
+    for who, other in ((EGO, OTHER), (OTHER, EGO)):
+        choice = of(crossing(odd(who, 3.0, column, value), other, houses=(HOUSE,)))
+        assert choice.left_out[STRAYS] >= 2
+        for moment in choice.moments:
+            assert moment.vehicle != who.id or abs(moment.time_s - 3) > 1
+            assert moment.hidden != who.id or abs(moment.time_s - 3) > 1
+    slightly = of(crossing(odd(EGO, 3.0, 3, 12.9), OTHER, houses=(HOUSE,)))
+    assert STRAYS not in slightly.left_out
 
 
 def long(name: str, sha256: str, times: int = 10) -> Scene:
