@@ -57,7 +57,10 @@ def test_clusters_are_numbered_as_they_come_and_none_is_told_where_each_layout_i
     values = np.array([7, 7, 2, 4])
     assert units_of(values, (4, 2, 7), np.array([0, 0, 1])).tolist() == [1, 1, 0, 0]
     assert units_of(values, (4, 2, 7), None) is values
-    for alone in (["a", "b"], [None, None], [None, "a"], []):
+    parts = cluster_numbers(["a + b", "c", "b + d", "d", None])
+    assert parts is not None
+    assert parts.tolist() == [0, 1, 0, 0, 2]
+    for alone in (["a", "b"], [None, None], [None, "a"], ["a + b", "a+b"], []):
         assert cluster_numbers(alone) is None
 
 
@@ -68,6 +71,7 @@ def test_clusters_are_numbered_as_they_come_and_none_is_told_where_each_layout_i
         ([["x", "x", None], ["a", "b", "c"]], [0, 0, 1]),
         ([["a", "a", "b", "b"], [None, "x", "x", None]], [0, 0, 0, 0]),  # by way of both
         ([["a", "b", "a", "b"], ["b", "a", "b", None]], [0, 1, 0, 1]),  # a name says nothing
+        ([["a + b", "c", "b"], [None, "x", "x"]], [0, 0, 0]),  # a part is enough
         ([["a", "b"], [None, None]], None),
         ([[], []], None),
     ],
@@ -166,6 +170,7 @@ def test_families_have_no_cluster_in_common_and_halves_of_one_do() -> None:
     [
         ([["a", "a", "b"], ["b", "c", None]], [0, 0, 1, 1, 2, 3]),
         ([["a", "b", "c"], ["c", "b", "a"]], [0, 1, 2, 2, 1, 0]),  # in one alone each is its own
+        ([["a + b", "a + b", "c"], ["b", "d", "e"]], [0, 0, 1, 0, 2, 3]),  # what a cut overlaps
         ([["a", "b", "c"], ["d", "e", None]], None),
         ([[], []], None),  # not known
     ],

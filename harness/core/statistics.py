@@ -122,14 +122,17 @@ def known_mean(values: Floats, axis: int) -> Floats:
 
 
 def cluster_numbers(names: Sequence[str | None]) -> Ints | None:
-    """Return the number from 0 of each episode's cluster, (E,); None if no two have the same.
+    """Return the number from 0 of each episode's cluster, (E,); None if each is of its own.
 
-    `names` has the name of each episode's cluster; one without is a cluster of its own.
+    `names` has the name of each episode's cluster; one without is a cluster of its own. Names that
+    have one of their `parts_of` in common are of one cluster.
     """
-    numbers: dict[object, int] = {}
-    keys = [(place if name is None else name) for place, name in enumerate(names)]
-    each = [numbers.setdefault(key, len(numbers)) for key in keys]
-    return None if len(numbers) == len(each) else np.array(each, dtype=np.int64)
+    return joined_clusters([names])
+
+
+def parts_of(name: str) -> list[str]:
+    """Return the parts of a cluster's name: `a + b` says that it is of both."""
+    return name.split(" + ")
 
 
 def joined_clusters(partitions: Sequence[Sequence[str | None]]) -> Ints | None:
@@ -142,11 +145,14 @@ def joined_clusters(partitions: Sequence[Sequence[str | None]]) -> Ints | None:
     for names in partitions:
         first_of: dict[str, int] = {}
         for place, name in enumerate(names):
-            if name is not None:
-                both = first_of.setdefault(name, place), place
+            for part in [] if name is None else parts_of(name):
+                both = first_of.setdefault(part, place), place
                 one, other = sorted(_first(earlier, each) for each in both)
                 earlier[other] = one
-    return cluster_numbers([str(_first(earlier, place)) for place in range(len(earlier))])
+    numbers: dict[int, int] = {}
+    firsts = [_first(earlier, place) for place in range(len(earlier))]
+    each = [numbers.setdefault(first, len(numbers)) for first in firsts]
+    return None if len(numbers) == len(each) else np.array(each, dtype=np.int64)
 
 
 def _first(earlier: Sequence[int], place: int) -> int:

@@ -222,14 +222,17 @@ def _rows(path: str) -> Rows:
 
 
 def _clusters(path: str) -> set[str]:
-    """Return the names of what a run's layouts are cut from; a table without any is not read."""
+    """Return the parts of what a run's layouts are cut from; a table without any is not read."""
+    from harness.core.statistics import parts_of  # imported here because it is slow
+
     with (
         opened(os.path.join(path, "episodes.csv"), "rows") as data,
         TextIOWrapper(data, "utf-8-sig") as file,
     ):
         table = csv.DictReader(file)
         rows = table if "cluster" in (table.fieldnames or ()) else ()
-        return {row["cluster"] for row in rows if row["cluster"]}
+        names = {row["cluster"] for row in rows if row["cluster"]}
+    return {part for name in names for part in parts_of(name)}
 
 
 def _means(summaries: Sequence[Rows], together: bool) -> Rows:

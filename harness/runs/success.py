@@ -21,6 +21,7 @@ from harness.core.statistics import (
     known_mean,
     mean_of,
     paired_difference,
+    parts_of,
     resampled,
 )
 from harness.runs.estimates import over_episodes
@@ -306,15 +307,17 @@ def of_families(estimates: Sequence[Estimate], rules: Sequence[Success]) -> Esti
 
 def shares_cluster(families: Sequence[Sequence[str | None]]) -> bool:
     """Return whether two families have a cluster in common, by the name of each episode's."""
-    names = [{*of_family} - {None} for of_family in families]
-    return len(set[str | None]().union(*names)) < sum(map(len, names))
+    parts = []
+    for names in families:
+        parts.append({part for name in set(names) if name is not None for part in parts_of(name)})
+    return len(set[str]().union(*parts)) < sum(map(len, parts))
 
 
 def clusters_of(rules: Sequence[Success]) -> list[Ints] | None:
     """Return for each family the number of each episode's cluster, (E,); None if each is its own.
 
     A family is the scenes of one scenario, and `rules` has for each how its success is averaged.
-    Two families have a cluster in common if they name it alike.
+    Two families have a cluster in common if they name a part of it alike.
     """
     is_clustered = any(rule.clusters is not None for rule in rules)
     if not is_clustered and not shares_cluster([rule.names for rule in rules]):

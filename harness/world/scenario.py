@@ -17,7 +17,7 @@ from harness.world.parameters import SETTABLE, Parameters
 from harness.world.road import PathKey, Road
 from harness.world.state import Building, Kind, Part
 
-MOST_LETTERS = 200  # of the name of what layouts are cut from
+MOST_LETTERS = 1000  # of the name of what layouts are cut from
 LAYOUTS_KEPT = 64  # scenarios of single layouts that stay in memory, each with its road
 KNOWN_ACTIONS = ("SLOWER", "IDLE", "FASTER")  # actions that reference drivers and the planner use
 
@@ -181,6 +181,7 @@ class Scenario:
     licence: str = ""  # terms of that source, for the card; empty for the harness's own
     # returns what the layout of a seed, its argument, is cut from, such as the name of a recording
     # of traffic. Layouts of one are alike: an interval counts them as one, whatever their number.
+    # A name such as `a + b` says that it is cut from both: one that has `a` or `b` is alike, too.
     # None if each layout is drawn on its own
     cluster: Callable[[int], str] | None = None
     # spelling of 0.2, until 0.5.0: what starts an episode of such a world; takes the scenario and

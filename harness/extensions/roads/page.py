@@ -7,7 +7,7 @@ import numpy as np
 from harness.core.arrays import Floats, Ints
 from harness.core.errors import printable
 from harness.core.figures import POINTS, interval_of
-from harness.core.statistics import Estimate, rate_interval
+from harness.core.statistics import Estimate, parts_of, rate_interval
 from harness.dataset.forest import Forest
 from harness.extensions.roads.family import REPLAYED
 from harness.report.document import Section, Table
@@ -117,4 +117,10 @@ def _layouts(run: Run, success: Floats, his: Floats) -> Iterator[tuple[str, ...]
     for place in np.flatnonzero((means != his).any(axis=0)).tolist():
         episode = run.episodes[place]
         shares = [f"{100 * share:.0f}" for share in (his[place], *means[:, place])]
-        yield (str(episode.layout_seed), episode.cluster or "–", *shares)
+        yield (str(episode.layout_seed), _cut_from(episode.cluster), *shares)
+
+
+def _cut_from(cluster: str | None) -> str:
+    """Return what a layout is cut from: the first of several parts, and how many there are."""
+    first, *others = parts_of(cluster or "–")
+    return f"{first} and {len(others)} more" if others else first

@@ -125,6 +125,11 @@ class Sessions:
         """Return how many scenes share traffic with another that is not the same."""
         return sum(n for n in self.contents.values() if n > 1)
 
+    def contents_of(self, scene: str) -> list[str]:
+        """Return the contents of the session of a scene, that of the session first."""
+        names = [name for name, each in self.session.items() if each == self.session[scene]]
+        return sorted({self.traffic[name].content for name in names})
+
     def purpose(self, scene: str, time_s: float, horizon_s: float) -> str | None:
         """Return what a moment of a scene is for; None in a gap between two purposes."""
         session = self.session[scene]

@@ -27,7 +27,8 @@ from harness.world.scene_graph import SceneGraph
 from harness.world.simulator import LAMPS_MPS2
 from harness.world.state import Part
 
-LETTERS = 12  # of a digest, in the name of what a layout is cut from
+# Of a digest, in the name of what a layout is cut from, and how many scenes the name has at most.
+LETTERS, PARTS = 12, 40
 
 
 @dataclass(frozen=True)
@@ -212,8 +213,8 @@ class RecordedScenario(EnvironmentScenario):
 class Scenes:
     """Return, when called with a layout seed, the traffic from which its layout is cut.
 
-    Scenes that share traffic have one name. It follows from what moves in them, so that another
-    recording of the same has it, too.
+    Scenes that share traffic have one name. It has what moves in each of them, so that another
+    recording with any of the same shares a part of it.
     """
 
     name: str  # the scenario's name
@@ -221,8 +222,11 @@ class Scenes:
     def __call__(self, seed: int) -> str:
         recording = recording_of(self.name)
         sessions = sessions_of(recording)
-        session = sessions.session[nth(recording, seed).scene]
-        return f"traffic {session[:LETTERS]}"
+        scene = nth(recording, seed).scene
+        contents = sessions.contents_of(scene)
+        if len(contents) > PARTS:  # then any two have the first, and each its own
+            contents = [*contents[: PARTS - 1], sessions.traffic[scene].content]
+        return " + ".join(f"traffic {content[:LETTERS]}" for content in contents)
 
 
 @lru_cache(maxsize=16)

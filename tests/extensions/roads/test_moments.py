@@ -304,6 +304,9 @@ def test_scenes_that_share_traffic_are_one_session(which: str) -> None:
         groups.setdefault(found.session[name], []).append(name)
     assert sorted(groups.values()) == expected
     for session, names in groups.items():
+        contents = sorted({found.traffic[name].content for name in names})
+        assert [found.contents_of(name) for name in names] == [contents] * len(names)
+        assert contents[0] == session
         if which == "overlapping cuts" and len(names) > 1:
             purposes = [found.purpose(name, 5.0, HORIZON_S) for name in names]
             assert purposes == [dealt(session)] * len(names)
