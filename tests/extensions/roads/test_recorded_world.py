@@ -18,7 +18,7 @@ from harness.core.errors import UserError
 from harness.core.seeds import FIRST
 from harness.dataset.load import load
 from harness.dataset.verify import check
-from harness.extensions.roads import family, held, tables
+from harness.extensions.roads import family, fitness, held, tables
 from harness.extensions.roads.family import RECORDINGS, recording_of
 from harness.extensions.roads.fitness import is_mastered
 from harness.extensions.roads.held import sessions_of
@@ -374,6 +374,19 @@ CHOICES: dict[str, Callable[[dict[str, Any]], object]] = {
     "another candidates of its": lambda facts: facts["choice"].update(candidates=4),
     "another left_out of its": lambda facts: facts["choice"]["left_out"].popitem(),
 }
+
+
+@pytest.mark.slow
+def test_a_recorded_driver_who_fails_is_found(
+    once: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(family.FOLDERS, "")
+    trials()["reaction"].lays(tmp_path, once)
+    scenario = scenarios.get(RECORDINGS.named({"recording": str(tmp_path / "with")}))
+    fitness.other_choice.cache_clear()
+    monkeypatch.setattr(fitness, "is_mastered", lambda recording, moment: False)
+    with pytest.raises(UserError, match="its recorded driver does not reach the goal; make"):
+        RecordedWorld.examine(scenario, 0)
 
 
 @pytest.mark.slow
