@@ -97,6 +97,7 @@ def driven(settings: Settings, scenario: str | None = None) -> "LiveSource":
     source = LiveSource(first_seed, episodes, name, choice)
     if world_of_scenario := source.scenario.world:
         world_of_scenario.examine(source.scenario, first_seed)
+    source.scenario.cluster_of(source.layout_seeds[0])
     return source
 
 

@@ -225,6 +225,11 @@ class Scenario:
             return None
         with worded(f"scenario {printable(self.name, 80)}"):
             name: object = self.cluster(seed)
+            if self.cluster(seed) != name:
+                raise ValueError(
+                    f"cluster of layout seed {seed} differs from call to call; let it follow from "
+                    "the seed alone"
+                )
             if isinstance(name, str) and 0 < len(name) <= MOST_LETTERS and name.isprintable():
                 return name
             raise ValueError(

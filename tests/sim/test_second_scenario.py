@@ -6,6 +6,7 @@ import io
 import json
 import pickle
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -167,6 +168,9 @@ def test_what_a_layout_is_cut_from_is_a_text():
         odd = replace(SCENARIO, cluster=lambda seed, wrong=wrong: wrong)
         with pytest.raises(UserError, match=r"cluster of layout seed 3 is .*, no text of 1 to 1"):
             odd.cluster_of(3)
+    calls = count()
+    with pytest.raises(UserError, match=r"cluster of layout seed 3 differs from call to call"):
+        replace(SCENARIO, cluster=lambda seed: f"r{next(calls)}").cluster_of(3)
     assert SCENARIO.cluster_of(3) is None
     assert (RECORDED.cluster_of(3), RECORDED.at(3).cluster_of(4)) == ("recording 2", "recording 2")
 
