@@ -42,7 +42,7 @@ TIMES = ("name", "created", "command")
 @given(st.integers(1, 50), st.lists(st.integers(), max_size=60))
 def test_shards_are_all_of_it_in_order_and_of_about_one_size(of: int, items: list[int]) -> None:
     if of > len(items):
-        with pytest.raises(UserError, match=f"give {len(items)} shards or fewer"):
+        with pytest.raises(UserError, match=rf"give {len(items)} shards? or fewer$"):
             Shard(1, of).part(items)
         return
     parts = [Shard(n, of).part(items) for n in range(1, of + 1)]
@@ -245,6 +245,13 @@ def test_shards_that_are_forged_alike_are_refused_in_one_line_and_nothing_is_mad
         said = refused(harness, shards)
         assert "hold no parts of one whole (" in said or "is no shard; give folders" in said
     for config, each in zip(configs, stated, strict=True):
+        world = each["settings"]["world"]
+        parameters = {**world["scenario"]["parameters"], "zork": 1}
+        scenario = {**world["scenario"], "parameters": parameters}
+        settings = {**each["settings"], "world": {**world, "scenario": scenario}}
+        config.write_text(json.dumps({**each, "settings": settings}))
+    assert "has other parameters here (not zork)" in refused(harness, shards)
+    for config, each in zip(configs, stated, strict=True):
         config.write_text(json.dumps(each))
     part, other = (next((shard / ".work").glob("episodes-*")) for shard in shards[:2])
     for file in ("answers.jsonl", "episodes.csv", "decisions.parquet"):
@@ -263,7 +270,7 @@ def test_who_is_still_writing_is_waited_for(split: Path, harness: Typed, tmp_pat
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--shard", "1/4", "--out", "shard"), "the work has 3 parts; give 3 shards or fewer"),
+        (("--shard", "1/4", "--out", "shard"), "the work has 3 parts; give 3 shards or fewer, or --episodes 7 or more, 2 of which"),
         (("--shard", "1/3"), "--shard 1/3: give --out with a folder for this shard alone"),
         (("--shard", "1/3", "--out", "shard", "--latency", "measured", "--model", "swarm-tiny"),
          "--latency measured is of one machine"),

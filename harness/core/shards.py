@@ -17,6 +17,7 @@ import msgspec
 
 from harness.core import work
 from harness.core.errors import UserError, printable
+from harness.core.figures import amount
 from harness.core.files import bytes_of, text_of
 from harness.core.formats import CONFIG, WORK
 from harness.core.seals import write_seal
@@ -44,16 +45,17 @@ class Shard:
     def __str__(self) -> str:
         return f"{self.number}/{self.of}"
 
-    def part(self, items: Sequence[T]) -> Sequence[T]:
+    def part(self, items: Sequence[T], more: str = "") -> Sequence[T]:
         """Return this shard's slice of the items of a whole work, in their order.
 
         A shard is one of several parts of equal size. Raises UserError if there are more shards
-        than items.
+        than items; `more` says what gives as many.
         """
         if self.of > len(items):
+            parts, shards = amount(len(items), "part"), amount(len(items), "shard")
+            instead = f", or {more}" if more else ""
             raise UserError(
-                f"--shard {self}: the work has {len(items)} parts; give {len(items)} shards or "
-                "fewer"
+                f"--shard {self}: the work has {parts}; give {shards} or fewer{instead}"
             )
         start, stop = (len(items) * n // self.of for n in (self.number - 1, self.number))
         return items[start:stop]

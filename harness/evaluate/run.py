@@ -77,6 +77,7 @@ from harness.runs.settings import FILE, of_words, text_of
 from harness.runs.stopping import InterimLooks
 from harness.runs.summary import Figures, counted
 from harness.runs.unanswered import Tally
+from harness.world import scenarios
 
 if TYPE_CHECKING:  # only driving loads the simulator
     from harness.evaluate.live_world import LiveSource, LiveWorld
@@ -184,7 +185,9 @@ def evaluate_shard(
     made_of = sources(spec)
     earlier = unfinished(spec, out, str(shard))
     run_start, chunks = _begin_driving(spec, out, earlier, workers, str(shard))
-    own_chunks = shard.part(chunks)
+    at_once = _at_once(run_start.settings)
+    more = f"--episodes {at_once * (shard.of - 1) + 1} or more, {at_once} of which are one part"
+    own_chunks = shard.part(chunks, more)
     progress.more(sum(map(len, own_chunks)))
     with work.working(out, run_start, "run.json") as place:
         if earlier:
@@ -204,6 +207,9 @@ def merge(folders: Sequence[Path], out: Path) -> Evaluated:
     holds something else.
     """
     run_starts = shards.read(folders, RunStart)
+    with shards.made_whole(folders, out):
+        driven = msgspec.convert(run_starts[0].settings["world"], ClosedLoop).scenario
+    scenarios.of_manifest(driven["name"], driven["parameters"])  # which the report is of
     with shards.made_whole(folders, out):
         return _merged(run_starts, folders, out)
 
@@ -445,8 +451,12 @@ def _chunks_of(settings: Mapping[str, Any]) -> list[Sequence[int]]:
     numbers: Sequence[int] = range(min(world.episodes, most))
     if selection := recorded(world.selection):
         numbers = selection.choice(range(most), None).numbers
-    fill = math.ceil(most_at_once(settings["batch_size"]) / LEAST_VIEWERS)
-    return _split(numbers, max(EPISODES_AT_ONCE, fill))
+    return _split(numbers, _at_once(settings))
+
+
+def _at_once(settings: Mapping[str, Any]) -> int:
+    """Return how many episodes of a closed-loop run are driven in step."""
+    return max(EPISODES_AT_ONCE, math.ceil(most_at_once(settings["batch_size"]) / LEAST_VIEWERS))
 
 
 def _split(numbers: Sequence[int], size: int) -> list[Sequence[int]]:
