@@ -1,5 +1,6 @@
 """The runs that one report holds side by side."""
 
+import json
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from harness.core.memory import uncollected
 from harness.dataset.load import Dataset
 from harness.runs.contradictions import refuse
 from harness.runs.folder import Run, read
-from harness.runs.records import FrozenScenes
+from harness.runs.records import ClosedLoop, FrozenScenes
 from harness.runs.run_dataset import dataset_of
 from harness.world.scenario import Scenario
 
@@ -92,7 +93,8 @@ def gather(paths: Sequence[Path], dataset: Dataset | Path | None = None) -> Runs
         if _scenes(first) != _scenes(run):
             raise UserError(
                 f"{printable(first.path)} and {printable(run.path)} are not of the same scenes "
-                f"({_scene_words(first)} and {_scene_words(run)}); report them apart"
+                f"({_scene_words(first)} and {_scene_words(run)}{parameters_apart(first, run)}); "
+                "report them apart"
             )
     world = first.manifest.world
     if not isinstance(world, FrozenScenes):
@@ -121,6 +123,18 @@ def _scene_words(run: Run) -> str:
     if isinstance(world, FrozenScenes):
         return f"{printable(world.name, 40)} {printable(world.sha256, 12)}"
     return f"driven in closed loop from layout seed {world.first_seed}"
+
+
+def parameters_apart(one: Run, other: Run) -> str:
+    """Return in words, after a comma, which parameters of two driven runs' scenarios differ."""
+    worlds = one.manifest.world, other.manifest.world
+    given = [world.pinned[1] for world in worlds if isinstance(world, ClosedLoop)]
+    texts = []
+    for name in sorted(given[0].keys() | given[1].keys()) if len(given) == 2 else ():
+        values = [json.dumps(each.get(name)) for each in given]
+        if values[0] != values[1]:
+            texts.append(f", {printable(name, 40)} {printable(' and '.join(values), 60)}")
+    return "".join(texts[:3])
 
 
 def _names(runs: Sequence[Run]) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,9 +25,11 @@ from harness.dataset.load import Dataset, load
 from harness.report.compare import words
 from harness.report.compare.difference import Comparison, Difference, Flip, compare
 from harness.report.compare.pair import ORDER, SETTINGS, pair
+from harness.report.runs import parameters_apart
 from harness.runs.headline import BALANCED
 from harness.runs.metric_names import ONE_OPTIMAL
 from harness.runs.metrics import METRICS
+from harness.runs.records import ClosedLoop
 
 Said = tuple[int, str, str]
 WITNESSED = {name for name in METRICS if name.startswith("success_dangerous_rate_")}
@@ -417,6 +420,18 @@ def test_live_runs_are_compared_with_live_runs(
     for other, said in ((runs[0], "one was made by"), (Path("other"), "not of the same scenes")):
         with pytest.raises(UserError, match=said):
             pair(Path("cruise"), other)
+
+
+def test_what_two_worlds_differ_in_is_named() -> None:
+    def driven(**parameters: object) -> Any:
+        scenario = {"name": "street", "parameters": {"lanes": 2, **parameters}}
+        world = ClosedLoop(scenario=scenario, first_seed=0, episodes=1, late_against="nobody")
+        return SimpleNamespace(manifest=SimpleNamespace(world=world))
+
+    one = driven(react=True, beacon_loss=0.1)
+    assert parameters_apart(one, driven(react=True, beacon_loss=0.2)) == ""
+    said = parameters_apart(one, driven(react=False, beacon_loss=0.2))
+    assert said == ", react true and false"
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
 from harness.core.statistics import joined_clusters
+from harness.report.runs import parameters_apart
 from harness.report.words import facts
 from harness.runs.contradictions import sound
 from harness.runs.difficulty import Pool
@@ -218,6 +219,7 @@ def pair(a: Path, b: Path) -> Pair:
     side_a, side_b = _side(first), _side(second)
     if first.manifest.world.pinned != second.manifest.world.pinned:
         scenes = " and ".join(printable(where(run), 60) for run in (first, second))
+        scenes += parameters_apart(first, second)
         raise UserError(f"{both} are not of the same scenes ({scenes}); make both on the same")
     seeds_a, seeds_b = sorted(first.manifest.seeds), sorted(second.manifest.seeds)
     if seeds_a != seeds_b:
