@@ -204,6 +204,8 @@ def test_what_was_not_answered_is_no_answer(two: Dataset, tmp_path: Path) -> Non
         return [line["id"] for line in left_of(asked, out)]
 
     assert without(egos[0]) == [lines[egos[0]]["id"]]
+    with pytest.raises(Unanswered, match="; correct the 1 line there that say error, add a line"):
+        run(asked, out)
     assert without(helpers[0]) == []
     left = without(*helpers)
     assert set(left) & {lines[n]["id"] for n in helpers}

@@ -70,9 +70,12 @@ def settle(spec: Spec, out: Path) -> None:
         return
     write(left.values(), out)
     name, first = printable(file.path), next(iter(left))
+    errors = sum(question in file.answers for question in left)
+    lines = f"correct the {amount(errors, 'line')} there that say error, " if errors else ""
     raise Unanswered(
         f"{name} has no answer to {amount(len(left), 'question')}, the first {first}: they are in "
-        f"{printable(out / QUESTIONS)}; add a line for each to {name}, and type the same command"
+        f"{printable(out / QUESTIONS)}; {lines}add a line to {name} for each that has none, and "
+        "type the same command"
     )
 
 
