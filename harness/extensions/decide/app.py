@@ -32,6 +32,7 @@ from harness.extensions.decide.model import ServedModel
 
 MOST_BYTES = 2**20  # of a request
 MOST_SEEN_BYTES = 5 * 2**20  # of one with a picture
+MOST_PASSED_BYTES = 64 * 2**20  # of one that is read to its end, so that its sender hears of it
 BODY_S = 30.0  # within which a request must have come
 ANSWER_S = 120.0  # within which it is answered; a client's usual patience
 CONNECTIONS = 128  # open at the same time
@@ -146,17 +147,20 @@ class Service:
                 "a request is JSON, as application/json and not compressed", code="content_type"
             )
         most = MOST_SEEN_BYTES if self._model.sees else MOST_BYTES
-        data = bytearray()
+        data, length = bytearray(), 0
         try:
             async with asyncio.timeout(BODY_S):
                 async for chunk in request.stream():
-                    data += chunk
-                    if len(data) > most:
-                        raise Refusal(f"the request has more than {most} bytes", 413, "too_large")
+                    length += len(chunk)
+                    if length > MOST_PASSED_BYTES:
+                        break
+                    data += chunk if length <= most else b""
         except TimeoutError:
             raise Refusal(f"the request did not come within {BODY_S:g} s", 408, "timeout") from None
         except ClientDisconnect:
             raise Refusal("the client is gone", 400, "gone") from None
+        if length > most:
+            raise Refusal(f"the request has more than {most} bytes", 413, "too_large")
         return bytes(data)
 
     async def _answer(self, shape: Shape, body: bytes) -> dict[str, Any]:
