@@ -2,6 +2,7 @@
 figures played by hand.
 """
 
+import importlib
 import json
 import math
 import shutil
@@ -79,6 +80,9 @@ class Wanderer(Scripted):
 @pytest.fixture
 def wanderer(monkeypatch: pytest.MonkeyPatch) -> Wanderer:
     """In the place of every model's engine."""
+    # A module that is first imported under the patch would keep it, in all tests of this process.
+    for module in ("harness.evaluate.recompute", "harness.studies.replayed_run"):
+        importlib.import_module(module)
     backend = Wanderer()
     monkeypatch.setattr("harness.backends.registry.open_backend", lambda card, **options: backend)
     return backend
