@@ -5,6 +5,8 @@ and whether the processor multiplies in bfloat16.
 import os
 from pathlib import Path
 
+from harness.core.files import LARGEST, opened
+
 # products of bfloat16, the fastest first, as Linux names what a processor has
 BFLOAT16: tuple[str, ...] = ("amx_bf16", "avx512_bf16")
 CPU_INFO = Path("/proc/cpuinfo")  # where Linux says it
@@ -32,7 +34,8 @@ def bfloat16_products() -> str | None:
     None if it has none and would emulate them, or if the system does not say, as only Linux does.
     """
     try:
-        words = CPU_INFO.read_text("utf-8").split()
+        with opened(CPU_INFO, "text") as file:  # its size is stated as 0
+            words = file.read(LARGEST["text"]).decode("utf-8", "replace").split()
     except OSError:
         return None
     return next((name for name in BFLOAT16 if name in words), None)

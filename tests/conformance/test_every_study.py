@@ -44,7 +44,8 @@ def test_it_writes_page_and_tables_and_last_what_its_registration_says(
 ) -> None:
     of = tries(kind)
     before, whole = of.said["before"], of.said["whole"]
-    assert (whole.code, whole.err) == (0, "")
+    assert whole.code == 0
+    assert "harness: " not in whole.err  # it may say points as they are known
     assert f"wrote {of.trial.folder}/index.html\n" in whole.out
     manifest = of.folder / f"{kind}.json"
     assert json.loads(manifest.read_text())["format"] == f"swarmdrive-{kind}/1"
@@ -53,7 +54,9 @@ def test_it_writes_page_and_tables_and_last_what_its_registration_says(
         path.stem for path in of.folder.glob("*.jsonl")
     }
     page = (of.folder / "index.html").read_text()
-    assert page.count("<img ") == len(list(of.folder.glob("*.svg")))
+    # Figures in files are charts in the page, too.
+    assert page.count("data-chart=") >= len(list(of.folder.glob("*.svg")))
+    assert "<img " not in page
     new = whole.files.keys() - before.files.keys()
     outside = {path for path in new if not path.startswith(f"{of.trial.folder}/")}
     assert outside == set(of.trial.beside)
