@@ -28,7 +28,7 @@ from harness.world.scene_graph import AgedNode
 from harness.world.state import WorldState
 from harness.world.world import World
 
-SMALLEST = "--layouts 1 --datasets hard-brake-ahead-v2"
+SMALLEST = "--layouts 2 --datasets hard-brake-ahead-v2"
 DATASETS = (
     "occluded-intersection-v3", "hard-brake-ahead-v2", "do-not-pass-v2", "roundabout-entry-v2",
     "parking-exit-v2", "blind-merge-v2",

@@ -133,7 +133,7 @@ def line(row: Row, load: float, before: Mapping[str, str]) -> str:
 def is_worse(row: Row, former: str) -> bool:
     """Return whether a figure is `WORSE` than a former one, such as `2 ms`, in the same unit."""
     number, _, unit = former.partition(" ")
-    if unit != row.unit or not row.measured:
+    if not number or unit != row.unit or not row.measured:
         return False
     is_more_better = unit in MORE or "of ideal" in row.what
     ratio = row.measured / float(number)

@@ -170,7 +170,9 @@ def test_scenes_that_a_command_reports_are_not_tuned_on(tmp_path: Path) -> None:
     relabel(tmp_path / "report", {0: 7, 1: 8})
     tune, report = load(tmp_path / "tune"), load(tmp_path / "report")
     rebuilt.refuse(tune, [report])
-    with pytest.raises(UserError, match=r"has scene 0000\d-0-.*, which is 0000\d-0-.* of tune"):
+    with pytest.raises(
+        UserError, match=r"has scene 0000\d-0-.*, which is scene 0000\d-0-.* of tune"
+    ):
         rebuilt.refuse(tune, [tune])
 
 

@@ -64,13 +64,17 @@ class Streams(Part, frozen=True, kw_only=True):
             return
         if point.asks_again:
             raise wrong("stream", self.stream, f"{NONE} where {point.asks_twice}")
-        if point.elsewhere or point.question != PLAIN:
-            allowed = f"{NONE} where the ego hears others than its own helpers, or blind ones"
-            raise wrong("stream", self.stream, allowed)
+        for part in point.more:
+            if part.elsewhere or part.question != PLAIN:
+                control, *_ = part.__struct_fields__
+                allowed = f"{NONE} where {control} is {getattr(part, control)}"
+                raise wrong("stream", self.stream, allowed)
         channel = point.channel
         if point.radio.profile is None or isinstance(channel, Physical):
             return
-        if not isinstance(channel, Radio) or channel.density_coupled:
+        if isinstance(channel, Radio) and channel.density_coupled:
+            raise wrong("stream", self.stream, f"{NONE} where density_coupled is true")
+        if not isinstance(channel, Radio):
             allowed = f"{NONE}: channel {point.radio.profile} does not tell a loss of one message"
             raise wrong("stream", self.stream, allowed)
 

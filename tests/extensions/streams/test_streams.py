@@ -269,7 +269,7 @@ def test_congestion_control_thins_the_radio_and_the_stream() -> None:
         ("6g:stream=cpm,stream_interval_s=0.05", "seconds from 0.1 to 1 (ETSI TS 103 324)"),
         ("6g:stream=cpm,stream_interval_s=2", "seconds from 0.1 to 1 (ETSI TS 103 324)"),
         ("6g:stream=cpm,content=objects", "it must be none where content is objects"),
-        ("6g:stream=cpm,messages=blind", "it must be none where the ego hears others"),
+        ("6g:stream=cpm,messages=blind", "it must be none where messages is blind"),
         ("6g:congestion=adaptive", "channel 6g has no packets of other vehicles"),
         ("its-g5:congestion=fast", "unknown congestion 'fast'; known: adaptive, none, reactive"),
         ("single-local:stream=cpm", "has no channel, so stream changes nothing"),
