@@ -408,6 +408,7 @@ def test_a_measured_run_that_was_stopped_as_it_tidied_is_that_run(
     harness: Callable[..., Any], small_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its times bear a seal; without it nobody knows that they were measured here."""
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     monkeypatch.setattr(timing, "load_a_core", lambda: 0.0)
     typed = (
         "eval", "--model", LANGUAGE_MODEL, "--dataset", small_path, "--limit", "1", "--seeds", "0",
