@@ -32,6 +32,7 @@ from harness.extensions.streams.sending import (
     NAME,
     ROUNDING_S,
     Cpm,
+    Look,
     links,
     most_looks,
     stretch,
@@ -60,7 +61,7 @@ KEPT_S = 2.0  # age at which the ego drops a report: two of the longest interval
 GROWS_MPS2 = 2.0  # standard deviation of the acceleration that a report does not tell, assumed
 NO_SEED = -1  # in place of the channel's seed, as beacons' links have it
 
-Key = tuple[str, str, int]  # id of a scene, sender, and number of its look
+Key = tuple[str, Look]  # id of a scene, and the look that a CPM is of
 
 
 class Held(NamedTuple):
@@ -214,7 +215,7 @@ def _young(scene: Scene) -> Iterator[Scene]:
 
 
 def _key(scene: Scene, cpm: Cpm) -> Key:
-    return scene.id, cpm.sender, cpm.look.number
+    return scene.id, cpm.look
 
 
 def _states(held: Sequence[Held]) -> dict[Key, WorldState]:
