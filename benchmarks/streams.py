@@ -90,7 +90,7 @@ def load_of(name: str, layouts: int) -> tuple[float, ...]:
     return (
         len(cpms) / seconds,
         mean(len(cpm.objects) for cpm in cpms),
-        mean(stream.bits(cpm) for cpm in cpms) / 8,
+        float(stream.bits(cpms).mean()) / 8,
         mean(len(scene.state.vehicles) - 1 for scene in scenes),
         mean(own),
         len(nodes) / len(graphs),

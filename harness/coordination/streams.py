@@ -37,9 +37,29 @@ class Stream(Protocol):
         each with a text by sender, as `heard` returns it.
         """
 
+    def sent(self, scenario: Any, scenes: Sequence[Any]) -> "Sent":
+        """Return what helpers have sent since the decision point before each of n scenes.
+
+        All that they send counts, whoever hears it. At the first scene of a course it is nothing.
+        """
+
+
+class Sent(NamedTuple):
+    """Hold how much helpers have sent unasked before n decisions, each since the one before."""
+
+    messages: Floats  # number of messages, `(n,)`
+    bits: Floats  # their size, `(n,)`
+    # seconds that they were on air, `(n,)`; NaN where the channel's model does not know it
+    airtime_s: Floats
+
+    def take(self, at: Any) -> "Sent":
+        """Return those before some of the decisions: at `at`, indices or a mask."""
+        return Sent(*(array[at] for array in self))
+
 
 class Streamed(NamedTuple):
-    """Hold what n egos answer that have heard a stream; others answer as without one."""
+    """Hold what n egos answer that have heard a stream, and what was sent; NaN if not wanted."""
 
     own: Floats  # each ego's probabilities of its A actions, `(n, A)`; NaN where an answer failed
     inference_s: Floats  # seconds of each answer, `(n,)`; NaN where unknown
+    sent: Sent  # what helpers have sent since the decision before

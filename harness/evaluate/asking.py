@@ -24,7 +24,7 @@ from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
-from harness.coordination.streams import Stream, Streamed
+from harness.coordination.streams import Sent, Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.at_once import first_at_once
 from harness.core.errors import Unanswered, UserError, printable
@@ -464,7 +464,8 @@ class Asker:
         as without them. Only the scenes at the indices `at` are asked.
         """
         ids = [request_id(scene, scene.viewers[0], PLAIN) for scene in scenes]
-        sets = stream_sets(self.spec.scenario, [scenes[n] for n in at.tolist()], stream)
+        wanted = [scenes[n] for n in at.tolist()]
+        sets = stream_sets(self.spec.scenario, wanted, stream)
         for n, each in zip(at.tolist(), sets, strict=True):
             if each[1]:
                 ids[n] = fusion_id(*each)
@@ -475,7 +476,10 @@ class Asker:
         for scene, name in zip(scenes, ids, strict=True):
             answers.append([self.answers.get(name), *[None] * (len(scene.viewers) - 1)])
         laid_out = intents_of(self.spec, self.latency, scenes, answers)
-        return Streamed(laid_out.own, laid_out.inference_s[:, 0])
+        sent = Sent(*np.full((3, len(scenes)), np.nan))
+        for every, some in zip(sent, stream.sent(self.spec.scenario, wanted), strict=True):
+            every[at] = some
+        return Streamed(laid_out.own, laid_out.inference_s[:, 0], sent)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.streams import Sent
 from harness.core.arrays import Ints, any_of
 from harness.dataset.load import Scene
 from harness.evaluate.agreement import broken_words
@@ -33,13 +34,18 @@ def columns(decided: Decided[Any]) -> dict[str, Any]:
     unknown.
     """
     c, point = decided.result, decided.point
-    anybody = any_of(c.on_time)
+    anybody, unknown = any_of(c.on_time), np.full(c.messages.shape, np.nan)
+    streamed = decided.streamed or Sent(unknown, unknown, unknown)
+    streamed_s = decided.streamed.airtime_s if decided.streamed else 0.0
     return {
         "messages": c.messages,
         "requests": c.requests,
         "request_bits": c.request_bits,
         "reply_bits": c.reply_bits,
-        "airtime_ms": c.airtime_s * 1000,
+        "unasked": streamed.messages,
+        "unasked_bits": streamed.bits,
+        "airtime_ms": (c.airtime_s + streamed_s) * 1000,
+        "unasked_ms": streamed.airtime_s * 1000,
         "triggered": c.triggered,
         "busy_ratio": np.full(c.messages.shape, busy_ratio(point)),
         "own_failed": c.own_failed,

@@ -23,7 +23,7 @@ from harness.coordination.parts_of_packages import sources
 from harness.coordination.plans import Plans
 from harness.coordination.scheduling import Outlook
 from harness.coordination.sent import SentIntents
-from harness.coordination.streams import Stream, Streamed
+from harness.coordination.streams import Sent, Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
@@ -79,9 +79,9 @@ class Decided(Generic[DecisionPoint]):
     A step is one round of decisions in all episodes, and a condition, `point`, the settings of the
     radio, of asking helpers and of fusing their messages. `decision_points` are the situations to
     decide in, scenes as a rule. `due` says which decision is about which of them, in which episode
-    and with which seed; `result` has what was decided, such as the index of each action, (n,), and
+    and with which seed; `result` has what was decided, such as the index of each action, (n,),
     `said` the probabilities of actions that vehicles sent over the channel, attackers' lies
-    included.
+    included, and `streamed` how much helpers have sent unasked.
     """
 
     point: OperatingPoint  # the condition
@@ -91,6 +91,8 @@ class Decided(Generic[DecisionPoint]):
     due: Due  # the decisions that were due
     result: Coordination  # what was decided, (n, ...)
     said: SentIntents  # what vehicles sent over the channel, attackers' lies included
+    # what helpers have sent unasked since the decision before, (n,); None if they send nothing so
+    streamed: Sent | None
 
 
 class World(Protocol[DecisionPoint]):
@@ -350,7 +352,9 @@ def _steps(
             fusion = replace(fusions[point], call=call)
             result = fuse(point, sent[point], broadcasts[point].intents, fusion)
             memories[point].keep(due_here, result.state)
-            decided.append(Decided(point, decision_points, due_here, result, broadcasts[point]))
+            traffic = streamed[point.stream].sent.take(due_here.at) if point.stream else None
+            sent_intents = broadcasts[point]
+            decided.append(Decided(point, decision_points, due_here, result, sent_intents, traffic))
         yield decided
         world.step(decided)
 

@@ -43,7 +43,12 @@ COLUMNS = {
     "requests": WHOLE,  # requests broadcast; 0 if nobody was asked
     "request_bits": NUMBER,  # size of the requests
     "reply_bits": NUMBER,  # size of the scheduled replies
-    "airtime_ms": NUMBER,  # time on air of both; unknown where the channel model does not know it
+    # number of messages that helpers sent unasked since the decision before; unknown, like the next
+    # and `unasked_ms`, where they send nothing so
+    "unasked": NUMBER,
+    "unasked_bits": NUMBER,  # their size
+    "airtime_ms": NUMBER,  # time on air of all; unknown where the channel model does not know it
+    "unasked_ms": NUMBER,  # the part of it of messages sent unasked
     "busy_ratio": NUMBER,  # share of time that the channel is busy, where its model knows that
     "own_failed": FLAG,
     "triggered": FLAG,
@@ -75,6 +80,9 @@ COLUMNS = {
 }
 # A file has no such column, and none that was added, if all its values are unknown.
 OPTIONAL = (
+    "unasked",
+    "unasked_bits",
+    "unasked_ms",
     "busy_ratio",
     "miss",
     "false_alarm",
@@ -111,6 +119,7 @@ DECIMALS = {  # enough for every figure, and few enough to be the same on every 
     "fusion_ms": 3,
     "fused": 6,
     "airtime_ms": 6,
+    "unasked_ms": 6,
     "busy_ratio": 6,
     "arrival_ms": 3,
     "weight": 6,

@@ -1,5 +1,7 @@
 """The metrics of exchanges: messages, time on air, latency and packet loss."""
 
+import numpy as np
+
 from harness.core.figures import PERCENT, Unit
 from harness.runs.metric import COUNT, MS, Metric, decision_share, of_column
 from harness.runs.metric_names import LATENCY
@@ -23,20 +25,39 @@ EXCHANGE_METRICS = (
     ),
     Metric(
         "bits_per_episode",
-        "bits of all requests and scheduled replies",
+        "bits of all requests, scheduled replies and messages sent unasked",
         Unit("bit", 0),
         "lower",
-        decisions=lambda d: d["request_bits"] + d["reply_bits"],
+        decisions=lambda d: d["request_bits"] + d["reply_bits"] + np.nan_to_num(d["unasked_bits"]),
         total=True,
     ),
     Metric(
+        "unasked_per_episode",
+        "number of messages that helpers sent unasked, from the first decision to the last",
+        COUNT,
+        "lower",
+        decisions=of_column("unasked"),
+        total=True,
+        optional=True,
+    ),
+    Metric(
         "airtime_ms",
-        "total time on air of an episode's requests and scheduled replies",
+        "total time on air of an episode's requests, scheduled replies and messages sent unasked",
         MS,
         "lower",
         label="airtime",
         decisions=of_column("airtime_ms"),
         total=True,
+    ),
+    Metric(
+        "unasked_ms",
+        "the part of the time on air that messages sent unasked take",
+        MS,
+        "lower",
+        label="unasked airtime",
+        decisions=of_column("unasked_ms"),
+        total=True,
+        optional=True,
     ),
     Metric(
         "busy_ratio",

@@ -156,6 +156,10 @@ COLUMNS: Mapping[str, Added] = {
         "2026-11-23", None, "load of the channel; also missing where it is not known"
     ),
     **dict.fromkeys(
+        ("unasked", "unasked_bits", "unasked_ms"),
+        Added("2026-11-30", None, "streams; also missing where helpers send nothing unasked"),
+    ),
+    **dict.fromkeys(
         ("miss", "false_alarm"),
         Added("2026-11-27", None, "misses and false alarms; also missing in closed loop"),
     ),

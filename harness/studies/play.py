@@ -50,6 +50,7 @@ COLUMNS = (
     "messages",
     "request_bits",
     "reply_bits",
+    "unasked_bits",
     "effective_loss",
     "observed_loss",
 )

@@ -56,7 +56,7 @@ class Computer(Timer):
         # joules of inference: the ego's, of helpers that infer, and of a fusion call
         "inference_j": "busy_ratio",
         "helpers_j": "busy_ratio",  # the helpers' part of it
-        "radio_mj": "busy_ratio",  # millijoules to send the request and the replies
+        "radio_mj": "busy_ratio",  # millijoules to send all messages, those unasked too
         # joules of the ego's computer while it waits for messages and does not infer
         "waiting_j": "busy_ratio",
     }
@@ -192,8 +192,8 @@ class Computer(Timer):
 
         `inference_j` has joules of the ego, of the helpers that infer, and of a fusion call (a
         second question to the ego's model), and `helpers_j` the helpers' alone; `radio_mj`
-        millijoules to send the request and the replies; `waiting_j` joules of the ego's computer
-        while it waits for messages and does not infer. NaN where one of these is unknown.
+        millijoules to send all messages, those unasked too; `waiting_j` joules of the ego's
+        computer while it waits for messages and does not infer. NaN where one of these is unknown.
 
         Args:
             latency: how long answers take, with each agent's speed on the device. An agent is a
@@ -217,8 +217,11 @@ class Computer(Timer):
         ego_s = _egos_s(latency, part.decision_points, answers)[at]
         if _in_cloud(point):
             ego_s = np.zeros(len(at))
+        sent, airtime_s = _asked_for(result)
+        if part.streamed:
+            sent, airtime_s = sent + part.streamed.messages, airtime_s + part.streamed.airtime_s
         # as the table of decisions has them, in milliseconds
-        airtime_ms, decided_ms = result.airtime_s * 1000, result.latency_s * 1000
+        airtime_ms, decided_ms = airtime_s * 1000, result.latency_s * 1000
         waits_s = (decided_ms - result.fusion_s * 1000) / 1000 - ego_s
         idle = self.profile.idle_watts
         idle_watts = idle.value if idle else math.nan
@@ -226,7 +229,7 @@ class Computer(Timer):
         return {
             "inference_j": vehicles_j[:, 0] + of_helpers_j + calls_j,
             "helpers_j": of_helpers_j,
-            "radio_mj": 1000 * self._radio_j(point, result, airtime_ms / 1000),
+            "radio_mj": 1000 * self._radio_j(point, sent, airtime_ms / 1000),
             "waiting_j": idle_watts * np.maximum(waits_s, 0.0),
         }
 
@@ -253,20 +256,26 @@ class Computer(Timer):
         return joules
 
     def energy_j(self, point: "OperatingPoint", heard: "Exchange", joules: Floats) -> Floats:
-        radio_j = self._radio_j(point, heard, heard.airtime_s)
+        radio_j = self._radio_j(point, *_asked_for(heard))
         return np.asarray(joules[:, 0] + helpers_j(heard.infers, joules) + radio_j)
 
-    def _radio_j(self, point: "OperatingPoint", heard: "Exchange", airtime_s: Floats) -> Floats:
-        """Return the joules to send the messages of each decision, `(n,)`, by their time on air.
+    def _radio_j(self, point: "OperatingPoint", sent: Floats, airtime_s: Floats) -> Floats:
+        """Return the joules to send the `sent` messages of n decisions, `(n,)`, by time on air.
 
         Where the channel has only bits and a bandwidth, each message takes at least one frame of
         the device profile. A physical radio counts its own frames, with headers.
         """
         frame_ms = self.profile.frame_ms
         if frame_ms is not None and not point.physical:
-            sent = (heard.requests + heard.messages).astype(float)
             airtime_s = np.maximum(airtime_s, sent * frame_ms.value / 1000)
         return transmit_watts(self.profile, point) * airtime_s
+
+
+def _asked_for(heard: "Exchange") -> tuple[Floats, Floats]:
+    """Return how many messages each of n decisions asked for, requests too, and their airtime, s,
+    `(n,)` each.
+    """
+    return (heard.requests + heard.messages).astype(float), heard.airtime_s
 
 
 TIMER = Computer()

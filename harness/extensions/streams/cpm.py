@@ -21,6 +21,7 @@ import numpy as np
 from msgspec import structs
 
 from harness.coordination.encodings import ENCODINGS, JSON
+from harness.coordination.streams import Sent
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
@@ -37,8 +38,9 @@ from harness.extensions.streams.sending import (
     most_looks,
     stretch,
 )
-from harness.radio.channel import Channel, Physical
+from harness.radio.channel import Channel, Draws, Physical
 from harness.radio.fading import Trips
+from harness.radio.wrapped import broadcast
 from harness.world.perception.graph import scene_graphs
 from harness.world.perception.sensors import Detection
 from harness.world.perception.shared import (
@@ -138,21 +140,38 @@ class Cpms:
         senders = np.array([helpers.index(cpm.sender) for cpm in cpms])[:, None]
         shadows = trips.shadow(xy_m, self.channel.decorrelation_m)
         shadow = np.take_along_axis(shadows, senders, axis=1)
-        bits = np.array([self.bits(cpm) for cpm in cpms])[:, None]
+        bits = self.bits(cpms)[:, None]
         return np.broadcast_to(self.channel.loss(sites, shadow, bits), shadow.shape)[:, 0]
 
-    def bits(self, cpm: Cpm) -> float:
-        """Return the size of a CPM in bits, in this stream's encoding."""
+    def bits(self, cpms: Sequence[Cpm]) -> Floats:
+        """Return the size of n CPMs in bits, in this stream's encoding, (n,)."""
         if self.encoding != JSON:
-            objects = np.array([len(cpm.objects)])
+            objects = np.array([len(cpm.objects) for cpm in cpms])
             headers = isinstance(self.channel, Physical)
-            size = ENCODINGS[self.encoding].packet_bits("objects", headers, objects=objects)
-            return float(np.ravel(size)[0])
-        listed = []
-        for d in cpm.objects:
-            numbers = [round(d.x_m, 1), round(d.y_m, 1), round(d.speed_mps, 1)]
-            listed.append([d.id, d.kind, *numbers, d.indicator])
-        return 8.0 * len(canonical_bytes({"from": cpm.sender, "objects": listed}))
+            return ENCODINGS[self.encoding].packet_bits("objects", headers, objects=objects)
+        return np.array([8.0 * len(_written(cpm)) for cpm in cpms])
+
+    def sent(self, scenario: Scenario, scenes: Sequence[Scene]) -> Sent:
+        cpms, places = list[Cpm](), list[int]()
+        for n, scene in enumerate(scenes):
+            if scene.before():
+                of_scene = stretch(scenario, scene, self.interval_s).cpms
+                cpms += of_scene
+                places += [n] * len(of_scene)
+        bits, place = self.bits(cpms), np.array(places, dtype=int)
+        sums = []
+        for of_each in (np.ones(len(cpms)), bits, self._airtime_s(bits)):
+            sums.append(np.bincount(place, of_each, len(scenes)).astype(float))
+        return Sent(*sums)
+
+    def _airtime_s(self, bits: Floats) -> Floats:
+        """Return the time on air of n CPMs of these sizes, s, (n,); NaN where it is unknown."""
+        assert self.channel is not None, "a stream is sent over a channel"
+        n, of_links = np.zeros(len(bits), dtype=int), np.zeros((len(bits), 0))
+        # no draw changes a time on air
+        draws = Draws(of_links[..., None], of_links, Trips(n, n, n, 1), np.zeros((len(bits), 1)))
+        airtime_s = broadcast(self.channel, bits, draws).airtime_s
+        return np.broadcast_to(airtime_s, bits.shape)
 
     def graphs(
         self, scenario: Scenario, heard: Sequence[tuple[Scene, Mapping[str, str]]]
@@ -170,6 +189,15 @@ class Cpms:
             sectors = [next(graphs).sectors for _ in of_scene]
             cases.append(Told(scene.state, scene.graphs[scene.viewers[0]], senders, sectors))
         return with_reports(scenario, cases)
+
+
+def _written(cpm: Cpm) -> bytes:
+    """Return a CPM as compact JSON."""
+    listed = []
+    for d in cpm.objects:
+        numbers = [round(d.x_m, 1), round(d.y_m, 1), round(d.speed_mps, 1)]
+        listed.append([d.id, d.kind, *numbers, d.indicator])
+    return canonical_bytes({"from": cpm.sender, "objects": listed})
 
 
 def _held(scenario: Scenario, scene: Scene, texts: Mapping[str, str]) -> list[Held]:

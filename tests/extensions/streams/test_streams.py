@@ -3,6 +3,7 @@
 Scenes are frozen ones of a real dataset; where arithmetic is by hand, vehicles are put by hand.
 """
 
+import json
 import math
 import random
 from collections.abc import Sequence
@@ -11,19 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
-from evaluating import run, spec_of
+from evaluating import live_spec_of, run, spec_of
 from msgspec import structs
 
 from harness.coordination.named_points import named_point
 from harness.core.errors import UserError
-from harness.dataset.load import Dataset, Earlier, Scene
+from harness.dataset.load import Dataset, Earlier, Scene, load
 from harness.evaluate.dry_run import count
 from harness.evaluate.requests import stream_sets
 from harness.evaluate.sharing import shared_graphs
+from harness.extensions.devices import profiles as devices
+from harness.extensions.devices.timer import Computer, transmit_watts
 from harness.extensions.streams import sending
 from harness.extensions.streams.cpm import KEPT_S, Cpms, aged
 from harness.extensions.streams.motion import moments
+from harness.radio.channel import Broadcast
 from harness.radio.profiles import CHANNELS
 from harness.runs.folder import read
 from harness.world import lockstep, scenarios
@@ -34,6 +39,7 @@ from harness.world.world import World
 
 LOSSLESS = replace(CHANNELS["6g"], loss=0.0)
 AT_ONCE = Cpms(0.1, 0.0, LOSSLESS)
+BANDWIDTH_BPS = 200e6  # of 6g
 
 
 def scenes_of(dataset: Dataset) -> list[Scene]:
@@ -237,6 +243,133 @@ def test_a_lost_stream_leaves_every_decision_as_it_was(small: Dataset, tmp_path:
         for has in (False, True)
     )
     assert plain == with_stream
+
+
+OF_CPMS = [175, 195, 215, 237, 257, 278, 298]  # bytes as ETSI encodes and signs them, by objects
+
+
+def _as_json_bits(cpm: sending.Cpm) -> float:
+    listed = []
+    for d in cpm.objects:
+        numbers = [round(d.x_m, 1), round(d.y_m, 1), round(d.speed_mps, 1)]
+        listed.append([d.id, d.kind, *numbers, d.indicator])
+    told = {"from": cpm.look.sender, "objects": listed}
+    return 8.0 * len(json.dumps(told, separators=(",", ":")))
+
+
+def _by_its_g5_s(bits: float) -> float:
+    """40 µs and 8 µs a symbol of 48 bits, with 30 bytes of headers and 22 bits of service."""
+    return 40e-6 + 8e-6 * math.ceil((bits + 8 * 30 + 22) / 48)
+
+
+@pytest.mark.parametrize("loss", [0.0, 1.0])
+@pytest.mark.parametrize("profile", ["6g", "its-g5"])
+def test_what_is_sent_is_counted_whoever_hears_it(
+    small: Dataset, profile: str, loss: float
+) -> None:
+    """By own arithmetic, of the CPMs whose looks lie between two decisions."""
+    encoding = "json" if profile == "6g" else "etsi"
+    stream = named_point(f"{profile}:loss={loss},encoding={encoding},stream=cpm").stream
+    assert isinstance(stream, Cpms)
+    scenes = scenes_of(small)
+    counted = stream.sent(small.scenario, scenes)
+    for scene, *row in zip(scenes, *counted, strict=True):
+        cpms, before = sending.stretch(small.scenario, scene, 0.1).cpms, scene.before()
+        since_s = before.state.time_s if before else scene.state.time_s
+        expected = [0.0, 0.0, 0.0]
+        for cpm in cpms:
+            if since_s < cpm.look.time_s <= scene.state.time_s:
+                bits = _as_json_bits(cpm) if profile == "6g" else 8 * OF_CPMS[len(cpm.objects)]
+                airtime_s = bits / BANDWIDTH_BPS if profile == "6g" else _by_its_g5_s(bits)
+                for n, value in enumerate((1, bits, airtime_s)):
+                    expected[n] += value
+        assert row == pytest.approx(expected)
+        assert (row[0] > 0) == (before is not None)
+
+
+def test_time_on_air_is_unknown_where_a_radio_does_not_know_it(small: Dataset) -> None:
+    class Unknown(type(LOSSLESS)):  # type: ignore[misc]
+        def request(self, bits: Any, draws: Any) -> Broadcast:
+            return Broadcast(math.nan, math.nan)
+
+    scenes = scenes_of(small)
+    known = AT_ONCE.sent(small.scenario, scenes)
+    sent = Cpms(0.1, 0.0, Unknown(**vars(LOSSLESS))).sent(small.scenario, scenes)
+    assert np.array_equal(sent.bits, known.bits)
+    assert np.array_equal(np.isnan(sent.airtime_s), known.messages > 0)
+
+
+COUNTED = ("unasked", "unasked_bits", "unasked_ms")
+
+
+def _rows(done: Any) -> dict[tuple[str, int, int, int], dict[str, float]]:
+    """Each decision's columns of messages, by condition, episode, seed and step."""
+    d = done.decisions
+    names = (*COUNTED, "request_bits", "reply_bits", "airtime_ms")
+    keys = zip(d.labels("condition"), *map(d.whole, ("episode", "seed", "step")), strict=True)
+    values = zip(*(d[name].tolist() for name in names), strict=True)
+    return {key: dict(zip(names, row, strict=True)) for key, row in zip(keys, values, strict=True)}
+
+
+def test_a_run_counts_what_is_sent_beside_what_is_asked_for(small: Dataset, tmp_path: Path) -> None:
+    alone, plain, silent, both = points = [
+        "single-local", "6g:loss=0", "6g:loss=0,stream=cpm,tau_nats=9", "6g:loss=0,stream=cpm",
+    ]  # fmt: skip
+    done = evaluated(small, tmp_path / "run", points, (0,))
+    rows = _rows(done)
+    for (condition, _, _, step), row in rows.items():
+        has = condition in (silent, both)
+        assert [math.isnan(row[name]) for name in COUNTED] == [not has] * 3
+        if has:
+            assert (row["unasked_bits"] > 0) == (step > 0)
+            assert row["unasked_ms"] == pytest.approx(
+                row["unasked_bits"] / BANDWIDTH_BPS * 1e3, abs=1e-6
+            )
+        asked_ms = row["airtime_ms"] - (row["unasked_ms"] if has else 0)
+        asked_for = row["request_bits"] + row["reply_bits"]
+        assert asked_ms == pytest.approx(asked_for / BANDWIDTH_BPS * 1e3, abs=2e-6)
+        if condition == silent:
+            assert asked_for == 0
+    for condition in points:
+        here = [row for (name, *_), row in rows.items() if name == condition]
+        total = sum(row["request_bits"] + row["reply_bits"] for row in here)
+        total += sum(row["unasked_bits"] for row in here if condition in (silent, both))
+        score = done.score(condition, "bits_per_episode")
+        assert score.value == pytest.approx(total / len(small.episodes))
+    of_both = done.score(both, "unasked_per_episode").value
+    assert of_both > 10
+    assert done.score(both, "bits_per_episode").value > done.score(silent, "bits_per_episode").value
+    without = evaluated(small, tmp_path / "without", [alone, plain], (0,))
+    assert not {*COUNTED} & {*pq.read_schema(without.path / "decisions.parquet").names}
+    assert not {score.metric for score in without.scores} & {"unasked_per_episode", "unasked_ms"}
+
+
+@pytest.mark.slow
+def test_what_is_sent_unasked_takes_energy(small: Dataset, tmp_path: Path) -> None:
+    """As all messages do: a radio's power for as long as they are on air, or a frame at least."""
+    profile = devices.load("orin-nano")
+    assert profile.frame_ms is not None
+    points = tuple(map(named_point, ("its-g5:stream=cpm,tau_nats=9", "6g:stream=cpm,tau_nats=9")))
+    options: Any = {"timer": Computer(profile, "qwen3-0.6b"), "points": points, "seeds": (0,)}
+    done = read(run(spec_of(load(small.path, 1), "swarm-tiny", "v12", **options), tmp_path).out)
+    d = done.decisions
+    for point in points:
+        here = d.codes("condition", done.conditions) == done.conditions.index(point.name)
+        assert not d["messages"][here].any()
+        on_air_ms = d["airtime_ms"] if point.physical else d["unasked"] * profile.frame_ms.value
+        expected = (transmit_watts(profile, point) * on_air_ms)[here]
+        assert d["radio_mj"][here] == pytest.approx(expected, abs=1e-5)
+        assert expected.max() > 0
+
+
+@pytest.mark.slow
+def test_frozen_and_driven_send_alike(small: Dataset, tmp_path: Path) -> None:
+    texts = ("6g:stream=cpm", "its-g5:encoding=etsi,density_per_km=120,stream=cpm")
+    same: Any = {"points": tuple(map(named_point, texts)), "latency": "paper", "seeds": (0,)}
+    frozen = read(run(spec_of(load(small.path, 2), **same), tmp_path / "frozen").out)
+    driven = read(run(live_spec_of(episodes=2, first_seed=100, **same), tmp_path / "driven").out)
+    assert _rows(frozen) == _rows(driven)
+    assert len(_rows(frozen)) > 10
 
 
 def test_a_dry_run_counts_what_a_stream_adds(small: Dataset) -> None:
