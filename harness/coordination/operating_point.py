@@ -28,6 +28,7 @@ from harness.coordination.part_settings import (
     more_parts,
     part_of_settings,
     settings_alone,
+    settings_of_radio,
     without_gone,
 )
 from harness.coordination.parts import (
@@ -352,7 +353,8 @@ class OperatingPoint:
                 vehicles.
         """
         ask, consensus = self.ask, self.fusion.consensus
-        if self.radio.profile is None and setting not in settings_alone():
+        matters_alone = setting in settings_alone() and setting not in settings_of_radio()
+        if self.radio.profile is None and not matters_alone:
             return "it has no channel"
         if ask.schedule == NEVER and setting not in (*settings_alone(), "schedule"):
             return f"schedule {NEVER} asks nobody"

@@ -79,7 +79,7 @@ class Streams(Part, frozen=True, kw_only=True):
             raise wrong("stream", self.stream, allowed)
 
     def idle(self, setting: str) -> str | None:
-        if setting != "stream" and self.stream == NONE:
+        if setting.startswith("stream_") and self.stream == NONE:
             return f"helpers send nothing unasked (stream is {NONE})"
         return None
 

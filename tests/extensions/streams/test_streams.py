@@ -396,6 +396,22 @@ def test_congestion_control_thins_the_radio_and_the_stream() -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "setting", "reason"),
+    [
+        ("its-g5", "congestion", None),  # all vehicles send less, whether helpers do so or not
+        ("its-g5", "stream", None),
+        ("its-g5:stream=cpm", "stream_delay_s", None),
+        ("its-g5", "stream_delay_s", "helpers send nothing unasked (stream is none)"),
+        ("its-g5:congestion=reactive", "stream_interval_s", "helpers send nothing unasked (stream is none)"),
+        ("single-local", "congestion", "it has no channel"),
+        ("single-local", "stream", "it has no channel"),
+    ],
+)  # fmt: skip
+def test_a_sweep_refuses_what_changes_nothing(text: str, setting: str, reason: str | None) -> None:
+    assert named_point(text).idle(setting) == reason
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("6g:stream=cam", "unknown stream 'cam'; did you mean 'cpm'?"),
