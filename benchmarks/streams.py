@@ -5,7 +5,8 @@
 The first table drives tune layouts of each scenario by drawn actions, and compares where vehicles
 are ten times a second with where `harness.extensions.streams.motion` puts them by the states at the
 decisions alone. The second has the CPMs at decision points of each dataset's report layouts, and
-what an ego holds of them under `6g`.
+what an ego holds of them under `6g`. The third has the share of time that all helpers' CPMs, as
+ETSI encodes them, take on `its-g5`, beside that of the background's packets, all uncontrolled.
 """
 
 import argparse
@@ -34,6 +35,8 @@ DATASETS = (
     "parking-exit-v2", "blind-merge-v2",
 )  # fmt: skip
 EVERY_FRAMES = 5  # a tenth of a second
+SENT = "its-g5:encoding=etsi,"
+DENSITIES_PER_KM = (60, 120)
 
 
 def away_m(scenario: Scenario, seeds: Sequence[int]) -> list[float]:
@@ -98,6 +101,25 @@ def load_of(name: str, layouts: int) -> tuple[float, ...]:
     )
 
 
+def on_air(name: str, layouts: int) -> tuple[float, ...]:
+    """Return what helpers' CPMs take of the time on `its-g5`, in % of it.
+
+    It is the mean and the most at a dataset's decision points, each of the time since the one
+    before; then comes the background's busy ratio at each of `DENSITIES_PER_KM`.
+    """
+    dataset, stream = load(find(name), layouts), named_point(f"{SENT}stream=cpm").stream
+    assert stream is not None
+    scenes = [scene for scene in dataset.scenes(dataset.courses()) if scene.before()]
+    airtime_s = stream.sent(dataset.scenario, scenes).airtime_s
+    shares = airtime_s / dataset.scenario.parameters.decision_period_s
+    values = [float(shares.mean()), float(shares.max())]
+    for density in DENSITIES_PER_KM:
+        radio = named_point(f"{SENT}density_per_km={density}").physical
+        assert radio is not None
+        values.append(radio.busy_ratio())
+    return tuple(100 * value for value in values)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--layouts", type=int, default=30)
@@ -118,6 +140,11 @@ def main() -> None:
     print("|---|--:|--:|--:|--:|--:|--:|--:|")
     for name in args.datasets:
         cells = " | ".join(f"{value:.2f}" for value in load_of(name, args.layouts))
+        print(f"| `{name}` | {cells} |")
+    print("\n| dataset | CPMs, % of time | most | background at 60 a km | at 120 |")
+    print("|---|--:|--:|--:|--:|")
+    for name in args.datasets:
+        cells = " | ".join(f"{value:.2f}" for value in on_air(name, args.layouts))
         print(f"| `{name}` | {cells} |")
 
 
