@@ -7,7 +7,7 @@ from harness.core.errors import UserError
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Draws
 from harness.radio.fading import Trips
 from harness.world.scenario import Names
-from harness.world.sight_lines import corner, site
+from harness.world.sight_lines import corners, site
 from harness.world.state import Building, VehicleState, WorldState
 
 
@@ -42,6 +42,28 @@ def test_a_truck_between_two_vehicles_hides_them_a_wall_more_so_and_what_is_besi
     assert links.take([2, 0]).xy_m[1, 2].tolist() == [-30, 0]
 
 
+def test_many_points_at_once_are_each_alone():
+    """With vehicles and buildings drawn, in states that differ in size, one of which comes twice."""
+    rng, points = np.random.default_rng(4), []
+    for n in (2, 9, 20, 3, 12):
+        x_m, y_m, heading_rad = rng.uniform(-40, 40, (3, n)).tolist()
+        kinds = rng.choice(["car", "truck", "bicycle"], n).tolist()
+        vehicles = []
+        for k in range(n):
+            vehicles.append(vehicle(f"v{k + 1}", x_m[k], y_m[k], heading_rad[k], kinds[k]))
+        walls = [Building(f"b{k}", 12.0 * k, -9, 12.0 * k + 8, 9) for k in range(1, n // 2)]
+        points.append((state(*vehicles, buildings=tuple(walls)), ["v1", "v2", f"v{n}"]))
+    points.append((points[1][0], ["v3", "v2"]))
+    together = site(points)
+    assert {CLEAR, VEHICLE, BUILDING} == set(together.sight.ravel().tolist())
+    for n, point in enumerate(points):
+        alone, h = site([point]), len(point[1])
+        assert np.array_equal(together.xy_m[n, :h], alone.xy_m[0])
+        for name in ("sight", "blocker_m", "corner_m"):
+            here = getattr(together, name)[n, : h - 1]
+            assert np.array_equal(here, getattr(alone, name)[0], equal_nan=True), name
+
+
 def test_who_is_narrow_blocks_no_radio():
     ahead = vehicle("v2", 40, 0)
     riders = [vehicle(f"v{n}", 10 * n - 20, 0, kind=k) for n, k in enumerate(NARROW, 3)]
@@ -62,9 +84,11 @@ def test_vehicles_have_the_names_and_the_clock_of_their_traffics_source():
 
 
 def test_streets_cross_where_the_lines_along_the_headings_do():
-    assert corner(EGO, vehicle("v2", 30, 40, np.pi / 2)).tolist() == pytest.approx([30, 40])
-    assert corner(EGO, vehicle("v2", 30, -40, np.pi / 2)).tolist() == pytest.approx([30, 40])
-    assert np.isnan(corner(EGO, vehicle("v2", 30, 4, np.pi))).all(), "side by side"
+    right, left = vehicle("v2", 30, 40, np.pi / 2), vehicle("v3", 30, -40, np.pi / 2)
+    beside = vehicle("v4", 30, 4, np.pi)
+    crossing = corners([(EGO, right), (left, EGO), (EGO, beside)])
+    assert crossing[:2].tolist() == [pytest.approx([30, 40]), pytest.approx([40, 30])]
+    assert np.isnan(crossing[2]).all(), "side by side"
 
 
 def trips(seeds: int, steps: int = 6) -> Trips:

@@ -5,21 +5,21 @@ distances, and obstacles between antennas.
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 from harness.radio.channel import BUILDING, CLEAR, VEHICLE, Antenna, Site
-from harness.world.perception.rays import meetings
+from harness.world.perception.rays import first_met, outlines
 from harness.world.scenario import Names
-from harness.world.state import BROAD, HEIGHTS_M, Building, VehicleState, WorldState
+from harness.world.state import BROAD, HEIGHTS_M, VehicleState, WorldState
 
 NO_NAMES = Names(math.nan, {})
 LEAST_ANGLE_RAD = np.pi / 6  # streets that meet at a smaller angle run side by side, or merge
 
 
 Place = tuple[float, float]
+Link = tuple[WorldState, VehicleState | Place, VehicleState]  # a state, and both ends in it
 
 
 def site(
@@ -79,12 +79,15 @@ def _site(
     xy_m = np.full((n, 1 + most, 2), np.nan)
     sight, blocker_m = np.full((n, most), CLEAR), np.zeros((n, most))
     corner_m = np.full((n, most, 2), np.nan)
+    links: list[Link] = []
     for i, (state, first, targets) in enumerate(points):
         xy_m[i, : 1 + len(targets)] = [_xy(end) for end in (first, *targets)]
-        for h, target in enumerate(targets):
-            sight[i, h], blocker_m[i, h] = _between(state, first, target)
-            if isinstance(first, VehicleState):
-                corner_m[i, h] = corner(first, target)
+        links += [(state, first, target) for target in targets]
+    there = ~np.isnan(xy_m[:, 1:, 0])
+    sight[there], blocker_m[there] = _between(links)
+    pairs = [(a, b) for _, a, b in links if isinstance(a, VehicleState)]
+    if pairs:  # a place has no course
+        corner_m[there] = corners(pairs)
     return Site(xy_m, sight, blocker_m, corner_m)
 
 
@@ -92,35 +95,42 @@ def _xy(end: VehicleState | Place) -> Place:
     return (end.x_m, end.y_m) if isinstance(end, VehicleState) else end
 
 
-def _between(state: WorldState, a: VehicleState | Place, b: VehicleState) -> tuple[int, float]:
-    """Return what stands between two ends, and the height of the tallest vehicle between them."""
-    origin, line = np.array(_xy(a)), np.array([_xy(b)]) - _xy(a)
-    # TR 37.885 has a loss for cars and trucks alone; others are narrower than the first Fresnel
-    # zone, which at 5.9 GHz is 1 m wide halfway along 20 m.
-    vehicles = [v for v in state.vehicles if v.kind in BROAD and v not in (a, b)]
-    obstacles: list[VehicleState | Building] = [*vehicles, *state.buildings]
-    corners = [obstacle.corners() for obstacle in obstacles]
-    if not corners:
-        return CLEAR, 0.0
-    t, _ = meetings(origin, line, np.array(corners))
-    met: list[bool] = (t.reshape(-1, 4).min(axis=1) < 1).tolist()
-    between = list(compress(vehicles, met))
-    tallest_m = max((HEIGHTS_M[v.kind] for v in between), default=0.0)
-    if any(met[len(vehicles) :]):
-        return BUILDING, tallest_m
-    return (VEHICLE if tallest_m else CLEAR), tallest_m
-
-
-def corner(a: VehicleState, b: VehicleState) -> Floats:
-    """Return how far vehicles `a` and `b` are, m, from where their straight courses cross, (2,).
-
-    It is how far radio waves go around a corner of streets. NaN if their headings are within 30° of
-    parallel.
+def _between(links: Sequence[Link]) -> tuple[Ints, Floats]:
+    """Return what stands between both ends of m links, and the height of the tallest vehicle
+    there, both (m,).
     """
-    sine = np.sin(b.heading_rad - a.heading_rad)
-    if abs(sine) < np.sin(LEAST_ANGLE_RAD):
-        return np.full(2, np.nan)
-    dx, dy = b.x_m - a.x_m, b.y_m - a.y_m
-    along_a = (dx * np.sin(b.heading_rad) - dy * np.cos(b.heading_rad)) / sine
-    along_b = (dx * np.sin(a.heading_rad) - dy * np.cos(a.heading_rad)) / sine
-    return np.abs([along_a, along_b])
+    corners_m, first = outlines([state for state, _, _ in links])
+    # number of a link, that of an outline that may stand between its ends, and its height, 0 of a
+    # building
+    obstacles: list[tuple[int, int, float]] = []
+    for n, (state, a, b) in enumerate(links):
+        begin, box = first[id(state)]
+        # TR 37.885 has a loss for cars and trucks alone; others are narrower than the first
+        # Fresnel zone, which at 5.9 GHz is 1 m wide halfway along 20 m.
+        for place, v in enumerate(state.vehicles):
+            if v.kind in BROAD and v not in (a, b):
+                obstacles.append((n, begin + place, HEIGHTS_M[v.kind]))
+        obstacles += [(n, box + place, 0.0) for place in range(len(state.buildings))]
+    rows = np.array(obstacles).reshape(-1, 3)
+    (link, outline), height_m = rows[:, :2].T.astype(int), rows[:, 2]
+    ends = np.array([(*_xy(a), *_xy(b)) for _, a, b in links]).reshape(-1, 4)[link]
+    met = first_met(ends[:, :2], ends[:, 2:], corners_m[outline]) < 1
+    tallest_m, walled = np.zeros(len(links)), np.zeros(len(links), dtype=bool)
+    np.maximum.at(tallest_m, link[met], height_m[met])
+    walled[link[met & (height_m == 0)]] = True
+    return np.select([walled, tallest_m > 0], [BUILDING, VEHICLE], CLEAR), tallest_m
+
+
+def corners(pairs: Sequence[tuple[VehicleState, VehicleState]]) -> Floats:
+    """Return how far two vehicles are, m, from where their straight courses cross, (n, 2).
+
+    `pairs` are n such vehicles. It is how far radio waves go around a corner of streets. NaN if
+    their headings are within 30° of parallel.
+    """
+    poses = [(v.x_m, v.y_m, v.heading_rad) for pair in pairs for v in pair]
+    x, y, heading = np.array(poses).reshape(-1, 2, 3).T.copy()
+    (dx,), (dy,) = np.diff(x, axis=0), np.diff(y, axis=0)
+    sine = np.sin(heading[1] - heading[0])
+    crossing = np.where(np.abs(sine) < np.sin(LEAST_ANGLE_RAD), np.nan, sine)
+    aside_m = dx * np.sin(heading[::-1]) - dy * np.cos(heading[::-1])
+    return np.asarray(np.abs(aside_m / crossing).T)

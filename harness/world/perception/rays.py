@@ -6,7 +6,7 @@ Many viewers look at once, in one pass over arrays, and one viewer is many of wh
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,22 +63,40 @@ def turned(angle_rad: Any) -> Any:
     return (angle_rad + np.pi) % (2 * np.pi) - np.pi
 
 
+class Outlines(NamedTuple):
+    """Hold the outlines of all vehicles of some states, n, and behind these of all buildings, m."""
+
+    corners_m: Floats  # the four corners of each, (n+m, 4, 2)
+    # where the vehicles and the buildings of each state begin, by the state's `id`
+    first: dict[int, tuple[int, int]]
+
+
+def outlines(states: Sequence[WorldState]) -> Outlines:
+    """Return the outlines of all vehicles and buildings in some states, one of which may be there
+    several times.
+
+    Positions are in m to the east and south of the road's origin.
+    """
+    once = {id(state): state for state in states}
+    vehicles = [
+        (v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in once.values() for v in s.vehicles
+    ]
+    boxes = [building.corners() for state in once.values() for building in state.buildings]
+    of_vehicles = rectangle(*np.ascontiguousarray(np.array(vehicles).reshape(-1, 5).T))
+    corners_m = np.concatenate([of_vehicles, np.array(boxes).reshape(-1, 4, 2)])
+    begin, box, first = 0, len(vehicles), dict[int, tuple[int, int]]()
+    for key, state in once.items():
+        first[key] = begin, box
+        begin, box = begin + len(state.vehicles), box + len(state.buildings)
+    return Outlines(corners_m, first)
+
+
 def surfaces(looks: Sequence[Look]) -> Surfaces:
     """Return the outlines of all vehicles and buildings around each viewer, itself excluded.
 
     Each of `looks` is a state and the vehicle in it that looks, the viewer.
     """
-    states = {id(state): state for state, _ in looks}
-    vehicles = [
-        (v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in states.values() for v in s.vehicles
-    ]
-    boxes = [building.corners() for state in states.values() for building in state.buildings]
-    outlines = rectangle(*np.ascontiguousarray(np.array(vehicles).T))
-    corners = np.concatenate([outlines, np.array(boxes).reshape(-1, 4, 2)])
-    begin, box, first = 0, len(vehicles), dict[int, tuple[int, int]]()
-    for key, state in states.items():
-        first[key] = begin, box
-        begin, box = begin + len(state.vehicles), box + len(state.buildings)
+    corners, first = outlines([state for state, _ in looks])
     at, ids, counts = [], [], []
     for state, viewer in looks:
         begin, box = first[id(state)]
@@ -110,6 +128,17 @@ def meetings(origin: Floats, targets: Floats, corners: Floats) -> tuple[Floats, 
     """
     walls = _walls(np.broadcast_to(origin, (len(corners), 2)), corners).swapaxes(1, 2)
     return _met(walls.reshape(5, -1), targets[:, :1], targets[:, 1:])
+
+
+def first_met(origins: Floats, targets: Floats, corners: Floats) -> Floats:
+    """Return how far along each of n ways a rectangle of its own is met, (n,); inf if it is missed.
+
+    The ways go from `origins` to `targets`, (n, 2), and the rectangles are `corners` (n, 4, 2), all
+    in m. It is 1 at the target.
+    """
+    t, _ = _met(_walls(origins, corners), *(targets - origins).T)
+    first: Floats = t.min(axis=0)
+    return first
 
 
 def _walls(origins: Floats, corners: Floats) -> Floats:
