@@ -217,11 +217,13 @@ def detections(pairs: Sequence[Line], ambient: Ambient) -> list[Detection | None
     distance, bearing, (_, lidar, radar) = lines[2:]
     z = np.zeros((8, len(pairs)))
     sensed = np.flatnonzero(lines.sensors.any(axis=0)).tolist()
-    keys = []
-    for state, viewer, v in (pairs[k] for k in sensed):
-        keys.append(("sensors", state.episode_seed, state.step, viewer.id, v.id))
-    for k, draws in zip(sensed, noise.generators(keys), strict=True):
-        z[:, k] = draws.standard_normal(8)
+    places: dict[tuple[object, ...], list[int]] = {}  # several between two decisions
+    for k in sensed:
+        state, viewer, v = pairs[k]
+        key = "sensors", state.episode_seed, state.step, viewer.id, v.id
+        places.setdefault(key, []).append(k)
+    for there, draws in zip(places.values(), noise.generators(list(places)), strict=True):
+        z[:, there] = draws.standard_normal((8, 1))
 
     # Across the bearing the radar is far coarser than the LiDAR, whose position is taken if both
     # see.
