@@ -318,11 +318,12 @@ def report(p: Parameters, sender: VehicleState, seen: Detection, exact: bool = F
 
 def _seen_together(case: Told) -> tuple[Sector, ...]:
     """Return each sector as the viewer with the most of it in sight sees it,
-    a lower bound of the union.
+    a lower bound of the union. Senders on another road see no sector that only theirs has.
     """
     sectors = {sector.sector: sector for sector in case.own.sectors}
     for of_sender in case.sectors:
         for sector in of_sender:
-            if sector.seen_share > sectors[sector.sector].seen_share:
+            here = sectors.get(sector.sector)
+            if here is not None and sector.seen_share > here.seen_share:
                 sectors[sector.sector] = sector
     return tuple(sectors.values())

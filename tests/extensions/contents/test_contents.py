@@ -43,7 +43,7 @@ from harness.runs import folder
 from harness.world import scenarios
 from harness.world.perception.graph import scene_graph, truth_graph
 from harness.world.perception.shared import NOBODY, Heard, merged, state_in_message
-from harness.world.scene_graph import SceneGraph
+from harness.world.scene_graph import SceneGraph, Sector
 from harness.world.state import Part, VehicleState, WorldState
 
 OBJECTS, BOTH, ORACLE = (
@@ -109,6 +109,16 @@ def test_ids_do_not_say_what_is_one_object(small: Dataset) -> None:
             [(n.forward_m, n.left_m, n.speed_mps) for n in graph.nodes] for graph in (plain, other)
         ]
         assert places[0] == places[1]
+
+
+def test_a_sector_of_another_road_counts_for_nobody(small: Dataset) -> None:
+    """Shuffled messages of a recording may be of another road, which has sectors of its own."""
+    case, elsewhere = heard_by_all(scenes_of(small)[0]), Sector("n13", 1.0, False, ())
+    helpers = []
+    for graph in case.helpers:
+        helpers.append(structs.replace(graph, sectors=(*graph.sectors, elsewhere)))
+    plain, other = merged(small.scenario, [case, case._replace(helpers=helpers)])
+    assert other == plain
 
 
 @pytest.mark.slow
