@@ -17,6 +17,7 @@ from statistics import mean
 import numpy as np
 
 from harness.coordination.named_points import named_point
+from harness.coordination.streams import Hearing
 from harness.core.seeds import FIRST
 from harness.dataset.load import Earlier, Scene, find, load
 from harness.evaluate.live_world import look
@@ -86,7 +87,8 @@ def load_of(name: str, layouts: int) -> tuple[float, ...]:
     cpms = [cpm for s in scenes for cpm in stretch(scenario, s, stream.interval_s).cpms]
     seconds = sum(len(s.state.helpers) for s in scenes) * scenario.parameters.decision_period_s
     heard = stream.heard(scenario, scenes)
-    graphs = stream.graphs(scenario, list(zip(scenes, heard, strict=True)))
+    pairs = zip(scenes, heard, strict=True)
+    graphs = stream.graphs(scenario, [Hearing(scene, scene, texts, {}) for scene, texts in pairs])
     nodes = [node for graph in graphs for node in graph.nodes]
     ages_s = [node.age_s for node in nodes if isinstance(node, AgedNode)]
     own = [len(scene.graphs[scene.viewers[0]].nodes) for scene in scenes]

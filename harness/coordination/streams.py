@@ -5,13 +5,27 @@ models answer. It stands in the key under which the ego's answer is kept, so tha
 are asked once.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from harness.core.arrays import Floats
+from harness.core.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     from harness.world.scene_graph import SceneGraph
+
+
+class Hearing(NamedTuple):
+    """Hold what an ego has heard of a stream, and what became of it on the way.
+
+    Scenes are decision points (`harness.dataset.load.Scene`).
+    """
+
+    scene: Any  # the ego's own
+    source: Any  # the one whose ego received the messages: `scene`, unless a control shuffles them
+    texts: Mapping[str, str]  # what it holds of each sender, by sender (`Stream.heard`)
+    # By sender, where it does not send what it sees, as under an attack: a function of what it
+    # knows and of the scene, both when it sends a message, which returns the graph that is sent.
+    changes: "Mapping[str, Callable[[SceneGraph, Any], SceneGraph]]"
 
 
 class Stream(Protocol):
@@ -28,13 +42,10 @@ class Stream(Protocol):
         the ego holds nothing are left out.
         """
 
-    def graphs(
-        self, scenario: Any, heard: Sequence[tuple[Any, Mapping[str, str]]]
-    ) -> "list[SceneGraph]":
-        """Return the ego's scene graph with what it has heard, for each scene.
+    def graphs(self, scenario: Any, heard: Sequence[Hearing]) -> "list[SceneGraph]":
+        """Return each ego's scene graph with what it has heard.
 
-        A scene graph is what one vehicle knows of a scene. `heard` has scenes, all of one road,
-        each with a text by sender, as `heard` returns it.
+        A scene graph is what one vehicle knows of a scene. The egos' scenes are all of one road.
         """
 
     def sent(self, scenario: Any, scenes: Sequence[Any]) -> "Sent":
@@ -58,8 +69,12 @@ class Sent(NamedTuple):
 
 
 class Streamed(NamedTuple):
-    """Hold what n egos answer that have heard a stream, and what was sent; NaN if not wanted."""
+    """Hold what n egos answer that have heard a stream, and what was sent before."""
 
     own: Floats  # each ego's probabilities of its A actions, `(n, A)`; NaN where an answer failed
     inference_s: Floats  # seconds of each answer, `(n,)`; NaN where unknown
     sent: Sent  # what helpers have sent since the decision before
+
+    def take(self, at: Ints) -> "Streamed":
+        """Return the answers at these indices, `(m,)`."""
+        return Streamed(self.own[at], self.inference_s[at], self.sent.take(at))

@@ -24,7 +24,7 @@ from harness.coordination.coordinate import FusionCall
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
-from harness.coordination.streams import Sent, Stream, Streamed
+from harness.coordination.streams import Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.at_once import first_at_once
 from harness.core.errors import Unanswered, UserError, printable
@@ -457,28 +457,26 @@ class Asker:
         ]
         return [self.answers[name] if self._has(name) else None for name in ids]
 
-    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
-        """Return what the egos of n scenes answer once they have heard a stream, `(n, ...)`.
+    def streamed(
+        self, scenes: Sequence[Scene], stream: Stream, codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Streamed:
+        """Return what K egos answer once they have heard a stream, `(K, ...)`.
 
         `stream` are the messages that helpers send unasked; an ego that has heard nothing answers
-        as without them. Only the scenes at the indices `at` are asked.
+        as without them. `codes`, `(K,)`, and `rewrites` say what each hears (`stream_sets`).
         """
-        ids = [request_id(scene, scene.viewers[0], PLAIN) for scene in scenes]
-        wanted = [scenes[n] for n in at.tolist()]
-        sets = stream_sets(self.spec.scenario, wanted, stream)
-        for n, each in zip(at.tolist(), sets, strict=True):
-            if each[1]:
-                ids[n] = fusion_id(*each)
+        sets = stream_sets(self.spec.scenario, scenes, stream, codes, rewrites)
         lacking = [each for each in sets if each[1] and not self._has(fusion_id(*each))]
         if lacking:
-            self.answer(list(stream_requests(self.spec, lacking)))
+            self.answer(list(stream_requests(self.spec, scenes, lacking)))
         answers: list[list[Answer | None]] = []
-        for scene, name in zip(scenes, ids, strict=True):
-            answers.append([self.answers.get(name), *[None] * (len(scene.viewers) - 1)])
-        laid_out = intents_of(self.spec, self.latency, scenes, answers)
-        sent = Sent(*np.full((3, len(scenes)), np.nan))
-        for every, some in zip(sent, stream.sent(self.spec.scenario, wanted), strict=True):
-            every[at] = some
+        for scene, senders in sets:
+            # Who has heard nothing has the id of the plain question.
+            answer = self.answers.get(fusion_id(scene, senders))
+            answers.append([answer, *[None] * (len(scene.viewers) - 1)])
+        of_egos = [scene for scene, _ in sets]
+        laid_out = intents_of(self.spec, self.latency, of_egos, answers)
+        sent = stream.sent(self.spec.scenario, of_egos)
         return Streamed(laid_out.own, laid_out.inference_s[:, 0], sent)
 
     def fusion_call(

@@ -6,12 +6,14 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from harness.backends.base import Request
 from harness.backends.tokens import counter, summarize_counts
-from harness.coordination.operating_point import Rewrites
+from harness.coordination.operating_point import OperatingPoint, Rewrites
 from harness.coordination.parts import PLAIN
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.fusion import key_of
+from harness.evaluate.fusion import codes_of, key_of
 from harness.evaluate.requests import EGO, fusion_id, requests, stream_requests, stream_sets
 from harness.evaluate.spec import Spec
 
@@ -73,10 +75,10 @@ def planned(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     for question in {point.question for point in asking if point.question != PLAIN}:
         yield from requests(spec, scenes, question)
     sets = {}
-    for stream in {point.stream for point in spec.points if point.stream}:
-        for each in stream_sets(spec.scenario, scenes, stream):
+    for point in spec.points:
+        for each in _unasked(spec, scenes, point):
             sets[fusion_id(*each)] = each
-    yield from stream_requests(spec, list(sets.values()))
+    yield from stream_requests(spec, scenes, list(sets.values()))
 
 
 def streamed(spec: Spec, scenes: Sequence[Scene]) -> dict[str, int]:
@@ -87,9 +89,27 @@ def streamed(spec: Spec, scenes: Sequence[Scene]) -> dict[str, int]:
     counts = {}
     for point in spec.points:
         if point.stream:
-            sets = stream_sets(spec.scenario, scenes, point.stream)
+            sets = _unasked(spec, scenes, point)
             counts[point.name] = sum(bool(senders) for _, senders in sets)
     return counts
+
+
+def _unasked(
+    spec: Spec, scenes: Sequence[Scene], point: OperatingPoint
+) -> list[tuple[Scene, list[str]]]:
+    """Return each scene with the keys of what its ego has heard unasked, if anything.
+
+    Each has one question, whoever attacks and whatever layout is heard: here all helpers, and the
+    next scene's.
+    """
+    if not point.stream:
+        return []
+    n, helpers = len(scenes), max(len(scene.viewers) for scene in scenes) - 1
+    rewrites, at = point.rewrites, np.arange(n)
+    places = at * n + np.roll(at, -1) if rewrites.elsewhere else at
+    attacks = np.ones((n, helpers if rewrites.changes.of_attackers else 0), dtype=bool)
+    codes = codes_of(attacks, places)
+    return stream_sets(spec.scenario, scenes, point.stream, codes, rewrites)
 
 
 def lacking(

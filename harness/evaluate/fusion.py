@@ -95,7 +95,9 @@ def heard_in(code: int, helpers: int, attacked: bool = False) -> tuple[int, list
     return code >> bits, heard, [h for h in heard if attacked and code >> (helpers + h) & 1]
 
 
-def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> str:
+def key_of(
+    helper: str, rewrites: Rewrites, attacks: bool, source: str = "", unasked: str = ""
+) -> str:
     """Return the text that names a helper's message, and how it is shown, in a fusion call's id.
 
     A fusion call asks the ego's model again, with the messages. `helper` is the sender's id, and
@@ -103,10 +105,12 @@ def key_of(helper: str, rewrites: Rewrites, attacks: bool, source: str = "") -> 
     named, too. Such as `v2`, `v2~blind` (another question), `v3!liar&schema` (changed by attack and
     defence), `v2!text` where it holds words alone, `v2!objects` where the ego's scene graph has its
     objects, or `v2!objects&from:00012-3` where it comes from the scene `source`. A scene graph is
-    what one vehicle knows of a scene.
+    what one vehicle knows of a scene. `unasked` says what the ego holds of messages that were sent
+    unasked (`Stream.heard`), as in `v3!stream:cpm:0.1:12.15&ghost`.
     """
     of_attackers, of_all = rewrites.changes
-    changed = [*([of_attackers] if attacks and of_attackers else []), *of_all]
+    changed = [OF_STREAM + unasked] if unasked else []
+    changed += [*([of_attackers] if attacks and of_attackers else []), *of_all]
     if rewrites.call:
         changed += [rewrites.call, *([WHOLE] if rewrites.whole else [])]
     if source:
@@ -138,17 +142,9 @@ def plan_keys(helpers: Sequence[str], intents: Intents, row: int, on_time: Bools
     return keys
 
 
-def stream_key(sender: str, text: str) -> str:
-    """Return the key of what an ego holds of the messages that a sender sends unasked.
-
-    `text` says what (`Stream.heard`). The key is such as `v3!stream:cpm:0.1:12.15`.
-    """
-    return f"{sender}{REWRITTEN}{OF_STREAM}{text}"
-
-
 def stream_text(key: str) -> str:
     """Return what the key of a message says of its sender's stream; empty for another message."""
-    mark = key.partition(REWRITTEN)[2]
+    mark = key.partition(REWRITTEN)[2].partition("&")[0]
     return mark.removeprefix(OF_STREAM) if mark.startswith(OF_STREAM) else ""
 
 
@@ -200,7 +196,7 @@ def marks_of(key: str) -> Marks:
             whole = True
         elif mark in named:
             call = named[mark]
-        elif not mark.startswith(FROM):
+        elif not mark.startswith((FROM, OF_STREAM)):
             changes.append(mark)
     return Marks(changes, call, whole or call is None)
 

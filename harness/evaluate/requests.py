@@ -9,13 +9,13 @@ import numpy as np
 
 from harness.backends.base import Request
 from harness.backends.base import Role as AskedRole
-from harness.coordination.operating_point import Rewrites
+from harness.coordination.operating_point import AS_SENT, Rewrites
 from harness.coordination.parts import PLAIN, Question
 from harness.coordination.parts_of_packages import shown_graph
 from harness.coordination.streams import Stream
 from harness.core.arrays import Bools, Ints
 from harness.dataset.load import Scene
-from harness.evaluate.fusion import heard_in, key_of, messages_of, stream_key
+from harness.evaluate.fusion import heard_in, key_of, messages_of
 from harness.evaluate.pictures import picture
 from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
@@ -145,26 +145,52 @@ def fusion_id(scene: Scene, senders: Sequence[str]) -> str:
 
 
 def stream_sets(
-    scenario: Scenario, scenes: Sequence[Scene], stream: Stream
+    scenario: Scenario,
+    scenes: Sequence[Scene],
+    stream: Stream,
+    codes: Ints,
+    rewrites: Rewrites = AS_SENT,
 ) -> list[tuple[Scene, list[str]]]:
-    """Return each scene with the keys of what its ego has heard of a stream.
+    """Return for each of K egos its scene with the keys of what it has heard of a stream.
 
-    `stream` are the messages that helpers send unasked, in `scenario`; a key is as in `heard_sets`.
+    `stream` are the messages that helpers send unasked, in `scenario`; `rewrites` says how they are
+    changed, and a key is as in `heard_sets`. `codes`, `(K,)`, has for each ego an integer that says
+    in which of `scenes` it is and, if attacks change messages, which helpers attack
+    (`fusion.codes_of`). An ego that would hear another layout, and has none, has heard nothing.
     """
+    width = 0
+    if rewrites.changes.of_attackers:
+        width = max(len(scene.viewers) for scene in scenes) - 1
+    places = []
+    for code in codes.tolist():
+        at, attacking, _ = heard_in(code, width)
+        at, source = divmod(at, len(scenes)) if rewrites.elsewhere else (at, at)
+        places.append((at, source, attacking))
+    texts = stream.heard(scenario, [scenes[source] for _, source, _ in places])
     sets = []
-    for scene, senders in zip(scenes, stream.heard(scenario, scenes), strict=True):
-        sets.append((scene, [stream_key(*each) for each in senders.items()]))
+    for (at, source, attacking), of_senders in zip(places, texts, strict=True):
+        name = scenes[source].id if rewrites.elsewhere else ""
+        alone = rewrites.elsewhere and source == at
+        helpers = enumerate(scenes[source].viewers[1:])
+        attackers = {helper for place, helper in helpers if place in attacking}
+        senders = []
+        for sender, unasked in of_senders.items():
+            if not alone:
+                senders.append(key_of(sender, rewrites, sender in attackers, name, unasked))
+        sets.append((scenes[at], senders))
     return sets
 
 
-def stream_requests(spec: Spec, sets: Sequence[tuple[Scene, Sequence[str]]]) -> Iterator[Request]:
+def stream_requests(
+    spec: Spec, scenes: Sequence[Scene], sets: Sequence[tuple[Scene, Sequence[str]]]
+) -> Iterator[Request]:
     """Yield the requests that ask egos with what they have heard of a stream, by `stream_sets`.
 
-    `spec` is the evaluation. An ego that has heard nothing is left out: its question is the plain
-    one.
+    `spec` is the evaluation, and `scenes` are those that the sets were made of. An ego that has
+    heard nothing is left out: its question is the plain one.
     """
     heard = [each for each in sets if each[1]]
-    graphs = shared_graphs(spec.scenario, heard, {})
+    graphs = shared_graphs(spec.scenario, heard, {scene.id: scene for scene in scenes})
     for (scene, senders), graph in zip(heard, graphs, strict=True):
         yield fusion_request(spec, scene, {}, senders, graph)
 

@@ -1,6 +1,7 @@
 """Make the scene graphs that egos are asked with once helpers have shared what they see."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from msgspec import structs
@@ -8,6 +9,7 @@ from msgspec import structs
 from harness.coordination.contents_of_packages import graphs as graphs_heard
 from harness.coordination.part_settings import change_of, questions, stream_of
 from harness.coordination.parts_of_packages import shown_graph
+from harness.coordination.streams import Hearing
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
@@ -45,11 +47,12 @@ def _shared_graphs(
 ) -> Sequence[SceneGraph | None]:
     keys = [key for _, senders in sets for key in senders]
     if texts := [text for text in map(stream_text, keys) if text]:
-        heard = []
+        hearings = []
         for scene, senders in sets:
-            of_scene = {key.partition(REWRITTEN)[0]: stream_text(key) for key in senders}
-            heard.append((scene, of_scene))
-        return stream_of(texts[0]).graphs(scenario, heard)
+            name = source_of(scene.id, senders)
+            source = scene if name == scene.id else scenes[name]
+            hearings.append(_hearing(scenario, scene, source, senders))
+        return stream_of(texts[0]).graphs(scenario, hearings)
     calls = (marks_of(key).call for key in keys)
     call = next((call for call in calls if call and call.in_graph), None)
     if call is None:
@@ -64,6 +67,26 @@ def _shared_graphs(
     return graphs_heard(call, scenario, cases)
 
 
+def _hearing(scenario: Scenario, scene: Scene, source: Scene, senders: Sequence[str]) -> Hearing:
+    """Return what an ego has heard of a stream, by the keys of its senders' messages."""
+    texts, changes = {}, {}
+    for key in senders:
+        sender, _, question = key.partition(REWRITTEN)[0].partition(ASKED)
+        texts[sender] = stream_text(key)
+        if question or source.id != scene.id or marks_of(key).changes:
+            change = partial(_unasked, source.seat or scenario, key, source.id != scene.id)
+            changes[sender] = change
+    return Hearing(scene, source, texts, changes)
+
+
+def _unasked(
+    scenario: Scenario, key: str, elsewhere: bool, graph: SceneGraph, scene: Scene
+) -> SceneGraph:
+    """Return the graph that a message sent unasked is made of, given what its sender knows."""
+    sent = _changed(scenario, scene, key, graph)
+    return _without_ego(sent) if elsewhere else sent
+
+
 def _without_ego(graph: SceneGraph) -> SceneGraph:
     """Return a graph without the ego, which the ego that hears it would take for somebody else."""
     return structs.replace(
@@ -73,8 +96,14 @@ def _without_ego(graph: SceneGraph) -> SceneGraph:
 
 def _sent(scenario: Scenario, scene: Scene, key: str) -> SceneGraph:
     """Return the graph that a message of this key is made of."""
-    sender, _, question = key.partition(REWRITTEN)[0].partition(ASKED)
-    graph = shown_graph(questions()[question], scene.graphs[sender])
+    sender = key.partition(REWRITTEN)[0].partition(ASKED)[0]
+    return _changed(scenario, scene, key, scene.graphs[sender])
+
+
+def _changed(scenario: Scenario, scene: Scene, key: str, graph: SceneGraph) -> SceneGraph:
+    """Return what a message of this key is made of, given what its sender knows of the scene."""
+    question = key.partition(REWRITTEN)[0].partition(ASKED)[2]
+    graph = shown_graph(questions()[question], graph)
     changes = [change_of(change) for change in marks_of(key).changes]
     for change in sorted(changes, key=lambda change: change.adds):
         graph = change.graph(graph, scenario, scene)

@@ -247,11 +247,19 @@ class Ask(Protocol[AskedPoint]):
         """
         ...
 
-    def streamed(self, points: Sequence[AskedPoint], /, stream: Stream, at: Ints) -> Streamed:
-        """Return what the egos of n points answer once they have heard a stream, `(n, ...)`.
+    def streamed(
+        self,
+        points: Sequence[AskedPoint],
+        /,
+        stream: Stream,
+        codes: Ints,
+        rewrites: Rewrites = AS_SENT,
+    ) -> Streamed:
+        """Return what K egos answer once they have heard a stream, `(K, ...)`.
 
-        `stream` are the messages that helpers send unasked. Only the points at the indices `at`
-        need values.
+        `stream` are the messages that helpers send unasked. `codes`, `(K,)`, and `rewrites` are as
+        in `fusion_call`, but that the integers say who attacks and not who was heard, which the
+        stream says.
         """
         ...
 
@@ -352,7 +360,7 @@ def _steps(
             fusion = replace(fusions[point], call=call)
             result = fuse(point, sent[point], broadcasts[point].intents, fusion)
             memories[point].keep(due_here, result.state)
-            traffic = streamed[point.stream].sent.take(due_here.at) if point.stream else None
+            traffic = streamed[point].sent if point.stream else None
             sent_intents = broadcasts[point]
             decided.append(Decided(point, decision_points, due_here, result, sent_intents, traffic))
         yield decided
@@ -417,16 +425,22 @@ def _streamed(
     ask: Ask[DecisionPoint],
     decision_points: Sequence[DecisionPoint],
     due: Mapping[OperatingPoint, Due],
-) -> dict[Stream, Streamed]:
-    """Return what egos answer that have heard what helpers send unasked, by stream."""
-    at: dict[Stream, list[Ints]] = {}
+) -> dict[OperatingPoint, Streamed]:
+    """Return what egos answer that have heard what helpers send unasked, by condition."""
+    codes = dict[OperatingPoint, Ints]()
+    of_stream: dict[tuple[Stream, Rewrites], list[Ints]] = {}
     for point, due_here in due.items():
         if point.stream is not None:
-            at.setdefault(point.stream, []).append(due_here.at)
-    return {
-        stream: ask.streamed(decision_points, stream, np.unique(np.concatenate(places)))
-        for stream, places in at.items()
-    }
+            codes[point] = places_of(point, due_here, len(decision_points))
+            of_stream.setdefault((point.stream, point.rewrites), []).append(codes[point])
+    answers = dict[OperatingPoint, Streamed]()
+    for (stream, rewrites), each in of_stream.items():
+        distinct = np.unique(np.concatenate(each))
+        of_distinct = ask.streamed(decision_points, stream, distinct, rewrites)
+        for point in codes:
+            if (point.stream, point.rewrites) == (stream, rewrites):
+                answers[point] = of_distinct.take(np.searchsorted(distinct, codes[point]))
+    return answers
 
 
 def _answers_of_helpers(
@@ -434,7 +448,7 @@ def _answers_of_helpers(
     decision_points: Sequence[DecisionPoint],
     due: Mapping[OperatingPoint, Due],
     answers: Mapping[Question, Intents],
-    streamed: Mapping[Stream, Streamed],
+    streamed: Mapping[OperatingPoint, Streamed],
 ) -> Mapping[Question, Intents]:
     """Ask the helpers whose answers some condition uses, and return the intents by question.
 
@@ -465,7 +479,7 @@ def heard(
     point: OperatingPoint,
     answers: Mapping[Question, Intents],
     due: Due,
-    streamed: Mapping[Stream, Streamed],
+    streamed: Mapping[OperatingPoint, Streamed],
 ) -> Intents:
     """Return what vehicles intend in n decisions that are due, as the ego may hear it.
 
@@ -473,12 +487,9 @@ def heard(
     all decision points observed, by the question that helpers were asked. Helpers' may be answers
     to another question, or come from another decision's scene, as in a control; who has no other to
     hear from hears nobody. Distances and inference times stay the decision's own. `streamed` has
-    what egos answer that have heard a stream, by stream.
+    what egos answer that have heard a stream, by condition.
     """
-    plain = answers[PLAIN]
-    if point.stream is not None:
-        plain = _with_own(plain, streamed[point.stream])
-    intents = _able(point, plain, due)
+    intents = _able(point, answers[PLAIN], due, streamed.get(point))
     if point.question != PLAIN:
         source = _able(point, answers[point.question], due)
         intents = _with_helpers(intents, source, source.valid)
@@ -503,11 +514,18 @@ def _with_helpers(intents: Intents, source: Intents, valid: Bools) -> Intents:
     return replace(intents, valid=valid, **arrays)
 
 
-def _able(point: OperatingPoint, intents: Intents, due: Due) -> Intents:
-    """Return the intents of the decisions that are due, of helpers that can send the content."""
+def _able(
+    point: OperatingPoint, intents: Intents, due: Due, streamed: Streamed | None = None
+) -> Intents:
+    """Return the intents of the decisions that are due, of helpers that can send the content.
+
+    The egos' are `streamed`, if they have heard a stream.
+    """
     every = np.array_equal(due.at, np.arange(len(intents.own)))
-    prepared_intents = point.prepared(intents if every else intents.take(due.at))
-    return able(point, prepared_intents, due.senders)
+    of_due = intents if every else intents.take(due.at)
+    if streamed is not None:
+        of_due = _with_own(of_due, streamed)
+    return able(point, point.prepared(of_due), due.senders)
 
 
 def as_sent(point: OperatingPoint, intents: Intents) -> Intents:

@@ -359,11 +359,14 @@ class ReplayedRun:
         with self._writing():
             return self._asker.others(scenes, question, at)
 
-    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
-        """Return what the egos of n scenes answer once they have heard a stream, (n, ...).
+    def streamed(
+        self, scenes: Sequence[Scene], stream: Stream, codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Streamed:
+        """Return what K egos answer once they have heard a stream, (K, ...).
 
-        `stream` are the messages that helpers send unasked; only the scenes at the indices `at`
-        need values. The model is asked what is not stored. Raises UserError if it may not be.
+        `stream` are the messages that helpers send unasked; `codes`, (K,), and `rewrites` say what
+        each hears (`requests.stream_sets`). The model is asked what is not stored. Raises UserError
+        if it may not be.
         """
         if not self._asks:
             raise UserError(
@@ -371,7 +374,7 @@ class ReplayedRun:
                 "messages unasked; leave it out"
             )
         with self._writing():
-            return self._asker.streamed(scenes, stream, at)
+            return self._asker.streamed(scenes, stream, codes, rewrites)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT
@@ -471,8 +474,10 @@ class _Nearest:
     ) -> Fuses:
         return self._stored.fusion_call(scenes, codes, rewrites)
 
-    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
-        return self._stored.streamed(scenes, stream, at)
+    def streamed(
+        self, scenes: Sequence[Scene], stream: Stream, codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Streamed:
+        return self._stored.streamed(scenes, stream, codes, rewrites)
 
     def call_of_agents(self, scenes: Sequence[Scene], at: Ints, intents: Intents) -> FusionCall:
         return self._stored.call_of_agents(scenes, at, intents)

@@ -52,9 +52,11 @@ class Controlled(Part, frozen=True, kw_only=True):
     An operating point is the settings of radio, asking and fusion. `own` takes messages of the
     ego's own helpers. Two values are controls: `shuffled` takes messages of helpers in another
     start situation, and `blind` those of helpers that are shown nothing. A gain in success that
-    remains under them does not come from what helpers see. Methods are the hooks of `Part`, a group
-    of such settings. `behind` is the setting after which it stands in records, `questions` has what
-    helpers may be asked by it, and `controls` says by the value what the ego hears.
+    remains under them does not come from what helpers see. Of what helpers send unasked, `shuffled`
+    is all that the ego of the other decision then holds, whoever sends there; `blind` is where the
+    sender is, as often as it would send. Methods are the hooks of `Part`, a group of such settings.
+    `behind` is the setting after which it stands in records, `questions` has what helpers may be
+    asked by it, and `controls` says by the value what the ego hears.
     """
 
     behind: ClassVar[str] = "on_demand"

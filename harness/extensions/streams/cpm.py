@@ -11,9 +11,10 @@ ask no more questions than one.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from math import cos, hypot, sin
 from typing import NamedTuple
 
@@ -21,12 +22,12 @@ import numpy as np
 from msgspec import structs
 
 from harness.coordination.encodings import ENCODINGS, JSON
-from harness.coordination.streams import Sent
+from harness.coordination.streams import Hearing, Sent
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
-from harness.dataset.load import Scene
+from harness.dataset.load import Scene, by_seat
 from harness.extensions.streams.inclusion import LONGEST_S, SHORTEST_S
 from harness.extensions.streams.motion import moments
 from harness.extensions.streams.sending import (
@@ -41,18 +42,19 @@ from harness.extensions.streams.sending import (
 from harness.radio.channel import Channel, Draws, Physical
 from harness.radio.fading import Trips
 from harness.radio.wrapped import broadcast
-from harness.world.perception.graph import scene_graphs
+from harness.world.perception.graph import listed_graphs, scene_graphs
 from harness.world.perception.sensors import Detection
 from harness.world.perception.shared import (
     Report,
     Told,
+    detection_of,
     itself,
     report,
     state_in_message,
     with_reports,
 )
 from harness.world.scenario import Scenario
-from harness.world.scene_graph import SceneGraph
+from harness.world.scene_graph import SceneGraph, Sector
 from harness.world.state import VehicleState, WorldState
 
 HEARD = re.compile(
@@ -69,7 +71,7 @@ Key = tuple[str, Look]  # id of a scene, and the look that a CPM is of
 class Held(NamedTuple):
     """Hold what an ego holds of one sender in a scene."""
 
-    scene: Scene
+    scene: Scene  # of the ego that received it
     last: Cpm  # the newest one
     newest: tuple[tuple[Cpm, Detection], ...]  # of each object the newest CPM, and what it says
 
@@ -173,21 +175,21 @@ class Cpms:
         airtime_s = broadcast(self.channel, bits, draws).airtime_s
         return np.broadcast_to(airtime_s, bits.shape)
 
-    def graphs(
-        self, scenario: Scenario, heard: Sequence[tuple[Scene, Mapping[str, str]]]
-    ) -> list[SceneGraph]:
-        of_scenes = [_held(scenario, scene, texts) for scene, texts in heard]
-        of_senders = [each for of_scene in of_scenes for each in of_scene]
+    def graphs(self, scenario: Scenario, heard: Sequence[Hearing]) -> list[SceneGraph]:
+        of_egos = [_held(scenario, each.source, each.texts) for each in heard]
+        of_senders = list(chain(*of_egos))
         states = _states(of_senders)
-        views = []
-        for each in of_senders:
-            views.append((states[_key(each.scene, each.last)], each.last.sender))
-        graphs = iter(scene_graphs(scenario, views))
+        sectors = iter(_sectors(scenario, states, of_senders))
         cases = []
-        for (scene, _), of_scene in zip(heard, of_scenes, strict=True):
-            senders = [_reports(scenario, states, each) for each in of_scene]
-            sectors = [next(graphs).sectors for _ in of_scene]
-            cases.append(Told(scene.state, scene.graphs[scene.viewers[0]], senders, sectors))
+        for hearing, of_ego in zip(heard, of_egos, strict=True):
+            scene, reports, seen = hearing.scene, [], []
+            for held in of_ego:
+                sent, in_sight = held, next(sectors)
+                if change := hearing.changes.get(held.last.sender):
+                    sent, in_sight = _changed(scenario, states, held, in_sight, change)
+                reports.append(_reports(scenario, states, sent))
+                seen.append(in_sight)
+            cases.append(Told(scene.state, scene.graphs[scene.viewers[0]], reports, seen))
         return with_reports(scenario, cases)
 
 
@@ -198,6 +200,48 @@ def _written(cpm: Cpm) -> bytes:
         numbers = [round(d.x_m, 1), round(d.y_m, 1), round(d.speed_mps, 1)]
         listed.append([d.id, d.kind, *numbers, d.indicator])
     return canonical_bytes({"from": cpm.sender, "objects": listed})
+
+
+def _sectors(
+    scenario: Scenario, states: Mapping[Key, WorldState], held: Sequence[Held]
+) -> list[Sequence[Sector]]:
+    """Return how much of each direction of danger each sender saw at its last look."""
+    sectors: list[Sequence[Sector]] = [()] * len(held)
+    for seat, places in by_seat([each.scene for each in held], scenario).items():
+        views = []
+        for n in places:
+            last = held[n].last
+            views.append((states[_key(held[n].scene, last)], last.sender))
+        for n, graph in zip(places, scene_graphs(seat, views), strict=True):
+            sectors[n] = graph.sectors
+    return sectors
+
+
+def _changed(
+    scenario: Scenario,
+    states: Mapping[Key, WorldState],
+    held: Held,
+    sectors: Sequence[Sector],
+    change: Callable[[SceneGraph, Scene], SceneGraph],
+) -> tuple[Held, Sequence[Sector]]:
+    """Return what an ego holds of a sender if each CPM was changed, and the sectors of the last.
+
+    Which CPMs go, and how long they are, is by what the sender sees, whatever it then writes.
+    """
+    by_look = {cpm.look.number: cpm for cpm in held.cpms}
+    cpms = [by_look[number] for number in sorted(by_look)]
+    looks = []
+    for cpm in cpms:
+        state = states[_key(held.scene, cpm)]
+        looks.append((state, state.vehicle(cpm.sender)))
+    objects, seat = [cpm.objects for cpm in cpms], held.scene.seat or scenario
+    graphs = listed_graphs(seat, looks, objects, [sectors] * len(cpms))
+    newest: dict[str, tuple[Cpm, Detection]] = {}
+    for cpm, (state, sender), graph in zip(cpms, looks, graphs, strict=True):
+        sent = change(graph, held.scene.changed(state=state))
+        newest |= {node.id: (cpm, detection_of(sender, node)) for node in sent.sensed}
+        sectors = sent.sectors
+    return Held(held.scene, held.last, tuple(newest.values())), sectors
 
 
 def _held(scenario: Scenario, scene: Scene, texts: Mapping[str, str]) -> list[Held]:

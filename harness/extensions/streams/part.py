@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from msgspec import Meta
 
-from harness.coordination.parts import PLAIN, Part, RunFacts, Text, wrong
+from harness.coordination.parts import Part, RunFacts, Text, wrong
 from harness.core.config import Seconds
 from harness.core.errors import unknown
 from harness.extensions.streams.congestion import NONE, RULES, Settled, settled
@@ -64,11 +64,6 @@ class Streams(Part, frozen=True, kw_only=True):
             return
         if point.asks_again:
             raise wrong("stream", self.stream, f"{NONE} where {point.asks_twice}")
-        for part in point.more:
-            if part.elsewhere or part.question != PLAIN:
-                control, *_ = part.__struct_fields__
-                allowed = f"{NONE} where {control} is {getattr(part, control)}"
-                raise wrong("stream", self.stream, allowed)
         channel = point.channel
         if point.radio.profile is None or isinstance(channel, Physical):
             return

@@ -270,10 +270,16 @@ def itself(p: Parameters, v: VehicleState, exact: bool = False) -> Report:
 
 
 def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = False) -> Report:
+    """Return a node of a sender's list, as its message reports it."""
+    sent = report(p, sender, detection_of(sender, node), exact)
+    return replace(sent, node=node) if exact else sent
+
+
+def detection_of(sender: VehicleState, node: Node) -> Detection:
     """Return a node of a sender's list, in the frame of the road, where headings are clockwise."""
     c, s = cos(sender.heading_rad), sin(sender.heading_rad)
     dx, dy = node.forward_m * c + node.left_m * s, node.forward_m * s - node.left_m * c
-    detection = Detection(
+    return Detection(
         node.id,
         node.sensors,
         None if node.type == "vehicle" else node.type,
@@ -285,8 +291,6 @@ def _reported(p: Parameters, sender: VehicleState, node: Node, exact: bool = Fal
         None,
         None if node.braking is UNSET else node.braking,
     )
-    sent = report(p, sender, detection, exact)
-    return replace(sent, node=node) if exact else sent
 
 
 def report(p: Parameters, sender: VehicleState, seen: Detection, exact: bool = False) -> Report:

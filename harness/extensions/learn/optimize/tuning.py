@@ -307,11 +307,12 @@ class _Asker(Asker):
         self._charge(questions)
         super()._ask_at(scenes, places, question)
 
-    def streamed(self, scenes: Sequence[Scene], stream: Stream, at: Ints) -> Streamed:
-        where = [scenes[n] for n in at.tolist()]
-        sets = stream_sets(self.spec.scenario, where, stream)
+    def streamed(
+        self, scenes: Sequence[Scene], stream: Stream, codes: Ints, rewrites: Rewrites = AS_SENT
+    ) -> Streamed:
+        sets = stream_sets(self.spec.scenario, scenes, stream, codes, rewrites)
         self._charge([fusion_id(*each) for each in sets if each[1]])
-        return super().streamed(scenes, stream, at)
+        return super().streamed(scenes, stream, codes, rewrites)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

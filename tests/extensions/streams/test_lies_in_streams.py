@@ -1,0 +1,181 @@
+"""What an ego hears of a stream where helpers are blind, or in another layout.
+
+Scenes are frozen ones of a real dataset, and nothing is lost, but where seeds are compared.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import as_read, run, scenes_of, spec_of
+
+from harness.coordination.named_points import named_point
+from harness.coordination.operating_point import OperatingPoint
+from harness.core.files import digest
+from harness.dataset.load import Dataset, Scene
+from harness.evaluate.dry_run import count
+from harness.evaluate.fusion import codes_of, source_of
+from harness.evaluate.requests import fusion_id, stream_sets
+from harness.evaluate.sharing import shared_graphs
+from harness.extensions.streams.cpm import Cpms
+from harness.runs import folder
+from harness.world.scene_graph import AgedNode, SceneGraph
+
+pytest.importorskip("harness.extensions.controls")
+
+STREAM = "6g:stream=cpm,tau_nats=9,loss=0"
+CHANGED = ("messages=shuffled", "messages=blind")
+
+
+@pytest.fixture(scope="module")
+def pair(small: Dataset) -> Dataset:
+    return small.of_episodes({0, 1})
+
+
+def heard(
+    dataset: Dataset, point: OperatingPoint, scenes: Sequence[Scene]
+) -> list[tuple[Scene, list[str], SceneGraph]]:
+    """Each scene, the keys of what its ego hears if all helpers attack, and its graph."""
+    helpers = max(len(scene.viewers) for scene in scenes) - 1
+    attacks = np.ones((len(scenes), helpers if point.rewrites.changes.of_attackers else 0), bool)
+    places = np.arange(len(scenes))
+    if point.rewrites.elsewhere:
+        places = places * len(scenes) + np.roll(places, -1)
+    assert point.stream
+    codes = codes_of(attacks, places)
+    sets = stream_sets(dataset.scenario, scenes, point.stream, codes, point.rewrites)
+    graphs = shared_graphs(dataset.scenario, sets, {scene.id: scene for scene in scenes})
+    made = []
+    for (scene, senders), graph in zip(sets, graphs, strict=True):
+        assert graph
+        made.append((scene, senders, graph))
+    return made
+
+
+def told(graph: SceneGraph) -> list[AgedNode]:
+    """Who is known by a message."""
+    return [node for node in graph.nodes if isinstance(node, AgedNode)]
+
+
+def of_others(graph: SceneGraph) -> list[AgedNode]:
+    """Who is known by another's message."""
+    return [node for node in told(graph) if node.sensors != (f"v2v:{node.id}",)]
+
+
+def place(scene: Scene, node: AgedNode) -> tuple[float, float]:
+    """Where a node of the ego's graph is, in the frame of the road."""
+    ego = scene.state.ego
+    c, s = math.cos(ego.heading_rad), math.sin(ego.heading_rad)
+    x_m = ego.x_m + node.forward_m * c + node.left_m * s
+    return x_m, ego.y_m + node.forward_m * s - node.left_m * c
+
+
+# -- controls --------------------------------------------------------------------------------------
+
+
+def test_blind_helpers_tell_where_they_are_and_nothing_else(small: Dataset) -> None:
+    scenes, known = scenes_of(small), 0
+    for scene, senders, graph in heard(small, named_point(f"{STREAM},messages=blind"), scenes):
+        assert all("~blind!stream:cpm:0.1:" in sender for sender in senders)
+        assert not of_others(graph)
+        assert graph.sectors == scene.graphs[scene.viewers[0]].sectors
+        known += len(told(graph))
+    assert known > 20
+
+
+def test_a_shuffled_stream_puts_what_is_there_at_its_place_there(pair: Dataset) -> None:
+    """By own arithmetic, from what the other layout's ego received, without that ego."""
+    exact = replace(pair.scenario.parameters, perfect_knowledge=True)  # of senders' own poses
+    dataset = replace(pair, _scenes={})
+    scenes, point = scenes_of(dataset), named_point(f"{STREAM},messages=shuffled")
+    by_id, checked = {scene.id: scene for scene in scenes}, 0
+    there = replace(pair.scenario, parameters=exact)
+    assert isinstance(point.stream, Cpms)
+    for scene, senders, _ in heard(pair, point, scenes):
+        source = by_id[source_of(scene.id, senders)]
+        assert source.id != scene.id
+        objects: dict[tuple[str, float, str], Any] = {}
+        for sent in point.stream.received(pair.scenario, source):
+            age_s = round(source.state.time_s - sent.look.time_s, 2)
+            objects |= {(d.id, age_s, f"v2v:{sent.sender}"): d for d in sent.objects}
+        [graph] = shared_graphs(there, [(scene, senders)], by_id)
+        assert graph
+        for node in of_others(graph):
+            assert node.id != source.viewers[0]
+            d = objects[node.id, node.age_s, node.sensors[0]]
+            x_m, y_m = place(scene, node)
+            moved_m = 0.0 if d.heading_rad is None else node.age_s * d.speed_mps
+            heading_rad = d.heading_rad or 0.0
+            assert x_m == pytest.approx(d.x_m + moved_m * math.cos(heading_rad), abs=0.4)
+            assert y_m == pytest.approx(d.y_m + moved_m * math.sin(heading_rad), abs=0.4)
+            checked += 1
+    assert checked > 20
+
+
+def test_who_has_no_other_layout_hears_nobody(small: Dataset) -> None:
+    point = named_point(f"{STREAM},messages=shuffled")
+    scenes = scenes_of(small)[:1]
+    assert heard_alone(small, point, scenes) == [fusion_id(scenes[0], [])]
+
+
+def heard_alone(dataset: Dataset, point: OperatingPoint, scenes: Sequence[Scene]) -> list[str]:
+    assert point.stream
+    codes = np.zeros(1, dtype=int)
+    sets = stream_sets(dataset.scenario, scenes, point.stream, codes, point.rewrites)
+    return [fusion_id(*each) for each in sets]
+
+
+def test_where_every_message_is_lost_a_stream_is_silent(small: Dataset) -> None:
+    scenes = scenes_of(small)
+    for radio in ("6g", "its-g5"):
+        stream = named_point(f"{radio}:stream=cpm,loss=1").stream
+        assert stream
+        assert not any(stream.heard(small.scenario, scenes))
+
+
+# -- runs ------------------------------------------------------------------------------------------
+
+
+def points_of(settings: Sequence[str]) -> tuple[OperatingPoint, ...]:
+    return tuple(named_point(f"6g:stream=cpm,tau_nats=9,{each}") for each in settings)
+
+
+@pytest.mark.slow
+def test_a_key_says_what_became_of_a_stream(pair: Dataset, tmp_path: Path) -> None:
+    """Further seeds ask no more, and whoever reads a run sees what was asked."""
+    one, two = (
+        folder.read(run(spec_of(pair, points=points_of(CHANGED), seeds=seeds), tmp_path / name).out)
+        for name, seeds in (("one", (0,)), ("two", (0, 1)))
+    )
+    assert {answer.id for answer in one.answers} == {answer.id for answer in two.answers}
+    of_attack = points_of(CHANGED[1:])
+    spec = spec_of(pair, points=of_attack, seeds=(0,))
+    stored = folder.read(run(spec, tmp_path / "read").out)
+    marks = set[str]()
+    for answer, _, messages in as_read(stored, pair):
+        assert digest(messages) == answer.prompt_sha256
+        marks |= {key.partition("&")[2] or "~" * ("~" in key) for key in answer.heard}
+    assert marks == {"~"}
+
+
+@pytest.mark.slow
+def test_a_pair_for_training_has_the_other_layouts_stream(pair: Dataset, tmp_path: Path) -> None:
+    pairs = pytest.importorskip("harness.extensions.learn.training.pairs").pairs
+    stored = folder.read(run(spec_of(pair, points=points_of(CHANGED[:1])), tmp_path / "run").out)
+    asked = {answer.prompt_sha256 for answer in stored.answers}
+    shuffled = [pair for pair in pairs(stored) if "&from:" in pair["viewer"]]
+    assert shuffled
+    assert {digest(pair["prompt"]) for pair in shuffled} <= asked
+
+
+def test_a_dry_run_counts_a_question_a_scene_whatever_became_of_the_stream(pair: Dataset) -> None:
+    plain = named_point("6g:stream=cpm,tau_nats=9")
+    points = (plain, *points_of(CHANGED))
+    counted = count(spec_of(pair, points=points), pair, None)
+    assert set(counted["streamed"].values()) == {counted["streamed"][plain.name]}
+    ego = counted["scenes"] + sum(counted["streamed"].values())
+    assert counted["requests_by_role"]["ego"] == ego
