@@ -15,6 +15,7 @@ from harness.coordination.contents import (
     CONTENTS,
     INTENTS,
     KINDS,
+    OBJECTS,
     PLANS,
     Content,
 )
@@ -167,7 +168,9 @@ class OperatingPoint:
 
     def _check_holds(self, act: ActsOn) -> None:
         """Raise ValueError for a setting that needs messages of other kinds."""
-        if act.kinds and self.content.holds.isdisjoint(act.kinds):
+        if not act.kinds or (OBJECTS in act.kinds and self.stream is not None):
+            return
+        if self.content.holds.isdisjoint(act.kinds):
             allowed = _any_of((*act.others(self.content.holds), act.instead))
             holds = f"content is {self.ask.content}, which holds no {_any_of(act.kinds)}"
             raise wrong(act.setting, act.value, f"{allowed} where {holds}")
@@ -509,7 +512,10 @@ class OperatingPoint:
 
     @cached_property
     def stream(self) -> Stream | None:
-        """Return the messages that helpers send unasked under these settings; None for none."""
+        """Return the messages that helpers send unasked under these settings; None for none.
+
+        They hold objects.
+        """
         streams = [part.unasked(self) for part in self._shipped]
         return next((stream for stream in streams if stream is not None), None)
 
@@ -551,7 +557,7 @@ class OperatingPoint:
     def _changes(self) -> Changes:
         """Return what parts change of messages whose words or objects a fusion call shows."""
         call = self.content.call
-        objects = call is not None and call.in_graph
+        objects = self.stream is not None or (call is not None and call.in_graph)
         each = []
         for part in self.more:
             with worded_part(part):

@@ -22,7 +22,7 @@ from harness.coordination.parts import PLAIN, Question
 from harness.coordination.parts_of_packages import sources
 from harness.coordination.plans import Plans
 from harness.coordination.scheduling import Outlook
-from harness.coordination.sent import SentIntents
+from harness.coordination.sent import SentIntents, Speaker
 from harness.coordination.streams import Sent, Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.strangers import strangers
@@ -330,7 +330,7 @@ def _steps(
         due = _due(world, points)
         intents = _with_needs(world, due, intents)
         others = _others(ask, decision_points, due)
-        streamed = _streamed(ask, decision_points, due)
+        streamed = _streamed(ask, decision_points, due, intents)
         answers = _answers_of_helpers(
             ask, decision_points, due, {PLAIN: intents, **others}, streamed
         )
@@ -340,7 +340,7 @@ def _steps(
         for point, due_here in due.items():
             intents_here = heard(point, answers, due_here, streamed)
             speaker, draws = speakers[point], due_here.draws
-            broadcasts[point] = speaker.said(intents_here, draws, due_here.episode, due_here.seed)
+            broadcasts[point] = _broadcast(point, speaker, intents_here, due_here)
             sent[point] = exchange(point, broadcasts[point].intents, broadcasts[point].draws)
             ties_here = tie_draws(draws, ties)
             fusions[point] = FusionInputs(None, memories[point].recall(due_here), ties_here)
@@ -425,13 +425,15 @@ def _streamed(
     ask: Ask[DecisionPoint],
     decision_points: Sequence[DecisionPoint],
     due: Mapping[OperatingPoint, Due],
+    intents: Intents,
 ) -> dict[OperatingPoint, Streamed]:
     """Return what egos answer that have heard what helpers send unasked, by condition."""
     codes = dict[OperatingPoint, Ints]()
     of_stream: dict[tuple[Stream, Rewrites], list[Ints]] = {}
     for point, due_here in due.items():
         if point.stream is not None:
-            codes[point] = places_of(point, due_here, len(decision_points))
+            attackers = _attackers_unasked(point, due_here, intents)
+            codes[point] = codes_of(attackers, places_of(point, due_here, len(decision_points)))
             of_stream.setdefault((point.stream, point.rewrites), []).append(codes[point])
     answers = dict[OperatingPoint, Streamed]()
     for (stream, rewrites), each in of_stream.items():
@@ -441,6 +443,27 @@ def _streamed(
             if (point.stream, point.rewrites) == (stream, rewrites):
                 answers[point] = of_distinct.take(np.searchsorted(distinct, codes[point]))
     return answers
+
+
+def _attackers_unasked(point: OperatingPoint, due: Due, intents: Intents) -> Bools:
+    """Return who attacks by what is sent unasked, `(n, H)`; `(n, 0)` if no attack changes that."""
+    if not point.rewrites.changes.of_attackers:
+        return np.zeros((len(due.at), 0), dtype=bool)
+    return _broadcast(point, point.speaker(), intents.take(due.at), due).attackers
+
+
+def _broadcast(point: OperatingPoint, speaker: Speaker, intents: Intents, due: Due) -> SentIntents:
+    """Return what vehicles send in the n decisions that are due, given what they intend.
+
+    Who attacks by what is sent unasked is drawn by layout alone, as its losses are: further seeds
+    then ask no further questions.
+    """
+    draws = due.draws
+    if point.stream is None or not point.rewrites.changes.of_attackers or draws.trips is None:
+        return speaker.said(intents, draws, due.episode, due.seed)
+    of_layout = replace(draws, trips=draws.trips.of_layout())
+    lies = speaker.said(intents, of_layout, due.episode, due.seed)
+    return replace(lies, draws=replace(lies.draws, trips=draws.trips))
 
 
 def _answers_of_helpers(

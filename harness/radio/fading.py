@@ -9,7 +9,7 @@ chain S' = exp(-moved/D) S + noise, and it is nearly normal (kurtosis 3 - 1.5 / 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,6 +19,7 @@ from harness.core import noise
 from harness.core.arrays import Floats, Ints
 
 WAVES = 16
+NO_SEED = -1  # in place of the channel's seed, of what belongs to the layout
 BLOCK = 1024  # decisions computed at once, so that their waves stay in the processor's cache
 
 
@@ -39,6 +40,10 @@ class Trips:
 
     def take(self, at: Any) -> "Trips":
         return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
+
+    def of_layout(self) -> "Trips":
+        """Return the keys of numbers that belong to the layout, whatever the channel's seed is."""
+        return replace(self, seed=np.full_like(self.seed, NO_SEED))
 
     def uniforms(self, helpers: int) -> Floats:
         """Return uniform draws in [0, 1) for each decision's packets, `(..., 1 + 2H)`.

@@ -40,7 +40,7 @@ from harness.extensions.streams.sending import (
     stretch,
 )
 from harness.radio.channel import Channel, Draws, Physical
-from harness.radio.fading import Trips
+from harness.radio.fading import NO_SEED, Trips
 from harness.radio.wrapped import broadcast
 from harness.world.perception.graph import listed_graphs, scene_graphs
 from harness.world.perception.sensors import Detection
@@ -63,7 +63,6 @@ HEARD = re.compile(
 )
 KEPT_S = 2.0  # age at which the ego drops a report: two of the longest intervals
 GROWS_MPS2 = 2.0  # standard deviation of the acceleration that a report does not tell, assumed
-NO_SEED = -1  # in place of the channel's seed, as beacons' links have it
 
 Key = tuple[str, Look]  # id of a scene, and the look that a CPM is of
 

@@ -339,10 +339,10 @@ class Silent(Attack):
 
 @dataclass(frozen=True)
 class Absent(Attack):
-    """Leave the attackers out, so that they send nothing: no attack, but a bound for others.
+    """Leave the attackers out, so that they answer nothing: no attack, but a bound for others.
 
     It is what a consensus rule, by which the ego fuses messages, could reach that knows who
-    attacks.
+    attacks. What they send unasked is heard.
     """
 
     by_scene: ClassVar[bool] = True  # draws and past steps do not matter

@@ -12,7 +12,14 @@ from harness.coordination.rules import EGO_PROMPT
 from harness.coordination.sent import Speaker
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import unknown
-from harness.extensions.trust.attacks import ATTACKS, attacks_of, in_question
+from harness.extensions.trust.attacks import (
+    ATTACKS,
+    Attack,
+    Jump,
+    Spoof,
+    attacks_of,
+    in_question,
+)
 from harness.extensions.trust.changes import MESSAGES, AttackersMessage
 
 if TYPE_CHECKING:
@@ -50,6 +57,12 @@ USUAL = (
 
 def _attacks_on(holds: frozenset[str]) -> list[str]:
     return [name for name in ATTACKS if not holds.isdisjoint(ATTACKS[name].acts_on)]
+
+
+def _of_claims(attack: Attack) -> bool:
+    """Return whether an attack is on who and where helpers are, which a stream says, too."""
+    adds_voices = attack.adds and not attack.in_objects
+    return adds_voices or isinstance(attack, (Spoof, Jump))
 
 
 def _defences_on(holds: frozenset[str]) -> list[str]:
@@ -113,10 +126,16 @@ class Guard(Part, frozen=True, kw_only=True):
         attacks, call = attacks_of(self.attack), point.content.call
         shares = {attack.share for attack in attacks}
         allowed = ""
+        in_list = call is not None and call.in_graph
+        where = f"where content is {point.ask.content}"
+        if point.stream is not None:
+            in_list = any(attack.in_objects for attack in attacks)
+            where = "where there is a stream"
         if point.radio.profile is None:
             allowed = "left out where there is no channel"
-        elif call and call.in_graph and len(shares) > 1:
-            where = f"where content is {point.ask.content}"
+        elif point.stream is not None and any(map(_of_claims, attacks)):
+            allowed = f"one of what attackers say, not of who and where they are, {where}"
+        elif in_list and len(shares) > 1:
             allowed = f"attacks of one share {where}, as the same vehicles do all"
         elif point.has_fusion_call and not all(attack.by_scene for attack in attacks):
             asks = "consensus" if point.fusion.consensus == EGO_PROMPT else "content"
@@ -133,7 +152,7 @@ class Guard(Part, frozen=True, kw_only=True):
 
     @property
     def needs_all(self) -> bool:
-        return bool(self.attack)
+        return not all(attack.in_objects for attack in attacks_of(self.attack))
 
     def speaker(self) -> Speaker | None:
         from harness.extensions.trust.attackers import Attackers

@@ -1,4 +1,4 @@
-"""What an ego hears of a stream where helpers are blind, or in another layout.
+"""What an ego hears of a stream where helpers are blind, in another layout, or lie.
 
 Scenes are frozen ones of a real dataset, and nothing is lost, but where seeds are compared.
 """
@@ -11,24 +11,29 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import as_read, run, scenes_of, spec_of
+from evaluating import as_read, live_spec_of, run, scenes_of, spec_of, walked
 
+from harness.backends.registry import open_backend
 from harness.coordination.named_points import named_point
 from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError
 from harness.core.files import digest
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.dry_run import count
 from harness.evaluate.fusion import codes_of, source_of
 from harness.evaluate.requests import fusion_id, stream_sets
 from harness.evaluate.sharing import shared_graphs
+from harness.evaluate.spec import Spec
 from harness.extensions.streams.cpm import Cpms
 from harness.runs import folder
+from harness.world.perception.shared import NOBODY, invented
 from harness.world.scene_graph import AgedNode, SceneGraph
 
 pytest.importorskip("harness.extensions.controls")
+trust = pytest.importorskip("harness.extensions.trust.attacks")
 
 STREAM = "6g:stream=cpm,tau_nats=9,loss=0"
-CHANGED = ("messages=shuffled", "messages=blind")
+CHANGED = ("messages=shuffled", "messages=blind", "attack=ghost", "attack=hide+shift:offset_m=3")
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +142,119 @@ def test_where_every_message_is_lost_a_stream_is_silent(small: Dataset) -> None:
         assert not any(stream.heard(small.scenario, scenes))
 
 
+# -- attacks ---------------------------------------------------------------------------------------
+
+
+def test_a_liar_invents_hides_or_shifts_in_each_cpm(pair: Dataset) -> None:
+    scenes = scenes_of(pair)
+    plain = heard(pair, named_point(STREAM), scenes)
+    ghosts, hidden, moved = (
+        heard(pair, named_point(f"{STREAM},attack={attack}"), scenes)
+        for attack in ("ghost", "hide", "shift:offset_m=8")
+    )
+    shifted = invented_cars = 0
+    for (scene, senders, true), ghost, nobody, beside in zip(
+        plain, ghosts, hidden, moved, strict=True
+    ):
+        assert [sender.partition("&")[2] for sender in ghost[1]] == ["ghost"] * len(senders)
+        # Where the ego sees another car at its place, it is taken for that one.
+        invented_cars += NOBODY in {node.id for node in of_others(ghost[2])}
+        assert NOBODY not in {node.id for node in true.nodes}
+        assert not of_others(nobody[2])
+        assert {sector.seen_share for sector in nobody[2].sectors} == {1.0}
+        places = {(n.id, n.sensors, n.age_s): place(scene, n) for n in of_others(true)}
+        for node in of_others(beside[2]):
+            true_place = places.get((node.id, node.sensors, node.age_s))
+            if true_place:
+                away_m = math.dist(place(scene, node), true_place)
+                assert away_m == pytest.approx(8, abs=0.5)
+                shifted += 1
+    assert shifted > 10
+    assert invented_cars > 0.9 * len(scenes)
+
+
+def test_a_ghost_drives_on_as_its_rule_says_from_one_cpm_to_the_next(small: Dataset) -> None:
+    """Carried on from its last CPM it is near where a list that is asked for now would have it."""
+    aged = 0
+    for scene, senders, graph in heard(
+        small, named_point(f"{STREAM},attack=ghost"), scenes_of(small)
+    ):
+        viewer = senders[0].partition("!")[0]
+        now = invented(small.scenario, scene.state, viewer)
+        sender = scene.state.vehicle(viewer)
+        c, s = math.cos(sender.heading_rad), math.sin(sender.heading_rad)
+        x_m = sender.x_m + now.forward_m * c + now.left_m * s
+        y_m = sender.y_m + now.forward_m * s - now.left_m * c
+        for node in of_others(graph):
+            if node.id == NOBODY:
+                # The ego may have changed its speed by 6 m/s², and places have a beacon's errors.
+                within_m = 3 * node.age_s**2 + 3
+                assert math.dist(place(scene, node), (x_m, y_m)) < within_m
+                aged += node.age_s > 0.05
+    assert aged > 10
+
+
+class Watching:
+    """A proxy that keeps the ids of what it is asked."""
+
+    def __init__(self, spec: Spec) -> None:
+        self.proxy, self.asked = open_backend(spec.ego.card), list[str]()
+
+    def complete(self, requests: Any) -> Any:
+        self.asked += [request.id for request in requests]
+        return self.proxy.complete(requests)
+
+    def identity(self) -> Any:
+        return self.proxy.identity()
+
+
+def test_attackers_are_drawn_by_layout_and_are_the_same_in_all_they_say(small: Dataset) -> None:
+    """One of three, in what is sent unasked and asked for, whatever the channel's seed is."""
+    points = (named_point("6g:stream=cpm,loss=0,tau_nats=0,attack=ghost:share=1/3+liar:share=1/3"),)
+    spec = spec_of(small, points=points, seeds=(0, 1))
+    backend = Watching(spec)
+    parts = walked(spec, backend).parts
+    attackers: dict[int, set[str]] = {}
+    for part in parts:
+        for row, at in enumerate(part.due.at.tolist()):
+            scene = part.decision_points[at]
+            those = np.flatnonzero(part.said.attackers[row]).tolist()
+            names = {scene.viewers[1 + h] for h in those}
+            assert len(names) == 1
+            attackers.setdefault(scene.record.episode, set()).update(names)
+    assert {len(names) for names in attackers.values()} == {1}
+    assert len(set.union(*attackers.values())) > 1
+    for name in backend.asked:
+        scene_id, _, key = name.partition("/")
+        liars = {sender.partition("!")[0] for sender in key.split("+") if "&ghost" in sender}
+        assert liars <= attackers[int(scene_id.partition("-")[0])]
+    assert any("&ghost" in name for name in backend.asked)
+
+
+def test_a_liar_in_a_stream_alone_asks_no_helper(small: Dataset) -> None:
+    spec = spec_of(small, points=(named_point(f"{STREAM},attack=ghost"),), seeds=(0,))
+    assert {answer.role for answer in walked(spec, Watching(spec)).answers} == {"ego", "merge"}
+
+
+@pytest.mark.parametrize(
+    ("attack", "message"),
+    [
+        ("spoof", "attack is 'spoof'; it must be one of what attackers say"),
+        ("liar+jump", "attack is 'liar+jump'; it must be one of what attackers say"),
+        ("sybil", "not of who and where they are, where there is a stream"),
+        ("flood", "not of who and where they are, where there is a stream"),
+        ("ghost+liar:share=1", "attacks of one share where there is a stream"),
+    ],
+)
+def test_an_attack_that_a_stream_would_belie_is_refused_in_one_line(
+    attack: str, message: str
+) -> None:
+    with pytest.raises(UserError) as error:
+        named_point(f"6g:stream=cpm,attack={attack}")
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
 # -- runs ------------------------------------------------------------------------------------------
 
 
@@ -159,7 +277,7 @@ def test_a_key_says_what_became_of_a_stream(pair: Dataset, tmp_path: Path) -> No
     for answer, _, messages in as_read(stored, pair):
         assert digest(messages) == answer.prompt_sha256
         marks |= {key.partition("&")[2] or "~" * ("~" in key) for key in answer.heard}
-    assert marks == {"~"}
+    assert marks == {"", "~", "ghost", "hide&shift:offset_m=3"}
 
 
 @pytest.mark.slow
@@ -179,3 +297,20 @@ def test_a_dry_run_counts_a_question_a_scene_whatever_became_of_the_stream(pair:
     assert set(counted["streamed"].values()) == {counted["streamed"][plain.name]}
     ego = counted["scenes"] + sum(counted["streamed"].values())
     assert counted["requests_by_role"]["ego"] == ego
+
+
+@pytest.mark.slow
+def test_a_lied_to_ego_drives_as_in_frozen_scenes(pair: Dataset, tmp_path: Path) -> None:
+    how: dict[str, Any] = {"points": points_of(("attack=ghost:share=1/3",)), "seeds": (0,)}
+    live = live_spec_of("proxy", 2, pair.manifest.seed, **how)
+    walked_run, driven = (
+        folder.read(run(spec, tmp_path / name).out)
+        for name, spec in (("walked", spec_of(pair, **how)), ("driven", live))
+    )
+    assert not walked_run.decisions["off_lag"].any()
+    told_by = []
+    for each in (walked_run, driven):
+        rows = each.decisions.records(0, len(each.decisions))
+        told_by.append([(d.episode, d.scene, d.action, d.fused, d.latency_ms) for d in rows])
+    assert told_by[0] == told_by[1]
+    assert any("&ghost" in key for answer in driven.answers for key in answer.heard)
