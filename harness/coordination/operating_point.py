@@ -72,6 +72,7 @@ if TYPE_CHECKING:
 WEIGHING = ("weight_cap", "min_distance_m", "ego_distance_m")  # settings of the weights by distance
 # Settings of helpers' intents: how they are fused, and when a helper's model is asked.
 OF_INTENTS = ("consensus", *WEIGHING, "on_demand", "helper_rounds")
+OF_ASKING = ("ask", "fusion")  # parts that matter only where helpers are asked
 LONGEST_NAME = 1000
 
 
@@ -359,10 +360,12 @@ class OperatingPoint:
         matters_alone = setting in settings_alone() and setting not in settings_of_radio()
         if self.radio.profile is None and not matters_alone:
             return "it has no channel"
-        if ask.schedule == NEVER and setting not in (*settings_alone(), "schedule"):
-            return f"schedule {NEVER} asks nobody"
-        if ask.max_helpers == 0 and setting not in (*settings_alone(), "max_helpers"):
-            return "max_helpers is 0, so it asks nobody"
+        of_asking = part_of_settings().get(setting or "") in OF_ASKING
+        if (self.stream is None or of_asking) and setting not in settings_alone():
+            if ask.schedule == NEVER and setting != "schedule":
+                return f"schedule {NEVER} asks nobody"
+            if ask.max_helpers == 0 and setting != "max_helpers":
+                return "max_helpers is 0, so it asks nobody"
         if setting == "tau_nats" and ask.schedule != PAPER and not self.radio.helper_rounds:
             return f"schedule {ask.schedule} has a threshold of its own"
         if setting == "request_bits" and self.radio.encoding != JSON:

@@ -255,6 +255,13 @@ def test_an_attack_that_a_stream_would_belie_is_refused_in_one_line(
     assert "\n" not in str(error.value)
 
 
+def test_who_asks_nobody_still_hears_a_stream() -> None:
+    silent = named_point("6g:stream=cpm,schedule=never")
+    assert silent.idle("attack") is silent.idle("loss") is silent.idle("messages") is None
+    assert silent.idle("consensus") == "schedule never asks nobody"
+    assert named_point("6g:schedule=never").idle("loss") == "schedule never asks nobody"
+
+
 # -- runs ------------------------------------------------------------------------------------------
 
 
