@@ -31,6 +31,7 @@ def play(
     link=((0.9, 0.9), (0.9, 0.9), (0.9, 0.9)),
     jitter=(0.0, 0.5, 1.0),
     fusion_call=None,
+    allowed_s=None,
 ) -> Coordination:
     intents = Intents(
         np.array(own),
@@ -40,6 +41,7 @@ def play(
         np.array(range_m),
         np.full(len(valid), 1000.0),
         np.array(inference_s),
+        allowed_s=None if allowed_s is None else np.array(allowed_s),
     )
     return coordinate(
         point, intents, Draws(np.array(link), np.array(jitter)), FusionInputs(fusion_call)
@@ -100,6 +102,17 @@ def test_over_6g_all_three_are_fused_and_the_slowest_is_the_latency():
     assert decision.latency_s == pytest.approx(0.151907)
     assert not decision.deadline_missed
     assert (decision.messages, decision.lost, decision.late) == (3, 0, 0)
+
+
+def test_a_helper_that_has_just_sent_something_replies_once_it_may():
+    """As above; the second may after 160 ms, the third after 500, too late to be fused."""
+    decision = play(SIXG, allowed_s=(0.1, 0.16, 0.5))
+    assert decision.arrival_s == pytest.approx([0.150007, 0.165955, 0.506905])
+    assert decision.on_time.tolist() == [True, True, False]
+    assert decision.latency_s == pytest.approx(0.506905)
+    # Over v2x the others take their slots before the first may.
+    decision = play(V2X, allowed_s=(0.2, 0.0, 0.0))
+    assert decision.arrival_s == pytest.approx([0.2251, 0.17014, 0.19524])
 
 
 @pytest.mark.parametrize("lost_link", [(0.01, 0.9), (0.9, 0.01)], ids=["request", "reply"])

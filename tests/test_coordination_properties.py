@@ -22,7 +22,7 @@ Case = tuple[Intents, Draws]
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
     """Four decisions with up to five helpers, of which some are absent and all NaN;
-    some answers are sure.
+    some answers are sure, and in some cases helpers must wait before they send.
     """
     helpers, actions = draw(st.integers(0, 5)), draw(st.integers(2, 4))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
@@ -32,6 +32,7 @@ def cases(draw: st.DrawFn) -> Case:
         np.full(actions, draw(st.sampled_from([0.05, 1.0, 50.0]))), (4, 1 + helpers)
     )
     range_m = rng.uniform(0, 150, shape)
+    allowed_s = np.where(valid, rng.uniform(0, 0.4, shape), np.nan)
     return Intents(
         own=intents[:, 0],
         helpers=np.where(valid[..., None], intents[:, 1:], np.nan),
@@ -40,6 +41,7 @@ def cases(draw: st.DrawFn) -> Case:
         range_m=np.where(valid, range_m, np.nan),
         payload_bits=rng.uniform(0, 8000, shape),
         inference_s=rng.uniform(0.1, 0.2, (4, 1 + helpers)),
+        allowed_s=draw(st.sampled_from([None, allowed_s])),
     ), Draws(rng.random((*shape, 2)), rng.random(shape))
 
 
@@ -62,6 +64,8 @@ def shuffled(case: Case, order: list[int]) -> Case:
     per_helper = ("helpers", "valid", "range_m", "payload_bits")
     changed = {name: getattr(intents, name)[:, order] for name in per_helper}
     changed |= {name: getattr(intents, name)[:, with_ego] for name in ("distance_m", "inference_s")}
+    if intents.allowed_s is not None:
+        changed["allowed_s"] = intents.allowed_s[:, order]
     return replace(intents, **changed), Draws(draws.link[:, order], draws.jitter[:, order])
 
 
@@ -104,6 +108,23 @@ def test_a_decision_ends_after_the_egos_inference_and_every_arrival(point, case)
     assert np.all(decision.latency_s >= case[0].inference_s[:, 0])
     arrived = np.where(decision.delivered, decision.arrival_s, 0.0)
     assert np.all(decision.latency_s[:, None] >= arrived)
+
+
+@given(points, cases())
+def test_helpers_that_must_wait_delay_a_decision_by_so_much_at_most(point, case):
+    intents, draws = case
+    at_once, now = replace(intents, allowed_s=None), np.zeros(intents.valid.shape)
+    free = coordinate(point, at_once, draws)
+    assert_same(coordinate(point, replace(intents, allowed_s=now), draws), free)
+    if intents.allowed_s is not None:
+        held = coordinate(point, *case)
+        assert np.all(held.latency_s >= free.latency_s)
+        sent = np.isfinite(held.arrival_s)
+        assert np.all(held.arrival_s[sent] > intents.allowed_s[sent])
+        longest_s = np.max(np.where(free.asked, intents.allowed_s, 0.0), axis=-1, initial=0.0)
+        waits_s = np.maximum(longest_s - intents.inference_s[:, 0], 0.0)
+        assert np.all(held.latency_s <= free.latency_s + waits_s + 1e-12)
+        assert np.array_equal(held.asked, free.asked)
 
 
 @given(points, cases(), st.data())

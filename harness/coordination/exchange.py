@@ -10,7 +10,8 @@ In seconds from the start of the decision:
                           latency if the channel has one. Only now do they infer, if they infer on
                           demand
     ready                 a helper has the request and its own intent, and its reply can leave:
-                          max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]
+                          max(heard, inference_s[1+h]); on demand heard + inference_s[1+h]; and no
+                          sooner than it may send, if it has sent something unasked just before
     + slots               replies are on air, one after another or at once, as the profile says; a
                           slot is nominal latency + payload / bandwidth + jitter
     arrival_s[h]          the end of the helper's slot if request and reply arrived; else inf
@@ -236,8 +237,12 @@ def _ask_helpers(
 
     def ready(has_request_s: Floats | float) -> Floats:
         if point.ask.on_demand:
-            return has_request_s + helpers_s
-        return np.maximum(helpers_s - request_s, has_request_s)
+            ready_s = has_request_s + helpers_s
+        else:
+            ready_s = np.maximum(helpers_s - request_s, has_request_s)
+        if intents.allowed_s is None:
+            return ready_s
+        return np.maximum(ready_s, intents.allowed_s - request_s)
 
     links = Links(
         asked_helpers,

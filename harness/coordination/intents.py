@@ -67,6 +67,9 @@ class Intents:
     # plans; else None
     own_bits: Floats | None = None
     own_text_bytes: Floats | None = None  # bytes of the text in it, `(...)`; else None
+    # seconds from the decision's start until each helper may send, since it has sent something
+    # unasked just before, `(..., H)`; None if none has to wait
+    allowed_s: Floats | None = None
 
     def take(self, at: Any) -> "Intents":
         """Return what vehicles intend in some of the decisions: those at `at` of the leading axis.

@@ -54,6 +54,12 @@ class Stream(Protocol):
         All that they send counts, whoever hears it. At the first scene of a course it is nothing.
         """
 
+    def allowed_s(self, scenario: Any, scenes: Sequence[Any]) -> list[Mapping[str, float]]:
+        """Return, for each scene, when a sender may send its next message, s after it, by sender.
+
+        It is 0 or more. Senders that may at once can be left out.
+        """
+
 
 class Sent(NamedTuple):
     """Hold how much helpers have sent unasked before n decisions, each since the one before."""
@@ -69,12 +75,15 @@ class Sent(NamedTuple):
 
 
 class Streamed(NamedTuple):
-    """Hold what n egos answer that have heard a stream, and what was sent before."""
+    """Hold what n egos answer that have heard a stream, and what H helpers sent before."""
 
     own: Floats  # each ego's probabilities of its A actions, `(n, A)`; NaN where an answer failed
     inference_s: Floats  # seconds of each answer, `(n,)`; NaN where unknown
     sent: Sent  # what helpers have sent since the decision before
+    # seconds from each decision's start until each helper may send its reply, `(n, H)`; 0 for at
+    # once
+    allowed_s: Floats
 
     def take(self, at: Ints) -> "Streamed":
         """Return the answers at these indices, `(m,)`."""
-        return Streamed(self.own[at], self.inference_s[at], self.sent.take(at))
+        return Streamed(self.own[at], self.inference_s[at], self.sent.take(at), self.allowed_s[at])

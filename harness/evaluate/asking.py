@@ -477,7 +477,12 @@ class Asker:
         of_egos = [scene for scene, _ in sets]
         laid_out = intents_of(self.spec, self.latency, of_egos, answers)
         sent = stream.sent(self.spec.scenario, of_egos)
-        return Streamed(laid_out.own, laid_out.inference_s[:, 0], sent)
+        allowed_s = np.zeros((len(sets), max(len(scene.viewers) for scene in scenes) - 1))
+        by_sender = stream.allowed_s(self.spec.scenario, of_egos)
+        for n, (scene, of_ego_s) in enumerate(zip(of_egos, by_sender, strict=True)):
+            for helper, viewer in enumerate(scene.viewers[1:]):
+                allowed_s[n, helper] = of_ego_s.get(viewer, 0.0)
+        return Streamed(laid_out.own, laid_out.inference_s[:, 0], sent, allowed_s)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

@@ -527,7 +527,7 @@ def _with_own(intents: Intents, streamed: Streamed) -> Intents:
     """Return intents with the ego's as it answers once it has heard a stream."""
     inference_s = intents.inference_s.copy()
     inference_s[:, 0] = streamed.inference_s
-    return replace(intents, own=streamed.own, inference_s=inference_s)
+    return replace(intents, own=streamed.own, inference_s=inference_s, allowed_s=streamed.allowed_s)
 
 
 def _with_helpers(intents: Intents, source: Intents, valid: Bools) -> Intents:

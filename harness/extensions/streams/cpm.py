@@ -88,6 +88,8 @@ class Cpms:
     delay_s: float = 0.0  # seconds from a look to the ego's having its CPM
     channel: Channel | None = None  # radio channel; None where only what was heard is shown
     encoding: str = JSON  # how CPMs are written, which is their size
+    # seconds from any message of a helper to its next, as congestion control has it; 0 without
+    between_s: float = 0.0
 
     def heard(self, scenario: Scenario, scenes: Sequence[Scene]) -> list[Mapping[str, str]]:
         texts: list[Mapping[str, str]] = []
@@ -164,6 +166,20 @@ class Cpms:
         for of_each in (np.ones(len(cpms)), bits, self._airtime_s(bits)):
             sums.append(np.bincount(place, of_each, len(scenes)).astype(float))
         return Sent(*sums)
+
+    def allowed_s(self, scenario: Scenario, scenes: Sequence[Scene]) -> list[Mapping[str, float]]:
+        """Return when each helper may reply, s after each of n scenes, by its last CPM till then.
+
+        CPMs after the scene hold up no reply: which ones are due depends on what is decided.
+        """
+        if not self.between_s:
+            return [{} for _ in scenes]
+        by_sender: list[Mapping[str, float]] = []
+        for scene in scenes:
+            last_s, now_s = stretch(scenario, scene, self.interval_s).last_s, scene.state.time_s
+            until_s = {sender: at_s + self.between_s - now_s for sender, at_s in last_s.items()}
+            by_sender.append({sender: max(wait_s, 0.0) for sender, wait_s in until_s.items()})
+        return by_sender
 
     def _airtime_s(self, bits: Floats) -> Floats:
         """Return the time on air of n CPMs of these sizes, s, (n,); NaN where it is unknown."""

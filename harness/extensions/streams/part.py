@@ -95,12 +95,12 @@ class Streams(Part, frozen=True, kw_only=True):
     def unasked(self, point: "OperatingPoint") -> Cpms | None:
         if self.stream == NONE or point.radio.profile is None:
             return None
-        every_s = self.stream_interval_s
+        between_s, encoding = 0.0, point.radio.encoding
         if self.congestion != NONE:
             uncontrolled = point.changed(congestion=NONE).channel
-            every_s = max(every_s, self._settled(point, uncontrolled).allowed_s)
-        encoding = point.radio.encoding
-        return Cpms(interval_s(every_s), self.stream_delay_s, point.channel, encoding)
+            between_s = self._settled(point, uncontrolled).allowed_s
+        every_s = interval_s(max(self.stream_interval_s, between_s))
+        return Cpms(every_s, self.stream_delay_s, point.channel, encoding, between_s)
 
     @classmethod
     def unasked_of(cls, text: str) -> Cpms | None:

@@ -310,10 +310,10 @@ def test_time_on_air_is_unknown_where_a_radio_does_not_know_it(small: Dataset) -
 COUNTED = ("unasked", "unasked_bits", "unasked_ms")
 
 
-def _rows(done: Any) -> dict[tuple[str, int, int, int], dict[str, float]]:
+def _rows(done: Any) -> dict[Any, dict[str, float]]:
     """Each decision's columns of messages, by condition, episode, seed and step."""
     d = done.decisions
-    names = (*COUNTED, "request_bits", "reply_bits", "airtime_ms")
+    names = (*COUNTED, "request_bits", "reply_bits", "airtime_ms", "latency_ms", "off_lag")
     keys = zip(d.labels("condition"), *map(d.whole, ("episode", "seed", "step")), strict=True)
     values = zip(*(d[name].tolist() for name in names), strict=True)
     return {key: dict(zip(names, row, strict=True)) for key, row in zip(keys, values, strict=True)}
@@ -370,14 +370,60 @@ def test_what_is_sent_unasked_takes_energy(small: Dataset, tmp_path: Path) -> No
         assert expected.max() > 0
 
 
+CROWDED = "its-g5:encoding=etsi,density_per_km=600,stream=cpm"
+OBEYING = f"{CROWDED},congestion=reactive"  # a message every 200 ms (`radio congestion`)
+
+
+def test_a_reply_waits_as_long_as_after_any_packet(small: Dataset) -> None:
+    """By own arithmetic: since a helper's last CPM of all the course, and not after the scene."""
+    crowded, obeying = named_point(CROWDED).stream, named_point(OBEYING).stream
+    assert isinstance(crowded, Cpms)
+    assert isinstance(obeying, Cpms)
+    scenes, waits_s = scenes_of(small), list[float]()
+    assert not any(crowded.allowed_s(small.scenario, scenes))
+    for scene, allowed_s in zip(scenes, obeying.allowed_s(small.scenario, scenes), strict=True):
+        last_s, at = dict[str, float](), scene
+        while at is not None:
+            for cpm in sending.stretch(small.scenario, at, 0.2).cpms:
+                last_s[cpm.sender] = max(cpm.look.time_s, last_s.get(cpm.sender, -9))
+            at = at.before()
+        assert {*last_s} == {helper.id for helper in scene.state.helpers}
+        for sender, sent_s in last_s.items():
+            assert allowed_s[sender] == pytest.approx(max(sent_s + 0.2 - scene.state.time_s, 0))
+        waits_s += allowed_s.values()
+    assert 0 <= min(waits_s) < 0.05 < 0.15 < max(waits_s) <= 0.2
+
+
+def test_replies_of_a_run_wait(small: Dataset, tmp_path: Path) -> None:
+    done = evaluated(small, tmp_path / "run", [OBEYING], (0,))
+    stream = named_point(OBEYING).stream
+    assert stream is not None
+    rows, waited = done.decisions.records(0, len(done.decisions)), 0
+    scenes = small.scenes([row.scene for row in rows])
+    for row, allowed_s in zip(rows, stream.allowed_s(small.scenario, scenes), strict=True):
+        for message in row.messages:
+            if message.arrival_ms is not None:
+                wait_ms = 1000 * allowed_s[message.sender]
+                assert message.arrival_ms > wait_ms
+                waited += wait_ms > 145
+    assert waited > 3
+
+
 @pytest.mark.slow
 def test_frozen_and_driven_send_alike(small: Dataset, tmp_path: Path) -> None:
-    texts = ("6g:stream=cpm", "its-g5:encoding=etsi,density_per_km=120,stream=cpm")
+    """Up to a decision that is later than frozen scenes assume."""
+    texts = ("6g:stream=cpm", "its-g5:encoding=etsi,density_per_km=120,stream=cpm", OBEYING)
     same: Any = {"points": tuple(map(named_point, texts)), "latency": "paper", "seeds": (0,)}
     frozen = read(run(spec_of(load(small.path, 2), **same), tmp_path / "frozen").out)
     driven = read(run(live_spec_of(episodes=2, first_seed=100, **same), tmp_path / "driven").out)
-    assert _rows(frozen) == _rows(driven)
-    assert len(_rows(frozen)) > 10
+    late, compared, alike = dict[tuple[Any, ...], int](), 0, _rows(driven)
+    for (*place, step), row in sorted(_rows(frozen).items()):
+        if step <= late.setdefault((*place,), 99):
+            late[*place,] = step if row["off_lag"] else 99
+            assert {**alike[*place, step], "off_lag": row["off_lag"]} == row
+            compared += 1
+    assert compared > 10
+    assert any(step < 99 for (text, *_), step in late.items() if text == OBEYING)
 
 
 def test_a_dry_run_counts_what_a_stream_adds(small: Dataset) -> None:
