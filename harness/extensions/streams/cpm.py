@@ -35,9 +35,10 @@ from harness.extensions.streams.sending import (
     ROUNDING_S,
     Cpm,
     Look,
-    links,
+    Stretch,
     most_looks,
     stretch,
+    stretches,
 )
 from harness.radio.channel import Channel, Draws, Physical
 from harness.radio.fading import NO_SEED, Trips
@@ -55,6 +56,7 @@ from harness.world.perception.shared import (
 )
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import SceneGraph, Sector
+from harness.world.sight_lines import site
 from harness.world.state import VehicleState, WorldState
 
 HEARD = re.compile(
@@ -64,6 +66,9 @@ HEARD = re.compile(
 KEPT_S = 2.0  # age at which the ego drops a report: two of the longest intervals
 GROWS_MPS2 = 2.0  # standard deviation of the acceleration that a report does not tell, assumed
 
+SCENES_AT_ONCE = 64  # whose streams are computed together: more need more memory
+
+Sending = tuple[Scene, Stretch]  # a scene, and what was sent up to it since the decision before
 Key = tuple[str, Look]  # id of a scene, and the look that a CPM is of
 
 
@@ -93,58 +98,79 @@ class Cpms:
 
     def heard(self, scenario: Scenario, scenes: Sequence[Scene]) -> list[Mapping[str, str]]:
         texts: list[Mapping[str, str]] = []
-        for scene in scenes:
-            of_senders: dict[str, set[int]] = {}
-            for sender, look in self._newest(scenario, scene):
-                of_senders.setdefault(sender, set()).add(look)
-            texts.append({name: self._text(looks) for name, looks in sorted(of_senders.items())})
+        for begin in range(0, len(scenes), SCENES_AT_ONCE):
+            some = scenes[begin : begin + SCENES_AT_ONCE]
+            for scene, cpms in zip(some, self.received(scenario, some), strict=True):
+                looks: dict[str, set[int]] = {}
+                for sender, look in self._newest(scene, cpms):
+                    looks.setdefault(sender, set()).add(look)
+                texts.append({name: self._text(looks[name]) for name in sorted(looks)})
         return texts
 
     def _text(self, looks: set[int]) -> str:
         return f"{NAME}:{self.interval_s:g}:{'.'.join(map(str, sorted(looks)))}"
 
-    def _newest(self, scenario: Scenario, scene: Scene) -> set[tuple[str, int]]:
+    def _newest(self, scene: Scene, cpms: Sequence[Cpm]) -> set[tuple[str, int]]:
         """Return sender and look of the newest CPM of each object, and of each sender."""
         now_s = scene.state.time_s
         newest: dict[tuple[str, str], int] = {}  # by sender and object; the object is "" for any
-        for cpm in self.received(scenario, scene):
+        for cpm in cpms:
             sender, number, time_s = cpm.look
             if now_s - KEPT_S <= time_s <= now_s - self.delay_s + ROUNDING_S:
                 for name in ("", *(d.id for d in cpm.objects)):
                     newest[sender, name] = max(number, newest.get((sender, name), 0))
         return {(sender, number) for (sender, _), number in newest.items()}
 
-    def received(self, scenario: Scenario, scene: Scene) -> Iterator[Cpm]:
-        """Yield the CPMs that the ego of a scene receives, however late, young enough to matter."""
-        for at in _young(scene):
-            cpms = stretch(scenario, at, self.interval_s).cpms
-            if cpms:
-                crosses = self._draws(scenario, at, cpms) >= self._loss(scenario, at, cpms)
-                yield from (cpm for cpm, there in zip(cpms, crosses, strict=True) if there)
+    def received(self, scenario: Scenario, scenes: Sequence[Scene]) -> list[list[Cpm]]:
+        """Return the CPMs that each scene's ego receives, however late, young enough to matter."""
+        young = [list(_young(scene)) for scene in scenes]
+        once = {id(at): at for of_scene in young for at in of_scene}
+        crossed = dict(zip(once, self._crossed(scenario, list(once.values())), strict=True))
+        received = []
+        for of_scene in young:
+            received.append([cpm for at in of_scene for cpm in crossed[id(at)]])
+        return received
 
-    def _draws(self, scenario: Scenario, scene: Scene, cpms: Sequence[Cpm]) -> Floats:
+    def _crossed(self, scenario: Scenario, scenes: Sequence[Scene]) -> list[list[Cpm]]:
+        """Return the CPMs up to each scene, since the decision before, that its ego receives."""
+        sent = list(zip(scenes, stretches(scenario, scenes, self.interval_s), strict=True))
+        new = [each for each in sent if self not in each[1].crossed]
+        crosses = iter((self._draws(scenario, new) >= self._loss(new)).tolist())
+        for _, each in new:
+            each.crossed[self] = [cpm for cpm in each.cpms if next(crosses)]
+        return [each.crossed[self] for _, each in sent]
+
+    def _draws(self, scenario: Scenario, sent: Sequence[Sending]) -> Floats:
         """Return the draws, by link and look, that decide which CPMs are lost, (n,)."""
-        seed, most = scene.state.episode_seed, most_looks(scenario, self.interval_s)
-        draws = []
-        for cpm in cpms:
-            of_link = _uniforms(seed, cpm.sender, scene.state.ego.id, most)
-            draws.append(of_link[cpm.look.number])
+        most, draws = most_looks(scenario, self.interval_s), []
+        for scene, each in sent:
+            seed, ego = scene.state.episode_seed, scene.state.ego.id
+            for cpm in each.cpms:
+                draws.append(_uniforms(seed, cpm.sender, ego, most)[cpm.look.number])
         return np.array(draws)
 
-    def _loss(self, scenario: Scenario, scene: Scene, cpms: Sequence[Cpm]) -> Floats:
+    def _loss(self, sent: Sequence[Sending]) -> Floats:
         """Return the probability that each CPM is lost on its way to the ego, (n,)."""
-        n = len(cpms)
-        if not isinstance(self.channel, Physical):
+        n = sum(len(each.cpms) for _, each in sent)
+        if not n or not isinstance(self.channel, Physical):
             return np.full(n, getattr(self.channel, "loss", 0.0))
-        sites, xy_m = links(scenario, scene, self.interval_s)
-        seeds = np.full(n, scene.state.episode_seed)
+        links: list[tuple[WorldState, Cpm, WorldState]] = []  # in a scene, and when it was sent
+        for scene, each in sent:
+            states = moments(scene, [cpm.look.time_s for cpm in each.cpms])
+            links += [(scene.state, *both) for both in zip(each.cpms, states, strict=True)]
+        sites = site([(state, (now.ego.id, cpm.sender)) for now, cpm, state in links])
+        places = [_place(now, cpm.sender) for now, cpm, _ in links]
+        seeds = np.array([now.episode_seed for now, _, _ in links])
+        bits = self.bits([cpm for _, cpm, _ in links])[:, None]
+        # Shadowing goes by a sender's place among the helpers; where others are does not matter.
+        xy_m = np.full((n, 2 + max(places), 2), np.nan)
+        place, xy_m[:, :1] = np.array(places)[:, None], sites.xy_m[:, :1]
+        np.put_along_axis(xy_m, 1 + place[..., None], sites.xy_m[:, 1:], axis=1)
         trips = Trips(np.full(n, NO_SEED), seeds, np.zeros(n, dtype=int), 1)
-        helpers = [helper.id for helper in scene.state.helpers]
-        senders = np.array([helpers.index(cpm.sender) for cpm in cpms])[:, None]
         shadows = trips.shadow(xy_m, self.channel.decorrelation_m)
-        shadow = np.take_along_axis(shadows, senders, axis=1)
-        bits = self.bits(cpms)[:, None]
-        return np.broadcast_to(self.channel.loss(sites, shadow, bits), shadow.shape)[:, 0]
+        shadow = np.take_along_axis(shadows, place, axis=1)
+        loss = self.channel.loss(sites, shadow, bits)
+        return np.broadcast_to(loss, shadow.shape)[:, 0]
 
     def bits(self, cpms: Sequence[Cpm]) -> Floats:
         """Return the size of n CPMs in bits, in this stream's encoding, (n,)."""
@@ -299,6 +325,11 @@ def _young(scene: Scene) -> Iterator[Scene]:
     while at is not None and at.state.time_s > scene.state.time_s - KEPT_S:
         yield at
         at = at.before()
+
+
+def _place(state: WorldState, helper: str) -> int:
+    """Return the index of a helper among all helpers of a state."""
+    return [v.id for v in state.helpers].index(helper)
 
 
 def _key(scene: Scene, cpm: Cpm) -> Key:

@@ -5,23 +5,19 @@ rules pick (`inclusion.py`). The phase of its looks is drawn by layout and helpe
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import chain
 from math import floor, inf
-from typing import NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from harness.core import noise
-from harness.core.arrays import Floats
 from harness.dataset.load import Scene
 from harness.extensions.streams.inclusion import LONGEST_S, Sighting, due
 from harness.extensions.streams.motion import moments
-from harness.radio.channel import Site
 from harness.world.perception.rays import surfaces
 from harness.world.perception.sensors import Detection, reports
 from harness.world.scenario import Scenario
-from harness.world.sight_lines import site
 from harness.world.state import WorldState
 
 NAME = "cpm"
@@ -58,59 +54,49 @@ class Stretch(NamedTuple):
     # what each object was when its sender last included it, by sender and object
     included: Mapping[str, Mapping[str, Sighting]]
     last_s: Mapping[str, float]  # when each sender sent last
+    crossed: dict[Any, list[Cpm]]  # what of it the ego receives, by stream, once computed
 
 
-OF_LINKS = ":links"  # ends the note of a stretch's links
-NOTHING = Stretch((), {}, {})
+Pair = tuple[Scene, Scene | None]  # a decision point, and the one before it
+NOTHING = Stretch((), {}, {}, {})
 _kept: deque[tuple[Scene, str]] = deque()  # scenes with a note of their stretch, the oldest first
 
 
 def stretch(scenario: Scenario, scene: Scene, interval_s: float) -> Stretch:
-    """Return what helpers send from the decision before to a scene, computed once.
+    """Return what helpers send from the decision before to a scene, as `stretches` does."""
+    [sent] = stretches(scenario, [scene], interval_s)
+    return sent
+
+
+def stretches(scenario: Scenario, scenes: Sequence[Scene], interval_s: float) -> list[Stretch]:
+    """Return what helpers send from the decision before to each scene, computed once.
 
     `interval_s` is the time between two looks, s. At the first decision of a course it is what they
     send from LEAD_S before on.
     """
     note = f"{NAME}:{interval_s:g}"
-    noted: Stretch | None = scene.notes.get(note)
-    if noted is not None:
-        return noted
-    before = scene.before()
-    earlier, since_s = NOTHING, scene.state.time_s - LEAD_S
-    if before is not None:
-        earlier, since_s = stretch(scenario, before, interval_s), before.state.time_s
-    new = scene.notes[note] = _new(scenario, scene, earlier, since_s, interval_s)
-    _kept.append((scene, note))
-    if len(_kept) > SCENES_KEPT:
+    generations = [_lacking(note, scenes)]
+    while generations[-1]:
+        generations.append(_lacking(note, [before for _, before in generations[-1]]))
+    for generation in reversed(generations):
+        new = [each for each in generation if note not in each[0].notes]
+        for (scene, _), sent in zip(new, _new(scenario, new, note, interval_s), strict=True):
+            scene.notes[note] = sent
+            _kept.append((scene, note))
+    of_scenes = [scene.notes[note] for scene in scenes]
+    while len(_kept) > SCENES_KEPT:
         oldest, oldest_note = _kept.popleft()
-        for name in (oldest_note, oldest_note + OF_LINKS):
-            oldest.notes.pop(name, None)
-    return new
+        del oldest.notes[oldest_note]
+    return of_scenes
 
 
-class CpmLinks(NamedTuple):
-    """Hold where vehicles are when n CPMs are sent."""
-
-    sites: Site  # of the ego and the sender alone, (n, ...)
-    xy_m: Floats  # places of the ego and all H helpers, m, (n, 1+H, 2)
-
-
-def links(scenario: Scenario, scene: Scene, interval_s: float) -> CpmLinks:
-    """Return the links to the ego of the CPMs of `stretch`, of which there are some."""
-    note = f"{NAME}:{interval_s:g}{OF_LINKS}"
-    noted: CpmLinks | None = scene.notes.get(note)
-    if noted is not None:
-        return noted
-    cpms, ego = stretch(scenario, scene, interval_s).cpms, scene.state.ego.id
-    radios = [ego, *(helper.id for helper in scene.state.helpers)]
-    points, places_m = [], []
-    states = moments(scene, [cpm.look.time_s for cpm in cpms])
-    for cpm, state in zip(cpms, states, strict=True):
-        points.append((state, (ego, cpm.sender)))
-        vehicles = [state.vehicle(name) for name in radios]
-        places_m.append([(v.x_m, v.y_m) for v in vehicles])
-    new = scene.notes[note] = CpmLinks(site(points), np.array(places_m))
-    return new
+def _lacking(note: str, scenes: Iterable[Scene | None]) -> list[Pair]:
+    """Return the scenes that lack a note, each once and with the one before it."""
+    lacking: dict[int, Scene] = {}
+    for scene in scenes:
+        if scene is not None and note not in scene.notes:
+            lacking[id(scene)] = scene
+    return [(scene, scene.before()) for scene in lacking.values()]
 
 
 def most_looks(scenario: Scenario, interval_s: float) -> int:
@@ -118,14 +104,27 @@ def most_looks(scenario: Scenario, interval_s: float) -> int:
     return floor((LEAD_S + scenario.parameters.time_limit_s) / interval_s) + 2
 
 
-def _new(
-    scenario: Scenario, scene: Scene, earlier: Stretch, since_s: float, interval_s: float
-) -> Stretch:
-    looks = _looks(scene, since_s, interval_s)
-    states = moments(scene, [look.time_s for look in looks])
+def _new(scenario: Scenario, pairs: Sequence[Pair], note: str, interval_s: float) -> list[Stretch]:
+    """Return the stretch up to each scene; that up to the one before is noted there."""
+    looks: list[list[Look]] = []
+    states: list[WorldState] = []
+    for scene, before in pairs:
+        since_s = scene.state.time_s - LEAD_S if before is None else before.state.time_s
+        looks.append(_looks(scene, since_s, interval_s))
+        states += moments(scene, [look.time_s for look in looks[-1]])
+    detections = iter(_detections(scenario, list(chain.from_iterable(looks)), states))
+    new = []
+    for (_, before), of_scene in zip(pairs, looks, strict=True):
+        earlier = NOTHING if before is None else before.notes[note]
+        new.append(_sent(earlier, [(look, next(detections)) for look in of_scene]))
+    return new
+
+
+def _sent(earlier: Stretch, seen: Sequence[tuple[Look, Sequence[Detection]]]) -> Stretch:
+    """Return what is sent after an earlier stretch, of what is seen at each look."""
     included = {sender: dict(objects) for sender, objects in earlier.included.items()}
     last_s, cpms = dict(earlier.last_s), list[Cpm]()
-    for look, detections in zip(looks, _detections(scenario, looks, states), strict=True):
+    for look, detections in seen:
         sightings = {d.id: _sighting(d, look.time_s) for d in detections}
         before = included.get(look.sender, {})
         names = due(sightings, before)
@@ -136,7 +135,7 @@ def _new(
         if names or look.time_s - last_s.get(look.sender, -inf) >= LONGEST_S - ROUNDING_S:
             last_s[look.sender] = look.time_s
             cpms.append(Cpm(look, tuple(d for d in detections if d.id in names)))
-    return Stretch(tuple(cpms), included, last_s)
+    return Stretch(tuple(cpms), included, last_s, {})
 
 
 def _looks(scene: Scene, since_s: float, interval_s: float) -> list[Look]:

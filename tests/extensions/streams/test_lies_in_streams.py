@@ -104,7 +104,8 @@ def test_a_shuffled_stream_puts_what_is_there_at_its_place_there(pair: Dataset) 
         source = by_id[source_of(scene.id, senders)]
         assert source.id != scene.id
         objects: dict[tuple[str, float, str], Any] = {}
-        for sent in point.stream.received(pair.scenario, source):
+        [received] = point.stream.received(pair.scenario, [source])
+        for sent in received:
             age_s = round(source.state.time_s - sent.look.time_s, 2)
             objects |= {(d.id, age_s, f"v2v:{sent.sender}"): d for d in sent.objects}
         [graph] = shared_graphs(there, [(scene, senders)], by_id)

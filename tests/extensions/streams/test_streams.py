@@ -147,7 +147,8 @@ def test_what_was_heard_is_what_helpers_saw_carried_on(small: Dataset) -> None:
     graphs = AT_ONCE.graphs(scenario, as_sent(scenes, heard))
     for scene, graph in zip(scenes, graphs, strict=True):
         ego, objects = scene.state.ego, {}
-        for sent in AT_ONCE.received(small.scenario, scene):
+        [received] = AT_ONCE.received(small.scenario, [scene])
+        for sent in received:
             age_s = round(scene.state.time_s - sent.look.time_s, 2)
             objects |= {(f"v2v:{sent.sender}", d.id, age_s): d for d in sent.objects}
         for node in graph.nodes:
@@ -206,6 +207,19 @@ def test_a_lost_or_late_stream_is_none(small: Dataset) -> None:
     for stream in (Cpms(0.1, 0.0, replace(LOSSLESS, loss=1.0)), Cpms(0.1, KEPT_S + 1, LOSSLESS)):
         assert not any(stream.heard(small.scenario, scenes))
     assert all(AT_ONCE.heard(small.scenario, scenes))
+
+
+@pytest.mark.parametrize("text", ["6g:stream=cpm", "its-g5:density_per_km=600,stream=cpm"])
+def test_many_scenes_at_once_hear_what_each_hears_alone(small: Dataset, text: str) -> None:
+    """Of a dataset that is read anew for each, so that nothing is known of the others."""
+    stream, names = named_point(text).stream, small.courses()
+    assert isinstance(stream, Cpms)
+    together = stream.heard(small.scenario, replace(small, _scenes={}).scenes(names))
+    alone = []
+    for name in names[-20:]:
+        alone += stream.heard(small.scenario, replace(small, _scenes={}).scenes([name]))
+    assert together[-20:] == alone
+    assert len({str(each) for each in alone}) > 10
 
 
 def test_a_helper_tells_of_whom_the_ego_does_not_see(small: Dataset) -> None:
