@@ -11,7 +11,7 @@ from former import SCENARIO
 from msgspec.structs import replace
 from together import act_together
 
-from harness.world.perception.graph import scene_graph, truth_graph
+from harness.world.perception.graph import scene_graph, scene_graphs, sectors_in_sight, truth_graph
 from harness.world.perception.rays import RAYS, blocked_by, sweep
 from harness.world.perception.sensors import detect, detections
 from harness.world.scene_graph import Arrival, EgoArrival, Point, Sector
@@ -309,6 +309,17 @@ def test_a_reported_truck_hides_a_stretch_of_a_sector_and_is_named():
     sectors = {s.sector: s for s in scene_graph(SCENARIO, scene(truck), "v1").sectors}
     assert sectors["oncoming"].by == ("v5",)
     assert sectors["oncoming"].seen_share < 1.0
+
+
+def test_sectors_alone_are_those_of_the_graphs():
+    truck = other(-2.0, -20.0, heading=SOUTH, kind="truck", approach="oncoming")
+    hidden = other(-2.0, -30.0, heading=SOUTH, vehicle="v6", approach="oncoming")
+    states = [scene(truck, hidden), *(World.start(SCENARIO, seed).state() for seed in range(4))]
+    looks = [(state, v.id) for state in states for v in state.vehicles]
+    graphs = scene_graphs(SCENARIO, looks)
+    sectors = sectors_in_sight(SCENARIO, looks)
+    assert [tuple(some) for some in sectors] == [graph.sectors for graph in graphs]
+    assert len({sector.seen_share for some in sectors for sector in some}) > 5
 
 
 # Nothing hidden leaks.

@@ -43,7 +43,7 @@ from harness.extensions.streams.sending import (
 from harness.radio.channel import Channel, Draws, Physical
 from harness.radio.fading import NO_SEED, Trips
 from harness.radio.wrapped import broadcast
-from harness.world.perception.graph import listed_graphs, scene_graphs
+from harness.world.perception.graph import listed_graphs, sectors_in_sight
 from harness.world.perception.sensors import Detection
 from harness.world.perception.shared import (
     Report,
@@ -253,8 +253,8 @@ def _sectors(
         for n in places:
             last = held[n].last
             views.append((states[_key(held[n].scene, last)], last.sender))
-        for n, graph in zip(places, scene_graphs(seat, views), strict=True):
-            sectors[n] = graph.sectors
+        for n, in_sight in zip(places, sectors_in_sight(seat, views), strict=True):
+            sectors[n] = in_sight
     return sectors
 
 

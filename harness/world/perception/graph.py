@@ -9,7 +9,7 @@ from harness.core.arrays import Bools
 from harness.world.beacons import estimated, last_heard
 from harness.world.perception.conflicts import Encounter, Seat, conflicts, places, tenths
 from harness.world.perception.rays import Look, Surfaces, hidden, surfaces
-from harness.world.perception.sensors import Detection, among, reports
+from harness.world.perception.sensors import Detection, among, reported, reports
 from harness.world.road import Road
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import (
@@ -54,11 +54,32 @@ def scene_graphs(
     several looks it is faster than one call of `scene_graph` each.
     """
     graphs: list[SceneGraph] = []
-    for begin in range(0, len(looks), AT_ONCE):
-        some = looks[begin : begin + AT_ONCE]
-        viewers = [(state, state.vehicle(viewer_id)) for state, viewer_id in some]
+    for viewers in _at_once(looks):
         graphs += _perceived(scenario, viewers, left_out)
     return graphs
+
+
+def sectors_in_sight(
+    scenario: Scenario, looks: Sequence[tuple[WorldState, str]]
+) -> list[list[Sector]]:
+    """Return how much of each sector each look has in sight: what `scene_graphs` has of them.
+
+    A sector is a direction that danger can come from. A look is a state of `scenario` and the id of
+    the vehicle that looks in it.
+    """
+    sectors: list[list[Sector]] = []
+    for viewers in _at_once(looks):
+        around = surfaces(viewers)
+        solid = ~around.vehicle | among(around, reported(viewers, around, scenario.parameters))
+        sectors += _sectors(scenario.road(), around, solid)
+    return sectors
+
+
+def _at_once(looks: Sequence[tuple[WorldState, str]]) -> Iterator[list[Look]]:
+    """Yield the viewers of all looks, as many at a time as are fastest."""
+    for begin in range(0, len(looks), AT_ONCE):
+        some = looks[begin : begin + AT_ONCE]
+        yield [(state, state.vehicle(viewer_id)) for state, viewer_id in some]
 
 
 def truth_graph(scenario: Scenario, state: WorldState) -> SceneGraph:
@@ -109,8 +130,8 @@ def _perceived(
 ) -> list[SceneGraph]:
     """Return the scene graph of each viewer, as its sensors and the beacons that it has tell it."""
     around = surfaces(looks)
-    reported = reports(looks, around, scenario.parameters)
-    listed = {place: d for place, d in reported.items() if d.id not in left_out}
+    sensed_by_all = reports(looks, around, scenario.parameters)
+    listed = {place: d for place, d in sensed_by_all.items() if d.id not in left_out}
     detected: list[list[Detection]] = [[] for _ in looks]
     for (n, _), d in listed.items():
         detected[n].append(d)
