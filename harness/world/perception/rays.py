@@ -81,13 +81,19 @@ def outlines(states: Sequence[WorldState]) -> Outlines:
     vehicles = [
         (v.x_m, v.y_m, v.heading_rad, *SIZES_M[v.kind]) for s in once.values() for v in s.vehicles
     ]
-    boxes = [building.corners() for state in once.values() for building in state.buildings]
+    # the states of an episode share their buildings
+    walls = {id(state.buildings): state.buildings for state in once.values()}
+    boxes = [building.corners() for buildings in walls.values() for building in buildings]
     of_vehicles = rectangle(*np.ascontiguousarray(np.array(vehicles).reshape(-1, 5).T))
     corners_m = np.concatenate([of_vehicles, np.array(boxes).reshape(-1, 4, 2)])
-    begin, box, first = 0, len(vehicles), dict[int, tuple[int, int]]()
+    begin, box = 0, len(vehicles)
+    first, first_box = dict[int, tuple[int, int]](), dict[int, int]()
+    for wall, buildings in walls.items():
+        first_box[wall] = box
+        box += len(buildings)
     for key, state in once.items():
-        first[key] = begin, box
-        begin, box = begin + len(state.vehicles), box + len(state.buildings)
+        first[key] = begin, first_box[id(state.buildings)]
+        begin += len(state.vehicles)
     return Outlines(corners_m, first)
 
 
