@@ -184,9 +184,9 @@ def _fits(scenario: Scenario, start: Draft, seed: int, parameters: Parameters) -
         sees += [True] * len(LOOKOUTS) + [False] * len(blind)
         targets += [phantom.id] * (len(LOOKOUTS) + len(blind))
     around = surfaces(looks)
-    pairs = reported(looks, around, parameters)
+    sensed = around.by_viewer(reported(looks, around, parameters))
     return all(
-        ((n, ids.index(target)) in pairs) == is_lookout
+        sensed[n, ids.index(target)] == is_lookout
         for n, (ids, target, is_lookout) in enumerate(zip(around.ids, targets, sees, strict=True))
     )
 

@@ -70,7 +70,7 @@ def sectors_in_sight(
     sectors: list[list[Sector]] = []
     for viewers in _at_once(looks):
         around = surfaces(viewers)
-        solid = ~around.vehicle | among(around, reported(viewers, around, scenario.parameters))
+        solid = ~around.vehicle | reported(viewers, around, scenario.parameters)
         sectors += _sectors(scenario.road(), around, solid)
     return sectors
 

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Struct
 
 from harness.core import noise
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats
 from harness.world.ambient import Ambient, sun_rad
 from harness.world.parameters import Parameters
 from harness.world.perception.rays import Look, Surfaces, cast, rays_on, surfaces, turned
@@ -86,34 +86,43 @@ def reports(
     `surfaces(looks)`. A vehicle that is hit by too few rays or out of range is not reported. Under
     `parameters.perception` 1 it still hides what is behind it, under 2 it hides nothing.
     """
-    pairs, nearby = reported(looks, around, parameters), _nearby(looks)
-    seen = detections([(*looks[n], nearby[n][place]) for n, place in pairs], parameters.light)
-    return {pair: d for pair, d in zip(pairs, seen, strict=True) if d}
+    lines = _lines(_around(looks), parameters.light)
+    seen = _reported(lines, around, parameters)
+    pairs = zip(around.viewer[seen].tolist(), around.place[seen].tolist(), strict=True)
+    detected = _estimates(lines.take(seen[around.vehicle]))
+    return {pair: d for pair, d in zip(pairs, detected, strict=True) if d}
 
 
-def reported(looks: Sequence[Look], around: Surfaces, parameters: Parameters) -> Collection[Pair]:
-    """Return whom the sensors of several viewers report: the keys of what `reports` returns."""
-    nearby = _nearby(looks)
-    least = _least_rays(around, nearby)
-    is_sensed: dict[Pair, bool] = {}
+def reported(looks: Sequence[Look], around: Surfaces, parameters: Parameters) -> Bools:
+    """Return a mask of the n surfaces that are vehicles which viewers' sensors report, (n,).
 
-    def sensed(count: Ints) -> dict[Pair, None]:
-        """Return whom sensors report where so many rays end on each surface, (n,)."""
-        enough = around.by_viewer(np.where(around.vehicle, count, 0)) >= least
-        viewers, places = np.nonzero(enough)
-        pairs = list(zip(viewers.tolist(), places.tolist(), strict=True))
-        new = [pair for pair in pairs if pair not in is_sensed]
-        lines = [(*looks[n], nearby[n][place]) for n, place in new]
-        is_sensed.update(zip(new, _sensed(lines, parameters.light), strict=True))
-        return dict.fromkeys(pair for pair in pairs if is_sensed[pair])
+    A surface is the outline of a vehicle or building as a viewer sees it. The arguments are as
+    those of `reports`, which has these vehicles.
+    """
+    return _reported(_lines(_around(looks), parameters.light), around, parameters)
 
-    rays = cast(around, around.vehicle)
+
+def _around(looks: Sequence[Look]) -> list[Line]:
+    """Return the line to each vehicle around each viewer, in the order of their surfaces."""
+    lines = []
+    for state, viewer in looks:
+        lines += [(state, viewer, v) for v in state.vehicles if v.id != viewer.id]
+    return lines
+
+
+def _reported(lines: "_Lines", around: Surfaces, parameters: Parameters) -> Bools:
+    # rays from which each surface is reported; no number is enough for what is out of range
+    least = np.full(len(around.place), np.inf)
+    broad = np.array([target.kind in BROAD for *_, target in lines.pairs], dtype=bool)
+    of_kind = np.where(broad, LEAST_RAYS, LEAST_ON_NARROW)
+    least[around.vehicle] = np.where(lines.sensors.any(axis=0), of_kind, np.inf)
+    rays = cast(around, least < np.inf)
     before = np.ones(len(around.place), dtype=bool)
     count, first = rays_on(around, rays, before)
-    now = sensed(count)
+    now = count >= least
     if parameters.perception == 1:
         return now
-    solid = ~around.vehicle | among(around, now)
+    solid = ~around.vehicle | now
     # What is reported although all hide each other stays so. The other rays end on what is not
     # reported.
     passing = (first >= 0) & ~solid[first]
@@ -121,36 +130,15 @@ def reported(looks: Sequence[Look], around: Surfaces, parameters: Parameters) ->
     if not (~solid[rays.surface] & (rays.t < np.inf) & (rays.surface != first)).any():
         return now
     while True:
-        then = sensed(certain + rays_on(around, rays, solid)[0])
-        after = ~around.vehicle | among(around, then)
+        then = certain + rays_on(around, rays, solid)[0] >= least
+        after = ~around.vehicle | then
         if np.array_equal(after, solid):
             return then
         if np.array_equal(after, before):
             # Vehicles that run into each other may hide each other in turns: none of them is
             # reported.
-            return [pair for pair in then if pair in now]
+            return then & now
         before, solid, now = solid, after, then
-
-
-def _nearby(looks: Sequence[Look]) -> list[list[VehicleState]]:
-    """Return the vehicles around each viewer, in the order of its surfaces."""
-    nearby = []
-    for state, viewer in looks:
-        nearby.append([v for v in state.vehicles if v.id != viewer.id])
-    return nearby
-
-
-def _least_rays(around: Surfaces, nearby: Sequence[Sequence[VehicleState]]) -> Ints:
-    """Return the rays from which each viewer's surface is reported, (v, k), as `by_viewer` has it.
-
-    `nearby` are the vehicles around each viewer.
-    """
-    least = np.full(around.by_viewer(around.vehicle).shape, LEAST_RAYS)
-    for n, vehicles in enumerate(nearby):
-        for place, v in enumerate(vehicles):
-            if v.kind not in BROAD:
-                least[n, place] = LEAST_ON_NARROW
-    return least
 
 
 def among(around: Surfaces, pairs: Collection[tuple[int, int]]) -> Bools:
@@ -176,11 +164,23 @@ def _motion(vehicles: Sequence[VehicleState]) -> Floats:
 class _Lines(NamedTuple):
     """Hold what lies between n viewers and the vehicles that they look at, each (n,)."""
 
+    pairs: Sequence[Line]
     viewers: Floats  # x, y, heading and speed of the viewers, (4, n)
     vehicles: Floats  # the same of the vehicles
     distance_m: Floats
     bearing_rad: Floats  # of the line in the road's frame
     sensors: Bools  # whether camera, LiDAR and radar report the vehicle, (3, n)
+
+    def take(self, which: Bools) -> "_Lines":
+        """Return the lines of a mask, (n,)."""
+        return _Lines(
+            list(compress(self.pairs, which)),
+            self.viewers[:, which],
+            self.vehicles[:, which],
+            self.distance_m[which],
+            self.bearing_rad[which],
+            self.sensors[:, which],
+        )
 
 
 def _lines(pairs: Sequence[Line], ambient: Ambient) -> _Lines:
@@ -195,13 +195,7 @@ def _lines(pairs: Sequence[Line], ambient: Ambient) -> _Lines:
         camera &= ~_dazzled([state.episode_seed for state, *_ in pairs], bearing, ambient)
     lidar = distance <= LIDAR_RANGE_M
     radar = in_field & (distance <= RADAR_RANGE_M)
-    return _Lines(viewers, vehicles, distance, bearing, np.stack([camera, lidar, radar]))
-
-
-def _sensed(pairs: Sequence[Line], ambient: Ambient) -> list[bool]:
-    """Return whether any sensor of a viewer reports a vehicle, for each pair of `detections`."""
-    is_sensed: list[bool] = np.asarray(_lines(pairs, ambient).sensors.any(axis=0)).tolist()
-    return is_sensed
+    return _Lines(pairs, viewers, vehicles, distance, bearing, np.stack([camera, lidar, radar]))
 
 
 def detections(pairs: Sequence[Line], ambient: Ambient) -> list[Detection | None]:
@@ -210,11 +204,14 @@ def detections(pairs: Sequence[Line], ambient: Ambient) -> list[Detection | None
     Each of `pairs` is a state, a viewer, and a vehicle that the viewer has a line of sight to,
     which is not checked. `ambient` is the light and weather, which limit the camera.
     """
+    return _estimates(_lines(pairs, ambient))
+
+
+def _estimates(lines: _Lines) -> list[Detection | None]:
+    pairs, viewers, vehicles, distance, bearing, (_, lidar, radar) = lines
     if not pairs:
         return []
-    lines = _lines(pairs, ambient)
-    (from_x, from_y, from_heading, from_speed), (x, y, heading, speed) = lines[:2]
-    distance, bearing, (_, lidar, radar) = lines[2:]
+    (from_x, from_y, from_heading, from_speed), (x, y, heading, speed) = viewers, vehicles
     z = np.zeros((8, len(pairs)))
     sensed = np.flatnonzero(lines.sensors.any(axis=0)).tolist()
     places: dict[tuple[object, ...], list[int]] = {}  # several between two decisions
