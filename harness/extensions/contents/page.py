@@ -69,7 +69,7 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
             "episode. 95 % intervals are over episodes; a mean gives each family the same weight "
             f"and is about these families alone. Clear: p at most {LEVEL:g} by Holm's method for "
             "all comparisons of a model with intents.",
-            "Bits are of all requests and replies; they add no load to a radio. All that the ego "
+            "Bits are of all messages; they add no load to a radio. All that the ego "
             "knows was seen at the decision's start, so its age when the ego acts is the "
             "decision's latency. Frozen scenes let each action begin "
             f"{' or '.join(f'{1000 * s:g}' for s in lags_s)} ms after its decision, whatever it "
