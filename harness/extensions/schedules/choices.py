@@ -193,8 +193,8 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     Then what each set of helpers leads to cannot be computed apart, and the best choice is not
     known. It is so if the settings `point` have a fusion call (the model is asked again with the
     messages), a consensus rule (how messages are fused) with memory, another content of messages
-    than intents (probabilities of actions), or what changes messages. `helpers` and `actions` are
-    the numbers of helpers and of meta-actions.
+    than intents (probabilities of actions), what changes messages, or messages sent unasked.
+    `helpers` and `actions` are the numbers of helpers and of meta-actions.
     """
     name, consensus = printable(point.name), point.fusion.consensus
     if consensus == EGO_PROMPT or RULES[consensus].start((), helpers, actions).shape[-1]:
@@ -202,13 +202,11 @@ def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
             f"--condition {name}: consensus {consensus} is no function of who is heard now, so "
             "that the oracle would be none; give linear, or another without memory"
         )
-    changed = {
-        "content": point.ask.content != INTENT,
-        **{
-            part.__struct_fields__[0]: part.needs_all or part.question != PLAIN or part.elsewhere
-            for part in point.more
-        },
-    }
+    changed = {"content": point.ask.content != INTENT}
+    for part in point.more:
+        first_setting, *_ = part.__struct_fields__
+        of_answers = part.needs_all or part.question != PLAIN or part.elsewhere
+        changed[first_setting] = of_answers or part.unasked(point) is not None
     for setting in changed:
         if changed[setting]:
             raise UserError(f"--condition {name}: the oracle knows no {setting}; leave it out")

@@ -26,6 +26,7 @@ from harness.evaluate.requests import stream_sets
 from harness.evaluate.sharing import shared_graphs
 from harness.extensions.devices import profiles as devices
 from harness.extensions.devices.timer import Computer, transmit_watts
+from harness.extensions.schedules.choices import refuse
 from harness.extensions.streams import sending
 from harness.extensions.streams.cpm import KEPT_S, Cpms, aged
 from harness.extensions.streams.motion import moments
@@ -477,6 +478,12 @@ def test_congestion_control_thins_the_radio_and_the_stream() -> None:
 )  # fmt: skip
 def test_a_sweep_refuses_what_changes_nothing(text: str, setting: str, reason: str | None) -> None:
     assert named_point(text).idle(setting) == reason
+
+
+def test_schedules_are_not_compared_as_if_nothing_were_heard() -> None:
+    with pytest.raises(UserError, match=r"the oracle knows no stream; leave it out$"):
+        refuse(named_point("its-g5:stream=cpm"), 3, 3)
+    refuse(named_point("its-g5:congestion=reactive"), 3, 3)
 
 
 @pytest.mark.parametrize(
