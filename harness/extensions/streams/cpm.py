@@ -210,9 +210,11 @@ class Cpms:
     def _airtime_s(self, bits: Floats) -> Floats:
         """Return the time on air of n CPMs of these sizes, s, (n,); NaN where it is unknown."""
         assert self.channel is not None, "a stream is sent over a channel"
-        n, of_links = np.zeros(len(bits), dtype=int), np.zeros((len(bits), 0))
+        n = len(bits)
+        one = np.zeros(n, dtype=int)
         # no draw changes a time on air
-        draws = Draws(of_links[..., None], of_links, Trips(n, n, n, 1), np.zeros((len(bits), 1)))
+        link, jitter, waits = np.zeros((n, 0, 2)), np.zeros((n, 0)), np.zeros((n, 1))
+        draws = Draws(link, jitter, Trips(one, one, one, 1), waits)
         airtime_s = broadcast(self.channel, bits, draws).airtime_s
         return np.broadcast_to(airtime_s, bits.shape)
 
