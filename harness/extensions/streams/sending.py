@@ -10,6 +10,7 @@ from functools import lru_cache
 from itertools import chain
 from math import floor, inf
 from typing import Any, NamedTuple
+from weakref import ref
 
 from harness.core import noise
 from harness.dataset.load import Scene
@@ -23,7 +24,7 @@ from harness.world.state import WorldState
 NAME = "cpm"
 LEAD_S = 2.0  # how long streams run before an episode starts
 AT_ONCE = 32  # looks whose rays fit into the processor's cache
-SCENES_KEPT = 2048  # whose CPMs stay in memory, some 20 kB each
+SCENES_KEPT = 2048  # whose CPMs stay in memory, some 10 kB each
 ROUNDING_S = 1e-9
 
 
@@ -59,7 +60,8 @@ class Stretch(NamedTuple):
 
 Pair = tuple[Scene, Scene | None]  # a decision point, and the one before it
 NOTHING = Stretch((), {}, {}, {})
-_kept: deque[tuple[Scene, str]] = deque()  # scenes with a note of their stretch, the oldest first
+# scenes with a note of their stretch, the oldest first; a driven one lives as long as its episode
+_kept: deque[tuple[ref[Scene], str]] = deque()
 
 
 def stretch(scenario: Scenario, scene: Scene, interval_s: float) -> Stretch:
@@ -82,11 +84,13 @@ def stretches(scenario: Scenario, scenes: Sequence[Scene], interval_s: float) ->
         new = [each for each in generation if note not in each[0].notes]
         for (scene, _), sent in zip(new, _new(scenario, new, note, interval_s), strict=True):
             scene.notes[note] = sent
-            _kept.append((scene, note))
+            _kept.append((ref(scene), note))
     of_scenes = [scene.notes[note] for scene in scenes]
     while len(_kept) > SCENES_KEPT:
-        oldest, oldest_note = _kept.popleft()
-        del oldest.notes[oldest_note]
+        kept, oldest_note = _kept.popleft()
+        oldest = kept()
+        if oldest is not None:
+            del oldest.notes[oldest_note]
     return of_scenes
 
 
