@@ -14,12 +14,14 @@ function highlighted(raw, spans) {
 const distribution = (actions, p) => (p ? actions.map((a, n) => `${a} ${number(p[n], 2)}`).join(", ") : "none");
 
 const sender = (answer) => answer.viewer.replace(/~\w+/, "");
-// Who answered, and whom it had heard: "v1 + v2 (objects) + v3 blind (objects), fusion".
+// Who answered, and whom it had heard: "v1 + v2 (objects) + v3 blind (objects), fusion". Before it asks anybody the ego
+// may have heard what is sent unasked: "v1 + v2 (stream), ego".
 const heard = (key) =>
-  key.replaceAll("+", " + ").replace(/~(\w+)/g, " $1").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ").replace(/^plan:.*/, "plan")})`);
+  key.replaceAll("+", " + ").replace(/~(\w+)/g, " $1").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ").replace(/^(plan|stream):.*/, "$1")})`);
+const roleWord = ({ role, viewer }) => (role !== "merge" ? role : viewer.includes("!stream:") ? "ego" : "fusion");
 const who = (answer) =>
   answer.viewer.includes("~") && answer.role !== "merge" ? `${sender(answer)}, ${answer.role} helper`
-    : `${heard(answer.viewer)}, ${answer.role === "merge" ? "fusion" : answer.role}`;
+    : `${heard(answer.viewer)}, ${roleWord(answer)}`;
 
 const signed = (value) => `${value < 0 ? "−" : "+"}${number(Math.abs(value), 2)}`;
 
