@@ -17,7 +17,7 @@ const sender = (answer) => answer.viewer.replace(/~\w+/, "");
 // Who answered, and whom it had heard: "v1 + v2 (objects) + v3 blind (objects), fusion". Before it asks anybody the ego
 // may have heard what is sent unasked: "v1 + v2 (stream), ego".
 const heard = (key) =>
-  key.replaceAll("+", " + ").replace(/~(\w+)/g, " $1").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ").replace(/^(plan|stream):.*/, "$1")})`);
+  key.replaceAll("+", " + ").replace(/~(\w+)/g, " $1").replace(/!([^ ]+)/g, (_, what) => ` (${what.replaceAll("&", ", ").replace(/^(plan:.*|stream:[^,]*)/, (part) => part.split(":")[0])})`);
 const roleWord = ({ role, viewer }) => (role !== "merge" ? role : viewer.includes("!stream:") ? "ego" : "fusion");
 const who = (answer) =>
   answer.viewer.includes("~") && answer.role !== "merge" ? `${sender(answer)}, ${answer.role} helper`
