@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Collection, Mapping
+from inspect import getattr_static
 
 from harness.coordination.contents import NAME
 from harness.coordination.parts import PACKAGES_PARTS, Part, Question
@@ -11,6 +12,8 @@ from harness.core.plugins import is_ours, package_of, texts
 from harness.core.strangers import aside, worded
 
 GROUP = "swarmdrive.parts"
+# hooks whose results nothing checks
+OF_PARTS_THAT_SHIP = ("again", "unasked", "unasked_of")
 
 
 def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
@@ -31,8 +34,11 @@ def added_parts(taken: Collection[str]) -> Mapping[str, type[Part]]:
                 kind = entry.load()
                 _check(what, kind, settings)
                 if not is_ours(entry):
-                    if kind.again is not Part.again:
-                        raise ValueError("it has `again`, which only parts that ship may have")
+                    for hook in OF_PARTS_THAT_SHIP:
+                        if getattr_static(kind, hook) is not getattr_static(Part, hook):
+                            raise ValueError(
+                                f"it has `{hook}`, which only parts that ship may have"
+                            )
                     PACKAGES_PARTS[kind] = what
                 kind()  # its defaults are allowed
         except UserError as error:

@@ -13,6 +13,7 @@ from harness.core.arrays import Ints, any_of
 from harness.dataset.load import Scene
 from harness.evaluate.agreement import broken_words
 from harness.evaluate.walk import Decided
+from harness.radio import wrapped
 from harness.runs.decisions import Decisions, Labels, by_action, by_message
 
 
@@ -23,7 +24,7 @@ def busy_ratio(point: OperatingPoint) -> float:
     `point` is the condition, its settings of the radio, of asking helpers and of fusing their
     messages. NaN if the channel model does not know it.
     """
-    return point.physical.busy_ratio() if point.physical else float("nan")
+    return wrapped.busy_ratio(point.physical) if point.physical else float("nan")
 
 
 def columns(decided: Decided[Any]) -> dict[str, Any]:

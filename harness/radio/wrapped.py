@@ -1,11 +1,13 @@
 """Channels that wrap another one and change part of its behaviour."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from harness.core import strangers
 from harness.core.arrays import ROUNDING, Floats, Ints, check_shape, numbers, read_only
+from harness.core.errors import printable
 from harness.radio.channel import (
     REQUEST,
     Broadcast,
@@ -129,6 +131,56 @@ def heard_s(channel: Channel, request: Broadcast, links: Links, draws: Draws) ->
         times_s = model.latencies_s(read_only(links.where), read_only(draws), REQUEST)
         return numbers("latencies", times_s, links.where.sight.shape)
     return np.asarray(request.heard_s)[..., None]
+
+
+def link_loss(
+    channel: Physical, site: Site, shadow: Callable[[float], Floats], bits: Floats | float
+) -> Floats:
+    """Return the probability that one transmission is lost on each of H links, `(..., H)`.
+
+    The model of another package gets arrays that it cannot write to, and its results are checked.
+    Raises UserError if it fails, or if a loss is no probability.
+
+    Args:
+        channel: the channel.
+        site: the positions of both ends of each link; those of a missing helper are NaN.
+        shadow: returns each link's shadowing, `(..., H)`, given the distance in m at which its
+            correlation is 1/e (`Physical.loss`).
+        bits: the transmission's size, one for all or `(..., H)`.
+    """
+    if is_ours(channel):
+        return channel.loss(site, shadow(channel.decorrelation_m), bits)
+    with strangers.worded(label(channel)):
+        distance_m = float(channel.decorrelation_m)
+        if not distance_m > 0.0:
+            raise ValueError(f"decorrelation_m of {distance_m:g}")
+        shadows = shadow(distance_m)
+        given = channel.loss(read_only(site), read_only(shadows), read_only(bits))
+        losses = numbers("losses", given, shadows.shape, (*shadows.shape[:-1], 1))
+        is_there = ~np.isnan(site.xy_m[..., 1:, 0])
+        if not np.all(((losses >= 0.0) & (losses <= 1.0)) | ~is_there):
+            raise ValueError("a loss that is no probability")
+    return losses
+
+
+def busy_ratio(channel: Physical) -> float:
+    """Return the share of time, 0 to 1, that a channel is busy; NaN where its model does not know.
+
+    Raises UserError if the model of another package fails, or returns something else.
+    """
+    if is_ours(channel):
+        return channel.busy_ratio()
+    with strangers.worded(label(channel)):
+        ratio = float(channel.busy_ratio())
+        if not 0.0 <= ratio <= 1.0 and not np.isnan(ratio):
+            raise ValueError(f"a busy ratio of {ratio:g}")
+    return ratio
+
+
+def label(channel: Channel) -> str:
+    """Return what messages call a channel of a package, by its class and module."""
+    kind = type(innermost(channel))
+    return f"channel {printable(kind.__name__)} of {printable(kind.__module__)}"
 
 
 @dataclass(frozen=True)

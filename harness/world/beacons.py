@@ -33,7 +33,7 @@ changes what anybody knows.
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -43,6 +43,7 @@ from msgspec.structs import replace
 from harness.core import noise
 from harness.core.arrays import Floats
 from harness.radio.fading import Trips
+from harness.radio.wrapped import link_loss
 from harness.world.parameters import Parameters, beacon_radio
 from harness.world.sight_lines import site
 from harness.world.state import Beacon, VehicleState, WorldState
@@ -344,9 +345,7 @@ def losses(
             replace(v, x_m=x, y_m=y, heading_rad=heading) for v, (x, y, heading, _) in there
         )
         links = site([(replace(state, vehicles=vehicles), radios)])
-        return np.asarray(
-            radio.loss(links, trips.shadow(links.xy_m, radio.decorrelation_m), BITS)[0]
-        )
+        return np.asarray(link_loss(radio, links, partial(trips.shadow, links.xy_m), BITS)[0])
 
     return at
 

@@ -754,6 +754,14 @@ BROKEN_PARTS = {
     f"{PARTS}controls = {{'a': 5}}\nODD = Own": "controls holds what is no text",
     f"{PARTS}usual = {{5: 'a'}}\nODD = Own": "usual holds what is no text",
     f"{PARTS}questions = ('zork',)\nODD = Own": "questions hold what is no Question",
+    **{
+        f"{PARTS}behind = 'tau_nats'\n    {hook}\nODD = Own": f"`{name}`, which only parts that ship"
+        for name, hook in {
+            "again": "def again(self, *given): return given[1:3]",
+            "unasked": "def unasked(self, point): return 3",
+            "unasked_of": "unasked_of = classmethod(lambda cls, text: 3)",
+        }.items()
+    },
     "ODD = 1 / 0": "part odd of package by-hand fails (ZeroDivisionError: division by zero at",
 }
 

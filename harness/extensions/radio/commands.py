@@ -49,6 +49,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     from harness.radio.channel import Physical
     from harness.radio.limits import outside
     from harness.radio.profiles import CHANNELS
+    from harness.radio.wrapped import busy_ratio
 
     profile_name, channel = channel_of(name)
     profile, settings = CHANNELS.profile(profile_name), asdict(channel)
@@ -57,7 +58,7 @@ def show(name: str = Name, as_json: options.Json = False) -> None:
     latencies, busy = latencies_ms(channel, DISTANCES_M), None
     if isinstance(channel, Physical):
         curves = {sight: curve.tolist() for sight, curve in by_sight(channel, DISTANCES_M).items()}
-        busy = number_or_none(channel.busy_ratio())
+        busy = number_or_none(busy_ratio(channel))
     if as_json:
         about = asdict(profile)
         del about["parameters"]

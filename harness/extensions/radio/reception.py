@@ -5,6 +5,7 @@ and others' curves.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from harness.extensions.radio.transceiver import Transceiver
 from harness.radio.channel import CLEAR, Channel, Draws, Links, Physical, Site
 from harness.radio.constant import density_coupled_loss
 from harness.radio.fading import Trips
-from harness.radio.wrapped import heard_s
+from harness.radio.wrapped import busy_ratio, heard_s, link_loss
 
 DISTANCES_M = (10, 20, 50, 100, 150, 200, 300, 400, 500)
 VEHICLES = (2, 4, 8, 16, 32, 64, 128)
@@ -155,9 +156,7 @@ def gaps(channel: Transceiver, distances_m: Sequence[float], n: int, seed: int =
         )
         none = np.zeros((n, PACKETS, 1))
         site = Site(xy_m, np.full(none.shape, CLEAR), none, np.full((*none.shape, 2), np.nan))
-        loss = channel.loss(site, trips.shadow(xy_m, channel.decorrelation_m), channel.packet_bits)[
-            ..., 0
-        ]
+        loss = link_loss(channel, site, partial(trips.shadow, xy_m), channel.packet_bits)[..., 0]
         trip, packet = np.nonzero((uniforms >= loss) & (PACKETS * share > 10))
         same = np.diff(trip) == 0
         waits_s, trip = np.diff(packet)[same] / channel.rate_hz, trip[1:][same]
@@ -291,7 +290,7 @@ def check(channel: Physical, n: int, files: Sequence[Path], where: str) -> Check
     curves = [compared(channel, curve, where) for file in files for curve in curves_of(file)]
     return Check(
         n,
-        number_or_none(channel.busy_ratio()),
+        number_or_none(busy_ratio(channel)),
         gaps(channel, DISTANCES_M, n // 10)
         if isinstance(channel, Transceiver) and channel.rate_hz
         else [],

@@ -12,13 +12,21 @@ counts as large as a request: a distribution over three actions is about 50 byte
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from harness.core.arrays import Floats
-from harness.radio.channel import Antenna, ByLink, Delivery, Draws, Links, Physical, Site
+from harness.radio.channel import Antenna, ByLink, Delivery, Draws, Links, Physical
 from harness.radio.consulted import Consulted
-from harness.radio.wrapped import Wrapped, broadcast, delivered, heard_s, innermost
+from harness.radio.wrapped import (
+    Wrapped,
+    broadcast,
+    delivered,
+    heard_s,
+    innermost,
+    link_loss,
+)
 
 EGO, HELPERS = slice(0, 1), slice(1, None)  # a unit's link to the ego, and those to the helpers
 
@@ -44,8 +52,9 @@ class Relay(Wrapped):
         repetition if there is one.
         """
         up, delay_s, loss, airtime_s = delivered(self.channel, links, draws)
+        shadow = partial(draws.shadow, links.where.xy_m)
         has_request = draws.packet[..., 0] >= link_loss(
-            self.channel, links.where, draws, links.request_bits
+            self.channel, links.where, shadow, links.request_bits
         )
         at_unit = links.where.antennas[self.unit]
         there = delivered(
@@ -56,10 +65,10 @@ class Relay(Wrapped):
         heard = there.up & links.asked & has_request
         copies = draws.of(".roadside-ego")
         copy = broadcast(self.channel, links.payload_bits, replace(copies, given=copies.packet))
-        to_ego = replace(links, site=at_unit.select(EGO))
+        ego_site = at_unit.select(EGO)
+        to_ego, shadow = replace(links, site=ego_site), partial(copies.shadow, ego_site.xy_m)
         copied = heard & (
-            copies.packet[..., 1]
-            >= link_loss(self.channel, at_unit.select(EGO), copies, links.payload_bits)
+            copies.packet[..., 1] >= link_loss(self.channel, ego_site, shadow, links.payload_bits)
         )
         if isinstance(innermost(self.channel), ByLink):
             at_unit_s, copy_s = there.delay_s, heard_s(self.channel, copy, to_ego, copies)
@@ -111,7 +120,8 @@ def by_unit(
     request_draw, policy_draw = np.moveaxis(one_link.packet[..., 0, :], -1, 0)
 
     def lost(size_bits: float) -> Floats:
-        return link_loss(channel, ego_link.where, to_ego, size_bits)[..., 0]
+        shadow = partial(to_ego.shadow, ego_link.where.xy_m)
+        return link_loss(channel, ego_link.where, shadow, size_bits)[..., 0]
 
     wanted = np.any(links.asked, axis=-1)
     to_unit = broadcast(channel, 2 * bits, draws)
@@ -144,13 +154,3 @@ def by_unit(
         policy_bits=bits * sent,
         airtime_s=airtime_s + np.sum(np.where(is_asked, replies.airtime_s, 0.0), axis=-1),
     )
-
-
-def link_loss(channel: Physical, site: Site, draws: Draws, bits: Floats | float) -> Floats:
-    """Return the probability that one transmission is lost on each of H links, `(..., H)`.
-
-    A link is that of two ends, such as the ego and a helper. `site` has their positions, `draws`
-    the random numbers of which each link's shadowing (change of power by what stands around) is
-    made, and `bits` is the transmission's size, one for all or `(..., H)`.
-    """
-    return channel.loss(site, draws.shadow(site.xy_m, channel.decorrelation_m), bits)

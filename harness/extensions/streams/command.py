@@ -80,11 +80,14 @@ def _plain(result: "Settled") -> dict[str, Any]:
 
 
 def _channel_of(text: str) -> "tuple[str, Channel]":
-    """Return a radio's name and its channel, given how `--condition` names it, such as `mode4`.
+    """Return a radio's name and its channel, which nothing controls.
+
+    `text` is how `--condition` names it, such as `mode4`.
 
     Raises UserError if nothing has the name, or what has it has no channel.
     """
     from harness.coordination.named_points import named_point
+    from harness.extensions.streams.congestion import NONE
     from harness.radio.wrapped import innermost
 
     point = named_point(text)
@@ -92,4 +95,4 @@ def _channel_of(text: str) -> "tuple[str, Channel]":
         raise UserError(
             f"{printable(text)} has no channel; `harness radio list` shows those there are"
         )
-    return point.radio.profile, innermost(point.channel)
+    return point.radio.profile, innermost(point.changed(congestion=NONE).channel)

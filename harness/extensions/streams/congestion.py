@@ -34,6 +34,8 @@ from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 from harness.core.arrays import Floats
 from harness.core.config import settable
 from harness.core.errors import UserError, printable, unknown
+from harness.core.strangers import worded
+from harness.radio import wrapped
 from harness.radio.channel import Channel, Physical
 
 NONE, REACTIVE, ADAPTIVE = "none", "reactive", "adaptive"
@@ -239,7 +241,7 @@ def settled(channel: Channel, rule: str, name: str) -> Settled:
         )
     if not channel.rate_hz:
         raise UserError(f"{printable(name)}: nobody sends at rate_hz = 0; give a larger one")
-    airtime_s = float(channel.message_s(channel.packet_bits))
+    airtime_s = _airtime_s(channel)
     if rule == NONE:
         phases: tuple[Phase, ...] = (_phase(name, channel, 0.0),)
     elif rule == REACTIVE:
@@ -288,13 +290,22 @@ def _phase(name: str, channel: Loaded, allowed_s: float, state: str = "") -> Pha
     """
     sent_s = max(allowed_s, 1 / channel.rate_hz)
     thinned = replace(cast("Any", channel), rate_hz=1 / sent_s)
-    busy_ratio = float(thinned.busy_ratio())
+    busy_ratio = wrapped.busy_ratio(thinned)
     if not 0 <= busy_ratio <= 1:
         raise UserError(
             f"{printable(name)}: its busy ratio is {busy_ratio:g}, so nobody can control it; "
             "give a channel that knows it, 0 to 1, such as its-g5"
         )
     return Phase(state, allowed_s, sent_s, busy_ratio)
+
+
+def _airtime_s(channel: Loaded) -> float:
+    """Return the time on air of a packet, s. Raises UserError if a package's channel has none."""
+    with worded(wrapped.label(channel), built_in=wrapped.is_ours(channel)):
+        airtime_s = float(channel.message_s(channel.packet_bits))
+        if not 0.0 < airtime_s < math.inf:
+            raise ValueError(f"a time on air of {airtime_s:g} s")
+    return airtime_s
 
 
 def _correction(busy_ratio: float) -> float:

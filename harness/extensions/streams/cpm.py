@@ -27,6 +27,7 @@ from harness.core import noise
 from harness.core.arrays import Floats
 from harness.core.errors import UserError, printable
 from harness.core.files import canonical_bytes
+from harness.core.strangers import worded
 from harness.dataset.load import Scene, by_seat
 from harness.extensions.streams.inclusion import LONGEST_S, SHORTEST_S
 from harness.extensions.streams.motion import moments
@@ -42,7 +43,7 @@ from harness.extensions.streams.sending import (
 )
 from harness.radio.channel import Channel, Draws, Physical
 from harness.radio.fading import NO_SEED, Trips
-from harness.radio.wrapped import broadcast
+from harness.radio.wrapped import broadcast, is_ours, label, link_loss
 from harness.world.perception.graph import listed_graphs, sectors_in_sight
 from harness.world.perception.sensors import Detection
 from harness.world.perception.shared import (
@@ -167,10 +168,12 @@ class Cpms:
         place, xy_m[:, :1] = np.array(places)[:, None], sites.xy_m[:, :1]
         np.put_along_axis(xy_m, 1 + place[..., None], sites.xy_m[:, 1:], axis=1)
         trips = Trips(np.full(n, NO_SEED), seeds, np.zeros(n, dtype=int), 1)
-        shadows = trips.shadow(xy_m, self.channel.decorrelation_m)
-        shadow = np.take_along_axis(shadows, place, axis=1)
-        loss = self.channel.loss(sites, shadow, bits)
-        return np.broadcast_to(loss, shadow.shape)[:, 0]
+
+        def shadow(decorrelation_m: float) -> Floats:
+            return np.take_along_axis(trips.shadow(xy_m, decorrelation_m), place, axis=1)
+
+        loss = link_loss(self.channel, sites, shadow, bits)
+        return np.broadcast_to(loss, (n, 1))[:, 0]
 
     def bits(self, cpms: Sequence[Cpm]) -> Floats:
         """Return the size of n CPMs in bits, in this stream's encoding, (n,)."""
@@ -215,7 +218,8 @@ class Cpms:
         # no draw changes a time on air
         link, jitter, waits = np.zeros((n, 0, 2)), np.zeros((n, 0)), np.zeros((n, 1))
         draws = Draws(link, jitter, Trips(one, one, one, 1), waits)
-        airtime_s = broadcast(self.channel, bits, draws).airtime_s
+        with worded(label(self.channel), built_in=is_ours(self.channel)):
+            airtime_s = broadcast(self.channel, bits, draws).airtime_s
         return np.broadcast_to(airtime_s, bits.shape)
 
     def graphs(self, scenario: Scenario, heard: Sequence[Hearing]) -> list[SceneGraph]:

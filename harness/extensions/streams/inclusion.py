@@ -70,9 +70,10 @@ def interval_s(allowed_s: float) -> float:
     """Return the seconds from one CPM to the next, given how soon a station may send again.
 
     `allowed_s` is by congestion control, which makes a station send less where the channel is busy.
-    The result is within the bounds of the standard (T_GenCpm between T_GenCpmMin and T_GenCpmMax).
+    The result is within the bounds of the standard (T_GenCpm between T_GenCpmMin and T_GenCpmMax),
+    in whole microseconds, as keys of answers have it.
     """
-    return min(max(allowed_s, SHORTEST_S), LONGEST_S)
+    return round(min(max(allowed_s, SHORTEST_S), LONGEST_S), 6)
 
 
 def interval_of_rate(rate_hz: float) -> float:

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 from msgspec import Meta
 
 from harness.coordination.parts import Part, RunFacts, Text, wrong
-from harness.core.config import Seconds
 from harness.core.errors import unknown
 from harness.extensions.streams.congestion import NONE, RULES, Settled, settled
-from harness.extensions.streams.cpm import Cpms, heard_of
+from harness.extensions.streams.cpm import KEPT_S, Cpms, heard_of
 from harness.extensions.streams.inclusion import LONGEST_S, SHORTEST_S, interval_s
 from harness.extensions.streams.sending import NAME
 from harness.radio.channel import Channel, Physical
@@ -26,6 +25,16 @@ Interval = Annotated[
         ge=SHORTEST_S,
         le=LONGEST_S,
         description=f"seconds from {SHORTEST_S:g} to {LONGEST_S:g} (ETSI TS 103 324)",
+    ),
+]
+
+
+Delay = Annotated[
+    float,
+    Meta(
+        ge=0,
+        lt=KEPT_S,
+        description=f"seconds from 0 to below {KEPT_S:g}, at which reports are dropped",
     ),
 ]
 
@@ -48,7 +57,7 @@ class Streams(Part, frozen=True, kw_only=True):
     # seconds between two looks of a helper, and the least between two of its messages
     stream_interval_s: Interval = 0.1
     # seconds from a look to the ego's having its message, declared: sensors' tracking and access
-    stream_delay_s: Seconds = 0.05
+    stream_delay_s: Delay = 0.05
     # rule by which all vehicles on the radio send less where it is busy, the background's too:
     # `reactive` or `adaptive` (ETSI TS 102 687), or `none`
     congestion: Text = NONE

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from weakref import ref
 
 from harness.core import noise
+from harness.core.errors import UserError, printable
 from harness.dataset.load import Scene
 from harness.extensions.streams.inclusion import LONGEST_S, Sighting, due
 from harness.extensions.streams.motion import moments
@@ -77,9 +78,10 @@ def stretches(scenario: Scenario, scenes: Sequence[Scene], interval_s: float) ->
     send from LEAD_S before on.
     """
     note = f"{NAME}:{interval_s:g}"
-    generations = [_lacking(note, scenes)]
+    generations = [_lacking(scenario, note, scenes)]
     while generations[-1]:
-        generations.append(_lacking(note, [before for _, before in generations[-1]]))
+        earlier = [before for _, before in generations[-1]]
+        generations.append(_lacking(scenario, note, earlier))
     for generation in reversed(generations):
         new = [each for each in generation if note not in each[0].notes]
         for (scene, _), sent in zip(new, _new(scenario, new, note, interval_s), strict=True):
@@ -94,13 +96,33 @@ def stretches(scenario: Scenario, scenes: Sequence[Scene], interval_s: float) ->
     return of_scenes
 
 
-def _lacking(note: str, scenes: Iterable[Scene | None]) -> list[Pair]:
+def _lacking(scenario: Scenario, note: str, scenes: Iterable[Scene | None]) -> list[Pair]:
     """Return the scenes that lack a note, each once and with the one before it."""
     lacking: dict[int, Scene] = {}
     for scene in scenes:
         if scene is not None and note not in scene.notes:
             lacking[id(scene)] = scene
-    return [(scene, scene.before()) for scene in lacking.values()]
+    return [(scene, _checked(scenario, scene, scene.before())) for scene in lacking.values()]
+
+
+def _checked(scenario: Scenario, scene: Scene, before: Scene | None) -> Scene | None:
+    """Return the scene before another, of which a stranger's dataset may say anything.
+
+    Raises UserError unless both are of one ego, at times that follow each other in an episode.
+    """
+    now_s, last_s = scene.state.time_s, scenario.parameters.time_limit_s
+    since_s = 0.0 if before is None else before.state.time_s
+    if not 0.0 <= since_s <= now_s <= last_s or (before and since_s == now_s):
+        raise UserError(
+            f"scene {printable(scene.id)} is {now_s:g} s after its episode's start, and the one "
+            f"before it {since_s:g} s, of {last_s:g} s at most; build the dataset again"
+        )
+    if before and before.state.ego.id != scene.state.ego.id:
+        raise UserError(
+            f"scene {printable(scene.id)} has another ego than the one before it "
+            f"({printable(before.id)}); build the dataset again"
+        )
+    return before
 
 
 def most_looks(scenario: Scenario, interval_s: float) -> int:
@@ -113,8 +135,7 @@ def _new(scenario: Scenario, pairs: Sequence[Pair], note: str, interval_s: float
     looks: list[list[Look]] = []
     states: list[WorldState] = []
     for scene, before in pairs:
-        since_s = scene.state.time_s - LEAD_S if before is None else before.state.time_s
-        looks.append(_looks(scene, since_s, interval_s))
+        looks.append(_looks(scene, before, interval_s))
         states += moments(scene, [look.time_s for look in looks[-1]])
     detections = iter(_detections(scenario, list(chain.from_iterable(looks)), states))
     new = []
@@ -142,10 +163,17 @@ def _sent(earlier: Stretch, seen: Sequence[tuple[Look, Sequence[Detection]]]) ->
     return Stretch(tuple(cpms), included, last_s, {})
 
 
-def _looks(scene: Scene, since_s: float, interval_s: float) -> list[Look]:
-    """Return the helpers' looks after a time and up to a scene, by time."""
+def _looks(scene: Scene, before: Scene | None, interval_s: float) -> list[Look]:
+    """Return the helpers' looks up to a scene since the one before it, by time.
+
+    A helper that was not there yet has no known way to the scene, and does not look.
+    """
+    helpers, since_s = scene.state.helpers, scene.state.time_s - LEAD_S
+    if before is not None:
+        ids, since_s = {v.id for v in before.state.vehicles}, before.state.time_s
+        helpers = tuple(helper for helper in helpers if helper.id in ids)
     looks = []
-    for helper in scene.state.helpers:
+    for helper in helpers:
         begin_s = phase(scene.state.episode_seed, helper.id) * interval_s - LEAD_S
         first = max(floor((since_s - begin_s) / interval_s + ROUNDING_S) + 1, 0)
         last = floor((scene.state.time_s - begin_s) / interval_s + ROUNDING_S)
