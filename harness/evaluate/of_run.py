@@ -53,6 +53,15 @@ def card_here(card: Card) -> Card:
     return cards.load(card.name) if card.engine == DRIVER else card
 
 
+def sees_all(card: Card) -> bool:
+    """Return whether a run's model sees what no vehicle can see, whatever its card says of that.
+
+    A rule does so if the one here does, and another model only if its engine can.
+    """
+    is_privileged = card_here(card).privileged
+    return is_privileged and "privileged" in registration(card.engine).card_keys
+
+
 def points_of(run: Run) -> dict[str, OperatingPoint]:
     """Return the settings of a run's conditions, each an operating point, by condition name.
 

@@ -12,7 +12,7 @@ from msgspec.structs import astuple
 
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
-from harness.backends.registry import open_backend, registration
+from harness.backends.registry import open_backend
 from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
 from harness.core.errors import Unanswered, UserError, in_range, printable
@@ -31,6 +31,7 @@ from harness.evaluate.of_run import (
     model_of,
     points_of,
     records_otherwise,
+    sees_all,
     spec_of,
 )
 from harness.evaluate.run import evaluate
@@ -317,9 +318,7 @@ def _of_agents(run: Run) -> Iterator[str]:
     manifest = run.manifest
     models = [model_of(run, record) for record in (manifest.agent(0), *manifest.helpers)]
     for card in models:
-        may_see_all = "privileged" in registration(card.engine).card_keys
-        sees_all = card_here(card).privileged if card.engine == DRIVER else card.privileged
-        if card.privileged != (sees_all and may_see_all):
+        if card.privileged != sees_all(card):
             yield f"run.json says of {printable(card.name)} that it sees other than it does"
         cost = (manifest.cost or {}).get(card.name)
         if cost and card.price:

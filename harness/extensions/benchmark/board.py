@@ -10,6 +10,7 @@ from markupsafe import Markup
 from harness.backends.registry import reads_prompts
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
+from harness.evaluate.of_run import model_of, sees_all
 from harness.extensions.benchmark.edition import Edition
 from harness.extensions.benchmark.rescore import Rescored
 from harness.report.document import Section, Table, document, forest, reach
@@ -102,7 +103,8 @@ def _apart(board: Sequence[Line]) -> list[Line]:
 
 def _privileged(suite: SuiteRun) -> bool:
     """Return whether an entry sees what no vehicle can see."""
-    return bool(suite.manifest.model.get("privileged"))
+    run = next(iter(suite.runs.values()))
+    return sees_all(model_of(run, run.manifest.agent(0)))
 
 
 def _value(score: Score | None) -> float:

@@ -268,7 +268,7 @@ def board(
     """Rank files of results on a page, each computed again.
 
     Entries share a rank where the layouts do not tell them apart. The page works offline.
-    Exit code 1 means that a file was left out.
+    Exit code 1 means that a file was left out, and 2 that all were.
     """
     from harness.extensions.benchmark import board as boards
     from harness.extensions.benchmark.rescore import Here
@@ -288,6 +288,8 @@ def board(
             except UserError as error:
                 typer.echo(f"harness: left out: {error}", err=True)
                 left_out.append(str(error))
+        if not entries:
+            raise typer.Exit(2)
         lines = boards.lines(entries)
         page = boards.write(lines, left_out, out)
         if as_json:

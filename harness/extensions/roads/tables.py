@@ -263,16 +263,22 @@ def _scene(recording: Recording, name: str) -> Scene:
     tracks = recording.rows(TRACKS, name)
     lanes = recording.rows(LANES, name)
     houses = recording.rows(BUILDINGS, name)
-    scene = Scene(
-        name,
-        facts.file,
-        facts.sha256,
-        facts.lights,
-        _tracks_of(tracks),
-        {lane.id: lane for lane in _lanes_of(lanes)},
-        tuple(House(str(row["id"]), _line(row)) for row in houses.to_pylist()),
-    )
-    checked(scene)
+    try:
+        scene = Scene(
+            name,
+            facts.file,
+            facts.sha256,
+            facts.lights,
+            _tracks_of(tracks),
+            {lane.id: lane for lane in _lanes_of(lanes)},
+            tuple(House(str(row["id"]), _line(row)) for row in houses.to_pylist()),
+        )
+        checked(scene)
+    except UserError as error:
+        raise UserError(
+            f"recording {printable(recording.folder)}: {error}; make it again: "
+            "`harness dataset import`"
+        ) from None
     for key, given in _computed_facts(scene).items():
         claim = getattr(facts, key)
         if claim != given:

@@ -42,6 +42,7 @@ from harness.extensions.streams.sending import (
     stretches,
 )
 from harness.radio.channel import Channel, Draws, Physical
+from harness.radio.constant import Radio
 from harness.radio.fading import NO_SEED, Trips
 from harness.radio.wrapped import broadcast, is_ours, label, link_loss
 from harness.world.perception.graph import listed_graphs, sectors_in_sight
@@ -154,7 +155,7 @@ class Cpms:
         """Return the probability that each CPM is lost on its way to the ego, (n,)."""
         n = sum(len(each.cpms) for _, each in sent)
         if not n or not isinstance(self.channel, Physical):
-            return np.full(n, getattr(self.channel, "loss", 0.0))
+            return np.full(n, _declared_loss(self.channel))
         links: list[tuple[WorldState, Cpm, WorldState]] = []  # in a scene, and when it was sent
         for scene, each in sent:
             states = moments(scene, [cpm.look.time_s for cpm in each.cpms])
@@ -238,6 +239,16 @@ class Cpms:
                 seen.append(in_sight)
             cases.append(Told(scene.state, scene.graphs[scene.viewers[0]], reports, seen))
         return with_reports(scenario, cases)
+
+
+def _declared_loss(channel: Channel | None) -> float:
+    """Return the loss of all links of a channel that is not physical."""
+    assert isinstance(channel, Radio), "another one is refused where conditions are made"
+    with worded(label(channel), built_in=is_ours(channel)):
+        loss = float(channel.loss)
+        if not 0.0 <= loss <= 1.0:
+            raise ValueError(f"a loss of {loss:g}")
+    return loss
 
 
 def _written(cpm: Cpm) -> bytes:
