@@ -53,13 +53,16 @@ def card_here(card: Card) -> Card:
     return cards.load(card.name) if card.engine == DRIVER else card
 
 
-def sees_all(card: Card) -> bool:
-    """Return whether a run's model sees what no vehicle can see, whatever its card says of that.
+def sees_all(model: Mapping[str, Any]) -> bool:
+    """Return whether a run's model sees what no vehicle can see, whatever its record says of that.
 
-    A rule does so if the one here does, and another model only if its engine can.
+    `model` is the record of its card. A rule does so if the one here does, and another model only
+    if its engine can.
     """
-    is_privileged = card_here(card).privileged
-    return is_privileged and "privileged" in registration(card.engine).card_keys
+    engine, is_privileged = model["engine"], bool(model.get("privileged"))
+    if engine == DRIVER:
+        is_privileged = cards.load(model["name"]).privileged
+    return is_privileged and "privileged" in registration(engine).card_keys
 
 
 def points_of(run: Run) -> dict[str, OperatingPoint]:

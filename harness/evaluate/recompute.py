@@ -316,9 +316,9 @@ def _of_limit(run: Run) -> Iterator[str]:
 def _of_agents(run: Run) -> Iterator[str]:
     """Yield what run.json says otherwise of what its models see, and of what they cost."""
     manifest = run.manifest
-    models = [model_of(run, record) for record in (manifest.agent(0), *manifest.helpers)]
-    for card in models:
-        if card.privileged != sees_all(card):
+    for record in (manifest.agent(0), *manifest.helpers):
+        card = model_of(run, record)
+        if card.privileged != sees_all(record["model"]):
             yield f"run.json says of {printable(card.name)} that it sees other than it does"
         cost = (manifest.cost or {}).get(card.name)
         if cost and card.price:

@@ -10,7 +10,7 @@ from markupsafe import Markup
 from harness.backends.registry import reads_prompts
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
-from harness.evaluate.of_run import model_of, sees_all
+from harness.evaluate.of_run import sees_all
 from harness.extensions.benchmark.edition import Edition
 from harness.extensions.benchmark.rescore import Rescored
 from harness.report.document import Section, Table, document, forest, reach
@@ -103,8 +103,7 @@ def _apart(board: Sequence[Line]) -> list[Line]:
 
 def _privileged(suite: SuiteRun) -> bool:
     """Return whether an entry sees what no vehicle can see."""
-    run = next(iter(suite.runs.values()))
-    return sees_all(model_of(run, run.manifest.agent(0)))
+    return sees_all(suite.manifest.model)
 
 
 def _value(score: Score | None) -> float:

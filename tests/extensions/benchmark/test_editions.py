@@ -593,7 +593,7 @@ def test_an_installation_that_computes_a_figure_otherwise_says_so(
     make_golden("mine-1", file, tmp_path / "made")
     assert project("benchmark", "verify", golden, "--quiet") == (0, "", "")
     code, out, err = project("benchmark", "board", golden)
-    assert (code, out, err.count("\n")) == (2, "", 2)
+    assert (code, out, err.count("\n")) == (2, "", 1)
     assert "editions/mine-1.golden.zip pins mine-1 and is no entry" in err
     Here().check(named("mine-1"))
     changed(golden, better)
