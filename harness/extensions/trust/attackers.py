@@ -17,10 +17,10 @@ from harness.coordination.intents import OF_EGO, WITH_EGO, Intents
 from harness.coordination.sent import SentIntents
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints, check_distributions, check_shape, read_only
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError
 from harness.core.strangers import is_ours, worded
 from harness.evaluate.draws import OF_ANOTHER_AGENT
-from harness.extensions.trust.attacks import Attack, Turn, attackers
+from harness.extensions.trust.attacks import Attack, Turn, attackers, label
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
 
@@ -98,10 +98,9 @@ def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:
     Raises UserError if it fails, changes what is not an attacker's,
     or lets a voice say no distribution.
     """
-    kind = type(attack)
     if is_ours(attack):
         return attack.act(sent, turn)
-    with worded(f"attack {kind.__name__} of {printable(kind.__module__)}"):
+    with worded(label(attack)):
         after = attack.act(read_only(sent), read_only(turn))
         if after.voice_of is None:
             after = replace(after, site=sent.site, outlook=sent.outlook, plans=sent.plans)
@@ -112,7 +111,12 @@ def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:
                 raise ValueError("a voice of nobody who is there")
             if sent.voice_of is None:
                 after = _with_honest_voices(sent, after, turn.attackers)
-        check_distributions("intents", after.helpers, after.valid)
+        intents = sent.helpers
+        if after.voice_of is not None:
+            intents = np.take_along_axis(intents, after.voice_of[..., None], axis=1)
+        # whose model was not asked, as of lists of objects, says nothing that could be one
+        answered = after.valid & ~np.isnan(intents).any(axis=-1)
+        check_distributions("intents", after.helpers, answered)
         if not np.array_equal(after.own, sent.own, equal_nan=True):
             raise ValueError("it changes the ego's own intent")
     return after

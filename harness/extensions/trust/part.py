@@ -7,11 +7,13 @@ import numpy as np
 
 from harness.coordination.contents import INTENTS, WORDS
 from harness.coordination.parts import ActsOn, Change, Changes, Part, Text, wrong
+from harness.coordination.parts_of_packages import ChangeOfPart
 from harness.coordination.robust import outvoted
 from harness.coordination.rules import EGO_PROMPT
 from harness.coordination.sent import Speaker
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import unknown
+from harness.core.strangers import is_ours
 from harness.extensions.trust.attacks import (
     ATTACKS,
     Attack,
@@ -19,6 +21,7 @@ from harness.extensions.trust.attacks import (
     Spoof,
     attacks_of,
     in_question,
+    label,
 )
 from harness.extensions.trust.changes import MESSAGES, AttackersMessage
 
@@ -168,7 +171,10 @@ class Guard(Part, frozen=True, kw_only=True):
         if text in MESSAGES:
             return MESSAGES[text]
         if text.partition(":")[0] in ATTACKS:
-            return AttackersMessage(attacks_of(text))
+            attacks = attacks_of(text)
+            change = AttackersMessage(attacks)
+            of_packages = [attack for attack in attacks if not is_ours(attack)]
+            return ChangeOfPart(label(of_packages[0]), change) if of_packages else change
         return None
 
     def after_call(self, fused: Floats, intents: Floats, heard: Bools) -> Floats:

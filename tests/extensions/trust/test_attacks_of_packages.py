@@ -3,12 +3,16 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from harness.coordination.intents import Intents
+from harness.coordination.part_settings import change_of
 from harness.core.errors import UserError
+from harness.dataset.load import Dataset
 from harness.extensions.trust.attackers import _acted
 from harness.extensions.trust.attacks import ATTACKS, Attack, Turn, with_voices
 
@@ -96,6 +100,42 @@ def test_an_attacker_may_be_silent_far_away_and_late() -> None:
         inference_s=np.add(s.inference_s, [0.0, 9.0, 0.0]),
     )), SAID, TURN)  # fmt: skip
     assert far.range_m[0].tolist() == [10.0, 1.0]
+
+
+def test_of_a_helper_that_was_not_asked_nothing_is_known() -> None:
+    """As where lists of objects are sent, which need no answer; what was answered stays one."""
+    unknown = np.where([[[True], [False]]] * 2, np.nan, SAID.helpers)
+    unasked = replace(SAID, helpers=unknown)
+    assert np.isnan(_acted(Lie(), unasked, TURN).helpers[:, 0]).all()
+    with pytest.raises(UserError, match="intents that are no distributions"):
+        _acted(Lie(lie=lambda s: replace(s, helpers=unknown)), SAID, TURN)
+
+
+@dataclass(frozen=True)
+class Listing(Attack):
+    """Lists what the text says."""
+
+    lists: str = "graph"
+
+    def listed(self, graph: Any, ghost: Any) -> Any:
+        if self.lists == "nothing":
+            return None
+        if self.lists == "boom":
+            raise TypeError("boom")
+        return structs.replace(graph, viewer="v77") if self.lists == "viewer" else graph
+
+
+def test_what_a_packages_attack_lists_is_a_graph_of_its_sender(
+    small: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(ATTACKS._loaded, "lists", Listing())
+    monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
+    scene = small.scenes(small.courses())[0]
+    graph = scene.graphs[scene.viewers[1]]
+    assert change_of("lists").graph(graph, small.scenario, scene) == graph
+    for lists, says in (("nothing", "no graph"), ("boom", "boom"), ("viewer", "viewer is another")):
+        with pytest.raises(UserError, match=rf"^attack Listing of \S+ fails .*{says}"):
+            change_of(f"lists:lists={lists}").graph(graph, small.scenario, scene)
 
 
 class Failing(Attack):
