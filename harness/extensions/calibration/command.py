@@ -32,7 +32,8 @@ def command(
     from typing import cast, get_args
 
     from harness.extensions.calibration.calibrations import Level
-    from harness.extensions.calibration.fitting import calibrate, write
+    from harness.extensions.calibration.fitting import calibrate
+    from harness.runs.fit import write
 
     if level not in get_args(Level):
         raise unknown("--level", level, get_args(Level))

@@ -2,8 +2,7 @@
 on a run on tune layouts.
 """
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import numpy as np
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
-from harness.core.files import write_whole
 from harness.core.seeds import seeds_text
 from harness.dataset import rebuilt
 from harness.dataset.forest import Forest
@@ -20,14 +18,13 @@ from harness.extensions.calibration.calibrations import (
     COOLEST,
     HOTTEST,
     LEAST_PRIOR,
+    WHAT,
     Calibration,
     Correction,
     Level,
-    check_seeds,
-    question_of,
-    weights_of,
 )
 from harness.runs.contradictions import sound
+from harness.runs.fit import check_seeds, question_of, weights_of
 from harness.runs.folder import Run
 from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats
@@ -126,7 +123,7 @@ def calibrate(
     data = dataset_of(run, dataset).of_episodes(run.grid.episodes)
     forest = data.forest
     first, last = int(forest.seeds.min()), int(forest.seeds.max())
-    check_seeds(name, first, last)
+    check_seeds(name, WHAT, first, last)
     rebuilt.refuse(data)
     check_scenes(run, data)
     refuse_others(run)
@@ -137,18 +134,18 @@ def calibrate(
     corrections = {each.role: each.correction for each in fitted}
     seeds = seeds_text(first, last - first + 1)
     calibration = Calibration(
-        level,
-        command,
-        f"{manifest.variant.model} on {manifest.world.name}, {seeds}, "
+        command=command,
+        fitted_on=f"{manifest.variant.model} on {manifest.world.name}, {seeds}, "
         f"{amount(len(forest.seeds), 'layout')}",
-        first,
-        last,
-        data.scenario.name,
-        tuple(run.actions),
-        question_of({**manifest.agent(0), "model": answerers.model}),
-        corrections["ego"],
-        corrections.get("helper"),
-        weights_of(answerers.identity),
+        first_seed=first,
+        last_seed=last,
+        scenario=data.scenario.name,
+        actions=tuple(run.actions),
+        question=question_of({**manifest.agent(0), "model": answerers.model}),
+        weights=weights_of(answerers.identity),
+        level=level,
+        ego=corrections["ego"],
+        helper=corrections.get("helper"),
     )
     return calibration, fitted
 
@@ -161,18 +158,3 @@ def _of_role(run: Run, role: str, forest: Forest, level: Level) -> Fitted | None
     optimal = forest.safe[[forest.place[a.scene] for a in read_answers]]
     correction = fit(p, optimal, level)
     return Fitted(role, correction, nats_of(p, optimal), nats_of(correction.of(p), optimal))
-
-
-def write(calibration: Calibration, out: Path) -> None:
-    """Write a calibration, what corrects a model's stated probabilities, to the TOML file `out`."""
-    fields = asdict(calibration)
-    tables = {name: fields.pop(name) for name in ("question", "weights", "ego", "helper")}
-    lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items()]
-    for name, table in tables.items():
-        if table:
-            lines += [
-                "",
-                f"[{name}]",
-                *(f"{json.dumps(k)} = {json.dumps(v)}" for k, v in table.items()),
-            ]
-    write_whole(out, "\n".join([*lines, ""]))

@@ -20,15 +20,9 @@ from harness.core.errors import UserError
 from harness.core.resources import MARKER
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
-from harness.extensions.calibration.calibrations import (
-    OF_QUESTION,
-    Calibration,
-    Correction,
-    calibration,
-    question_of,
-    weights_of,
-)
+from harness.extensions.calibration.calibrations import Calibration, Correction, calibration
 from harness.extensions.calibration.fitting import TEMPERATURES, calibrate, fit
+from harness.runs.fit import OF_QUESTION, question_of, weights_of
 from harness.runs.folder import read
 from harness.world import scenarios
 
@@ -327,8 +321,10 @@ def test_a_calibration_of_a_model_without_an_adapter_does_not_fit_one_with() -> 
     agent: dict[str, Any] = {"model": model, "prompt": {"version": "v", "sha256": "s"}}
     agent |= dict.fromkeys(OF_QUESTION, "x")
     here = scenarios.get("occluded-intersection")
-    of, who = (here.name, here.actions), question_of(agent)
-    found = Calibration("L1", "c", "r", 0, 3, *of, who, Correction(4))
+    found = Calibration(
+        command="c", fitted_on="r", first_seed=0, last_seed=3, scenario=here.name, actions=here.actions,
+        question=question_of(agent), level="L1", ego=Correction(4),
+    )  # fmt: skip
     assert found.obstacle(agent, here) is None
     for key in ("adapter", "sha256"):
         other = {**agent, "model": {**model, key: "new"}}
