@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from harness.coordination.coordinate import coordinate
 from harness.coordination.intents import Intents
 from harness.coordination.named_points import named_point
 from harness.coordination.operating_point import OperatingPoint, kept_of
@@ -15,6 +16,7 @@ from harness.coordination.parts import PACKAGES_PARTS, PLAIN, Kept, Part, Questi
 from harness.coordination.parts_of_packages import (
     SpeakerOfPart,
     after_call,
+    after_fusion,
     change_by,
     obstacle,
     prepared,
@@ -143,6 +145,34 @@ def test_the_last_word_on_a_call_is_a_policy(act: Callable[..., Any], says: str)
     with pytest.raises(UserError) as error:
         after_call(of_part("after_call", act), P, np.full((2, 3, 2), 0.5), ~NOBODY)
     assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("act", "says"),
+    [
+        (lambda fused: written(fused), "read-only"),
+        (lambda fused: fused[:1], "policies of shape (1, 2)"),
+        (lambda fused: 2 * fused, "policies that are no distributions"),
+        (lambda fused: 1 / 0, "ZeroDivisionError"),
+    ],
+)
+def test_the_policies_by_which_egos_act_are_policies(act: Callable[..., Any], says: str) -> None:
+    with pytest.raises(UserError) as error:
+        after_fusion(of_part("after_fusion", act), np.full((2, 2), 0.5))
+    assert says in str(error.value)
+
+
+def test_a_package_may_have_the_last_word_on_what_egos_do() -> None:
+    """It acts by the second action; with one helper or none, in every decision."""
+    point = named_point("6g:tau=0.5")
+    plain = coordinate(point, intents(), DRAWS)
+    second = np.array([0.0, 1.0])
+    part = of_part("after_fusion", lambda fused: np.broadcast_to(second, fused.shape))
+    object.__setattr__(point, "more", (part,))
+    acted = coordinate(point, intents(), DRAWS)
+    np.testing.assert_array_equal(acted.fused, np.broadcast_to(second, plain.fused.shape))
+    np.testing.assert_array_equal(acted.action, np.ones_like(plain.action))
+    np.testing.assert_array_equal(acted.latency_s, plain.latency_s)
 
 
 @pytest.mark.parametrize(

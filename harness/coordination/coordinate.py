@@ -17,7 +17,7 @@ from harness.coordination.contents import INTENTS
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.coordination.parts_of_packages import after_call
+from harness.coordination.parts_of_packages import after_call, after_fusion
 from harness.coordination.rules import EGO_PROMPT, RULES
 from harness.core.arrays import (
     Bools,
@@ -182,6 +182,8 @@ def fuse(
         fused, weights, state, rule_trust = _by_rule(name, messages, fusion.state)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
     fused = np.where(heard_any[..., None], fused, heard.own)
+    for part in point.more:
+        fused = after_fusion(part, fused)
     unknown = np.isnan(intents.inference_s[..., 0]) & (point.cloud.round_trip_s is None)
     return Coordination(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},

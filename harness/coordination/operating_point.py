@@ -249,7 +249,8 @@ class OperatingPoint:
     def changed(self, **settings: Any) -> "OperatingPoint":
         """Return a copy with some settings, or the `name`, changed.
 
-        `settings` are the new values by flat name, such as `tau_nats=0.5`.
+        `settings` are the new values by flat name, such as `tau_nats=0.5`. What these imply
+        (`Part.implies`) is set as well where it is not given.
         Raises UserError for a value that is not allowed, or settings that contradict each other.
         """
         name = settings.pop("name", self.name)
@@ -262,6 +263,9 @@ class OperatingPoint:
             }
         except ValueError as error:
             raise _error_of(name, error) from None
+        for part in filter(is_ours_part, parts.values()):
+            if not part.implies().keys() <= settings.keys():
+                return self.changed(name=name, **{**part.implies(), **settings})
         core_parts: dict[str, Any] = {part: parts[part] for part in PARTS if part in parts}
         changed_kinds = {type(part) for part in parts.values()}
         others = [part for part in self.more if type(part) not in changed_kinds]

@@ -219,6 +219,14 @@ class Part(Struct, frozen=True, kw_only=True):
     def check(self) -> None:
         """Raise ValueError or UserError if settings of this group contradict each other."""
 
+    def implies(self) -> Mapping[str, Any]:
+        """Return settings of a condition that follow from these, values by flat name.
+
+        `OperatingPoint.changed` sets those that its caller does not give; `check_with` is to refuse
+        others. Only a group that ships may imply some.
+        """
+        return {}
+
     @property
     def acts_on(self) -> Collection[ActsOn]:
         """Return which of these settings, as they are now, only matter if messages carry some kind.
@@ -364,6 +372,14 @@ class Part(Struct, frozen=True, kw_only=True):
             heard: which helpers were heard in time, `(..., H)`.
         """
         return fused
+
+    def after_fusion(self, policies: "Floats") -> "Floats":
+        """Return the policies by which egos act, `(..., A)`, given those after all fusion.
+
+        A policy is the probabilities of the ego's A actions; it is the ego's own intent where
+        nobody was heard.
+        """
+        return policies
 
     def ask(
         self,

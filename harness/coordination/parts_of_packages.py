@@ -161,6 +161,18 @@ def after_call(part: Part, fused: Floats, intents: Floats, heard: Bools) -> Floa
         return _distributions("policies", after, fused)
 
 
+def after_fusion(part: Part, policies: Floats) -> Floats:
+    """Return the policies by which egos act, `(..., A)`, given those after all fusion.
+
+    A policy is the probabilities of the ego's A actions; `part` is a group of settings of the
+    condition. Raises UserError if a package's part fails or returns no distributions.
+    """
+    if is_ours(part):
+        return part.after_fusion(policies)
+    with worded_part(part):
+        return _distributions("policies", part.after_fusion(read_only(policies)), policies)
+
+
 @dataclass(frozen=True)
 class ChangeOfPart:
     """Guard a package's change of helpers' messages, such as an attack's: check what it returns.
