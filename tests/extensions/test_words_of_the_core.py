@@ -67,6 +67,7 @@ ORDINARY = {
     "oracle": "a bound on schedules",
     "pack": "what is sent to another process",
     "paper": "the one whose method this is",
+    "promise": "what rules guarantee, and JavaScript's",
     "proxy": "the rule that stands for a model",
     "random": "of draws",
     "reaction": "of a human, in seconds",

@@ -1,0 +1,10 @@
+"""Promise how often a model does harm: thresholds that are chosen on tune layouts."""
+
+from harness.core.extensions import Extension
+
+_HERE = "harness.extensions.promise"
+
+EXTENSION = Extension(
+    name="promise",
+    adds={"parts": {"promise": f"{_HERE}.part:Careful"}},
+)

@@ -1,0 +1,106 @@
+"""Read and state promises, files `promises/*.toml`: thresholds with which a model does little harm.
+
+`harness study promise` writes one. It holds for one model, prompt, scenario and condition.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
+
+from harness.coordination.operating_point import OperatingPoint
+from harness.core import resources
+from harness.core.config import Count, convert, toml
+from harness.core.errors import UserError, printable, unknown
+from harness.core.files import read_once
+from harness.extensions.promise.risk import units_needed
+from harness.runs.fit import Fit, check_seeds
+
+FOLDER = "promises"
+WHAT = "a promise"  # in messages
+# settings that a promise chooses; all others are the condition's that it was made under
+CHOSEN = ("name", "promise", "careful_nats", "tau_nats")
+Harm = Literal["unsafe", "failed"]
+Nats = Annotated[float, Meta(ge=0, le=100, description="nats, 0 or more")]
+Share = Annotated[float, Meta(ge=0, le=1, description="a share from 0 to 1")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Promise(Fit):
+    """Hold a file of `promises/`: thresholds with which a model's mean harm is at most `at_most`.
+
+    The sentence is wrong in a share `delta` of all draws of tune layouts, at most. `obstacle` and
+    `obstacle_of_models` say for which model, prompt and scenario it holds, `other_setting` for
+    which condition.
+    """
+
+    harm: Harm  # what counts: `unsafe`, an episode that ends unsafely; `failed`, one that fails
+    at_most: Share  # of harm, mean over layouts and the channel's draws
+    delta: Share  # probability, over draws of tune layouts, that the promise is wrong, at most
+    settings: dict[str, bool | int | float | str]  # the condition's others, by flat name
+    tau_nats: Nats  # entropy of the ego's answer above which it asks
+    careful_nats: Nats | None = None  # entropy from which the ego is careful; None for never
+    units: Count  # number of tune layouts, or of scenes that these are cut from
+    mean_harm: Share  # on the tune layouts
+    channel_seeds: tuple[int, ...]  # over which harm was averaged
+    dataset_sha256: str  # digest of the tune layouts' scenes
+
+    @property
+    def implied(self) -> dict[str, Any]:
+        """Return the settings of a condition that keep this promise, values by flat name."""
+        return {"tau_nats": self.tau_nats, "careful_nats": self.careful_nats}
+
+    def other_setting(self, point: OperatingPoint) -> tuple[str, object, object] | None:
+        """Return a setting of a condition with which the promise was not made; None if none is.
+
+        Returned are its flat name, its value in the condition, and that of the promise.
+        """
+        plain = settings_of(OperatingPoint(point.name))
+        now, then = settings_of(point), {**plain, **self.settings}
+        for key in {**then, **now}:
+            if now.get(key) != then.get(key):
+                return key, now.get(key), then.get(key)
+        return None
+
+
+def settings_of(point: OperatingPoint) -> dict[str, Any]:
+    """Return the settings of a condition that a promise does not choose, those that are not None.
+
+    They are values by flat name, as in records of runs.
+    """
+    record: Mapping[str, Any] = point.record()
+    return {k: v for k, v in record.items() if v is not None and k not in CHOSEN}
+
+
+def names() -> list[str]:
+    """Return the names of all files of `promises/`, those that ship and the project's."""
+    return resources.names(FOLDER)
+
+
+def file_of(name: str) -> Any:
+    """Return the path of a promise's file, by its name. Raises UserError if it is unknown."""
+    if name not in names():
+        raise unknown("promise", name, names(), "; `harness study promise --write` makes one")
+    return resources.find(FOLDER, f"{name}.toml")
+
+
+def promise(name: str) -> Promise:
+    """Load a promise by the name of its file. Raises UserError if it is unknown or wrong."""
+    return _read(file_of(name))
+
+
+@read_once
+def _read(path: Any) -> Promise:
+    where = f"promise file {printable(path)}"
+    record = convert(toml(path, where), Promise, where)
+    check_seeds(where, WHAT, record.first_seed, record.last_seed)
+    if not (0 < record.at_most < 1 and 0 < record.delta < 1):
+        raise UserError(f"{where}: at_most and delta are shares between 0 and 1; make it again")
+    needed = units_needed(record.at_most, record.delta)
+    if record.units < needed or record.mean_harm >= record.at_most:
+        raise UserError(
+            f"{where}: a mean harm of {record.mean_harm:g} on {record.units} layouts promises no "
+            f"{record.at_most:g} (needed: less, on {needed} or more); make it again"
+        )
+    return record

@@ -1,0 +1,155 @@
+"""A careful ego, and the promise that says when it is: the settings of a condition."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluating import run, spec_of
+from hypothesis import given
+from hypothesis import strategies as st
+
+from harness.coordination.named_points import misnamed, named_point
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.trigger import entropy_nats
+from harness.core.errors import UserError
+from harness.dataset.load import Dataset
+from harness.extensions.promise.part import Careful
+from harness.runs.folder import Run, read
+
+pytestmark = pytest.mark.usefixtures("svg_alone")
+
+Typed = Callable[..., tuple[int, str, str]]
+
+
+@given(
+    st.lists(st.floats(0.01, 1.0), min_size=4, max_size=4),
+    st.none() | st.floats(0, 1.5),
+)
+def test_an_unsure_ego_is_careful_and_a_sure_one_decides(p, careful_nats):
+    policy = np.array([p, [0, 0, 0, 1]]) / [[sum(p)], [1]]
+    acted = Careful(careful_nats=careful_nats).after_fusion(policy)
+    for before, after, nats in zip(policy, acted, entropy_nats(policy), strict=True):
+        careful = careful_nats is not None and nats >= careful_nats
+        assert after.tolist() == ([1, 0, 0, 0] if careful else before.tolist())
+
+
+@pytest.mark.slow
+def test_always_careful_is_a_model_that_brakes_and_never_is_the_model(
+    small: Dataset, tmp_path: Path
+) -> None:
+    """Episode by episode; whom the ego asks and hears, and how late it is, stays."""
+    texts = ("6g", "6g:careful_nats=0", "6g:careful_nats=40")
+    points = tuple(named_point(text) for text in texts)
+    run(spec_of(small, points=points, seeds=(0,)), tmp_path / "run")
+    run(spec_of(small, model="brake", points=points[:1], seeds=(0,)), tmp_path / "brake")
+    played, brakes = read(tmp_path / "run"), read(tmp_path / "brake")
+    ends = {text: ends_of(played, text) for text in texts}
+    assert ends["6g:careful_nats=0"] == ends_of(brakes, "6g") != ends["6g"]
+    assert ends["6g:careful_nats=40"] == ends["6g"]
+    condition = np.array(played.decisions.labels("condition"))
+    step, latency_ms = played.decisions["step"], played.decisions["latency_ms"]
+    at_first = [latency_ms[(condition == text) & (step == 0)].tolist() for text in texts]
+    assert at_first[0] == at_first[1] == at_first[2] != []
+
+
+def ends_of(played: Run, condition: str) -> list[tuple[Any, ...]]:
+    of_condition = [each for each in played.episodes if each.condition == condition]
+    return [(each.episode, each.success, each.failure, each.time_s) for each in of_condition]
+
+
+def test_a_promise_is_its_thresholds(project: Path) -> None:
+    point = named_point("6g:promise=p")
+    assert point.name == "6g:promise=p"
+    record = point.record()
+    assert (record["promise"], record["tau_nats"], record["careful_nats"]) == ("p", 0.3, 0.9)
+    assert misnamed(record) == []
+    assert misnamed({**record, "tau_nats": 0.7}) == ["tau_nats"]
+    assert OperatingPoint.from_dict(record) == point
+    assert named_point("6g:promise=p,tau=0.3,careful_nats=0.9") == replace(
+        point, name="6g:promise=p,tau=0.3,careful_nats=0.9"
+    )
+    assert named_point("6g:promise=never").setting("careful_nats") is None
+    assert point.changed(promise="never").setting("careful_nats") is None
+    asks_more = point.changed(promise="", tau_nats=0.1)
+    assert asks_more.setting("careful_nats") == 0.9
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "6g:promise=p,tau=0.7",
+            "tau_nats is 0.7; it must be left out, or 0.3, where promise is p",
+        ),
+        ("6g:promise=p,careful_nats=1", "careful_nats is 1.0; it must be left out, or 0.9, where"),
+        ("6g:promise=never,careful_nats=1", "careful_nats is 1.0; it must be left out, or None, w"),
+        ("v2x:promise=p", "profile is 'v2x'; it must be 6g where promise is p, which was made so"),
+        ("6g:promise=p,max_helpers=1", "max_helpers is 1; it must be 3 where promise is p"),
+        ("6g:promise=p,loss=0.5", "loss is 0.5; it must be None where promise is p"),
+        ("single-local:promise=p", "profile is None; it must be 6g where promise is p"),
+        ("6g:promise=q", "unknown promise 'q'; known: never, p; `harness study promise"),
+        ("6g:careful_nats=-1", "careful_nats is -1.0; it must be nats, 0 or more"),
+    ],
+)
+def test_what_a_promise_does_not_hold_for_is_refused(project: Path, text: str, says: str) -> None:
+    with pytest.raises(UserError) as error:
+        named_point(text)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("units = 100", "units = 58", "on 58 layouts promises no 0.05 (needed: less, on 59 or"),
+        ("mean_harm = 0.0", "mean_harm = 0.05", "a mean harm of 0.05 on 100 layouts promises no"),
+        ("last_seed = 99", "last_seed = 200001", "a promise is fitted on tune seeds"),
+        ("delta = 0.05", "delta = 1.0", "at_most and delta are shares between 0 and 1"),
+        ("tau_nats = 0.3", "tau_nats = -0.3", "tau_nats"),
+        ('harm = "unsafe"', 'harm = "none"', "harm"),
+        ('"profile" = "6g"', '"profile" = ["6g"]', "settings"),
+    ],
+)
+def test_a_file_that_promises_nothing_is_refused(
+    project: Path, old: str, new: str, says: str
+) -> None:
+    file = project / "promises/p.toml"
+    text = file.read_text()
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new))
+    with pytest.raises(UserError) as error:
+        named_point("6g:promise=p")
+    assert says in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_run_is_played_by_a_promise_and_keeps_it(
+    project: Path, small_path: Path, harness: Typed
+) -> None:
+    """As by its thresholds typed; another model, prompt or number of egos has no such promise."""
+    words = ("eval", "--dataset", small_path, "--seeds", "0", "--quiet", "--no-cache")
+    typed = "6g:tau=0.3,careful_nats=0.9"
+    code, _, error = harness(
+        *words, "--condition", "6g:promise=p", "--condition", typed, "--out", "run"
+    )
+    assert (code, error) == (0, "")
+    played = read(project / "run")
+    assert ends_of(played, "6g:promise=p") == ends_of(played, typed)
+    assert list(played.manifest.kept["promises"]) == ["p"]
+    assert (project / "run/sources/promises/p.toml").exists()
+    condition = ("--condition", "6g:promise=p")
+    for more, says in (
+        (("--model", "uniform"), "promise p was fitted with model.name proxy, not uniform"),
+        (("--prompt", "v4"), "promise p was fitted with prompt.version v2, not v4"),
+    ):
+        code, _, error = harness(*words, *condition, *more, "--out", "other")
+        assert code == 2
+        assert says in error
+        assert error.count("\n") == 1
+    facts: Any = SimpleNamespace(several_decide=True)
+    reason = Careful(promise="p").obstacle(named_point("6g:promise=p"), facts)
+    assert reason == "promise p is of one ego; leave out --agents"
