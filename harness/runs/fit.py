@@ -9,6 +9,7 @@ from typing import Any
 from harness.core.errors import UserError, printable
 from harness.core.files import digest, write_whole
 from harness.core.seeds import purposes, seeds_text
+from harness.runs.folder import Run
 from harness.world.scenario import Scenario
 
 OF_MODEL = ("name", "engine", "weights", "file", "revision", "sha256", "quantisation", "adapter")
@@ -106,6 +107,20 @@ def check_seeds(where: str, what: str, first: int, last: int) -> None:
             f"{where}: {what} is fitted on tune seeds, and these are "
             f"{seeds_text(first, max(last - first, 0) + 1)}"
         )
+
+
+def check_answerers(run: Run) -> None:
+    """Raise UserError unless one model gave all answers of a run, and each is its likeliest."""
+    name, answerers = printable(run.path), run.manifest.answerers
+    if answerers.helpers is None or answerers.temperature is None:
+        raise UserError(
+            f"{name}: it replays another run's answers, and does not state how they were asked; "
+            "give that run"
+        )
+    if answerers.helpers or answerers.temperature:
+        of_others = "its helpers have a model of their own"
+        reason = of_others if answerers.helpers else "its answers are sampled"
+        raise UserError(f"{name}: {reason}; give a run with one model, whose answers are greedy")
 
 
 def write(fit: Fit, out: Path) -> None:

@@ -24,7 +24,7 @@ from harness.extensions.calibration.calibrations import (
     Level,
 )
 from harness.runs.contradictions import sound
-from harness.runs.fit import check_seeds, question_of, weights_of
+from harness.runs.fit import check_answerers, check_seeds, question_of, weights_of
 from harness.runs.folder import Run
 from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats
@@ -110,16 +110,8 @@ def calibrate(
         raise UserError(
             f"{name} was driven, and no tree says what follows; give a run of `harness eval`"
         )
+    check_answerers(run)
     answerers = manifest.answerers
-    if answerers.helpers is None or answerers.temperature is None:
-        raise UserError(
-            f"{name}: it replays another run's answers, and does not state how they were asked; "
-            "give that run"
-        )
-    if answerers.helpers or answerers.temperature:
-        of_others = "its helpers have a model of their own"
-        reason = of_others if answerers.helpers else "its answers are sampled"
-        raise UserError(f"{name}: {reason}; give a run with one model, whose answers are greedy")
     data = dataset_of(run, dataset).of_episodes(run.grid.episodes)
     forest = data.forest
     first, last = int(forest.seeds.min()), int(forest.seeds.max())
