@@ -101,6 +101,7 @@ CUT = {
     "harness eval": "--limit 2",  # of 240 episodes; one has no interval to gate on
     "harness study grid": "--limit 1 --seeds 0:1",  # of 200 episodes
     "harness drive": "--episodes 1 --seeds 0 --workers 1",  # of 240 with 5 seeds
+    "harness study promise": "--delta 99",  # one layout is enough
     "harness study contents": "--condition 6g --seeds 0",  # of 21 points and 5 seeds
     "harness study schedule compare": "--schedule entropy",  # of all
     "harness study twins": "--sample 1 --workers 1",  # of 12 episodes

@@ -6,5 +6,7 @@ _HERE = "harness.extensions.promise"
 
 EXTENSION = Extension(
     name="promise",
+    commands={"study promise": f"{_HERE}.command:command"},
+    studies={"promise": "promise"},
     adds={"parts": {"promise": f"{_HERE}.part:Careful"}},
 )
