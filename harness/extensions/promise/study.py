@@ -107,6 +107,11 @@ class Level:
     certified: int  # number of settings that may promise it
     chosen: OperatingPoint | None  # the best of them; None if there is none
 
+    @property
+    def label(self) -> str:
+        """Return what tables call it, such as `≤ 5 %`."""
+        return f"≤ {_percent(self.at_most)} %"
+
 
 @dataclass(frozen=True)
 class Result:
@@ -141,7 +146,7 @@ class Result:
         rows[ALWAYS] = grid_of(self.conditions[:1], actions, "unsafe").points[0]
         for level in self.levels:
             if level.chosen:
-                rows[f"≤ {_percent(level.at_most)} %"] = level.chosen
+                rows[level.label] = level.chosen
         return rows
 
 
@@ -488,13 +493,13 @@ def tables(result: Result) -> "dict[str, pd.DataFrame]":
     import pandas as pd
 
     rows, settings = list[dict[str, Any]](), list[dict[str, Any]]()
-    levels = {level.chosen: level.at_most for level in result.levels if level.chosen}
+    labels = {level.label for level in result.levels}
     for played in (result.report, *result.elsewhere):
         for label, point in result.rows.items():
             row = {
                 "run": played.run.name,
                 "dataset": played.run.dataset.name,
-                "promised": played is result.report and point in levels,
+                "promised": played is result.report and label in labels,
                 "setting": label,
                 **_thresholds(point),
             }

@@ -25,7 +25,7 @@ def lays(here: Path, once: Once) -> None:
     shutil.copytree(report_run(once), here / "report")
 
 
-FEW = "--at-most 60 --condition 6g"
+FEW = "--harm failed --at-most 60 --condition 6g"
 TRIALS = {
     "promise": Trial(
         "study promise report/run --tune run", FEW, f"{FEW} --seeds 7:8",
