@@ -370,11 +370,12 @@ def promise_study(result: Result, out_runs: Sequence[ReplayedRun]) -> Study:
         [needs(result), *(sentence(result, level) for level in result.levels)],
         [
             f"Harm is the share of {WORDS[result.harm]}, averaged over channel seeds {seeds}. "
-            f"Thresholds are chosen on n = {n} layouts ({seeds_text(first, last - first + 1)}), of "
-            f"{len(result.grid.points)} settings that were fixed before, by tests that are right "
-            f"together with probability {1 - result.delta:g} (learn then test, arXiv:2110.01052): "
-            f"{'exact binomial tails' if is_binary(result) else 'the Hoeffding-Bentkus bound'}, in "
-            f"{len(result.grid.order.chains)} chains. 95 % intervals are over layouts.",
+            f"Thresholds are chosen on n = {n} layouts ({seeds_text(first, last - first + 1)}). "
+            f"{len(result.grid.points)} settings were fixed before, and are tested in "
+            f"{len(result.grid.order.chains)} chains by "
+            f"{'exact binomial tails' if is_binary(result) else 'the Hoeffding-Bentkus bound'}, "
+            f"which are right together with probability {1 - result.delta:g} (learn then test, "
+            "arXiv:2110.01052). 95 % intervals are over layouts.",
             "A promise is of layouts that are drawn as the tune layouts are, with this model, "
             "prompt, scenario and condition. Of other roads, radios and models it says nothing.",
         ],
@@ -406,8 +407,8 @@ def needs(result: Result) -> str:
     shares = ", ".join(_percent(level.at_most) for level in result.levels)
     counts = ", ".join(str(level.needed) for level in result.levels)
     return (
-        f"A promise of {shares} % harm (delta = {_percent(result.delta)} %) needs {counts} tune "
-        f"layouts without harm; here are {result.units.shape[1]}."
+        f"To promise {shares} % (delta = {_percent(result.delta)} %) takes {counts} tune layouts "
+        f"without harm; here are {result.units.shape[1]}."
     )
 
 
