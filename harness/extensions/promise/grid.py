@@ -10,7 +10,7 @@ from harness.extensions.promise.risk import Order
 
 # Entropies from which the ego is careful, as shares of the largest; after them comes never. They
 # are dense where sure models are, and where unsure ones.
-SHARES = (0, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 3 / 4, 7 / 8, 15 / 16, 31 / 32)
+SHARES = tuple(n / 32 for n in (0, 1, 2, 4, 8, 12, 16, 20, 24, 26, 28, 29, 30, 31))
 DIGITS = 4  # of nats
 
 

@@ -367,7 +367,11 @@ def promise_study(result: Result, out_runs: Sequence[ReplayedRun]) -> Study:
     return Study(
         "promise",
         f"What {result.report.run.name} may promise",
-        [needs(result), *(sentence(result, level) for level in result.levels)],
+        [
+            needs(result),
+            *(sentence(result, level) for level in result.levels),
+            *filter(None, (outside(result, level) for level in result.levels)),
+        ],
         [
             f"Harm is the share of {WORDS[result.harm]}, averaged over channel seeds {seeds}. "
             f"Thresholds are chosen on n = {n} layouts ({seeds_text(first, last - first + 1)}). "
@@ -434,6 +438,23 @@ def sentence(result: Result, level: Level) -> str:
 def is_always(point: OperatingPoint) -> bool:
     """Return whether an ego is always careful under a condition."""
     return bool(point.setting("careful_nats") == 0)
+
+
+def outside(result: Result, level: Level) -> str:
+    """Return a sentence on the harm of a level's setting where nothing is promised.
+
+    It is on the layouts with the most harm of those that are not drawn as the tune layouts are;
+    empty without such.
+    """
+    if not result.elsewhere or level.chosen is None:
+        return ""
+    harms = {each.run.dataset.name: each.harm(level.chosen) for each in result.elsewhere}
+    worst = max(harms, key=lambda name: harms[name].value)
+    verdict = "is not kept" if harms[worst].low > level.at_most else "may be kept"
+    return (
+        f"On other roads {level.label} is no promise: on {worst} it {verdict}, with "
+        f"{interval_of(harms[worst])} % harm."
+    )
 
 
 def unable(result: Result, level: Level) -> str:

@@ -1,0 +1,68 @@
+"""Where nothing is promised: what is said of roads that a promise is not of."""
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from harness.coordination.named_points import named_point
+from harness.core.statistics import Estimate
+from harness.extensions.promise.study import Level, needs, outside, typed, unable
+
+POINT = named_point("6g")
+
+
+def scored(name: str, harm: Estimate) -> Any:
+    run = SimpleNamespace(dataset=SimpleNamespace(name=name), name="model")
+    return SimpleNamespace(run=run, harm=lambda point: harm)
+
+
+def result_of(harms: Mapping[str, Estimate], **more: Any) -> Any:
+    """What a study has of it, in so far as these sentences read it."""
+    elsewhere = [scored(name, harm) for name, harm in harms.items()]
+    fields = {"harm": "unsafe", "delta": 0.05, "report": scored("report", None), **more}
+    return SimpleNamespace(elsewhere=elsewhere, **fields)
+
+
+LEVEL = Level(0.05, 59, 3, POINT)
+FEW, MANY = Estimate(0.01, 0.001, 0.04, 100, 0), Estimate(0.95, 0.86, 0.98, 60, 0)
+SOME = Estimate(0.06, 0.03, 0.12, 100, 0)
+
+
+@pytest.mark.parametrize(
+    ("harms", "says"),
+    [
+        ({}, ""),
+        ({"near": FEW, "far": MANY}, "on far it is not kept, with 95.0 [86.0, 98.0] % harm."),
+        ({"near": FEW, "far": SOME}, "on far it may be kept, with 6.0 [3.0, 12.0] % harm."),
+    ],
+)
+def test_the_road_with_the_most_harm_is_named(harms: Mapping[str, Estimate], says: str) -> None:
+    sentence = outside(result_of(harms), LEVEL)
+    assert sentence.endswith(says)
+    assert sentence.startswith("On other roads ≤ 5 % is no promise: ") or not says
+
+
+def test_a_level_without_a_setting_has_none_elsewhere() -> None:
+    assert outside(result_of({"far": MANY}), Level(0.01, 299, 0, None)) == ""
+
+
+def test_too_few_layouts_are_no_fault_of_the_model() -> None:
+    result = result_of({}, units=SimpleNamespace(shape=(1, 100)), levels=[LEVEL])
+    assert unable(result, Level(0.01, 299, 0, None)) == (
+        "unsafe episodes ≤ 1 %: too few tune layouts to promise it"
+    )
+    assert unable(result, Level(0.05, 59, 0, None)) == (
+        "No setting of model can promise unsafe episodes ≤ 5 %"
+    )
+    assert needs(result) == (
+        "To promise 5 % (delta = 5 %) takes 59 tune layouts without harm; here are 100."
+    )
+
+
+def test_a_setting_is_written_as_it_is_typed() -> None:
+    for text in ("6g", "6g:max_helpers=1"):
+        point = named_point(text).changed(tau_nats=0.35, careful_nats=0.5)
+        assert named_point(typed(point)).changed(name=text) == point
+    assert typed(POINT) == "6g:tau=0.7"
