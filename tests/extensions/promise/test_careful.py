@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluating import run, spec_of
+from evaluating import live_spec_of, run, spec_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,8 +16,9 @@ from harness.coordination.named_points import misnamed, named_point
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.errors import UserError
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, load
 from harness.extensions.promise.part import Careful
+from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, read
 
 pytestmark = pytest.mark.usefixtures("svg_alone")
@@ -31,7 +32,10 @@ Typed = Callable[..., tuple[int, str, str]]
 )
 def test_an_unsure_ego_is_careful_and_a_sure_one_decides(p, careful_nats):
     policy = np.array([p, [0, 0, 0, 1]]) / [[sum(p)], [1]]
-    acted = Careful(careful_nats=careful_nats).after_fusion(policy)
+    part = Careful(careful_nats=careful_nats)
+    acted = part.after_fusion(policy)
+    together = part.after_fusion(np.stack([policy[::-1], policy]))
+    assert together.tolist() == [acted[::-1].tolist(), acted.tolist()]
     for before, after, nats in zip(policy, acted, entropy_nats(policy), strict=True):
         careful = careful_nats is not None and nats >= careful_nats
         assert after.tolist() == ([1, 0, 0, 0] if careful else before.tolist())
@@ -124,6 +128,26 @@ def test_a_file_that_promises_nothing_is_refused(
     with pytest.raises(UserError) as error:
         named_point("6g:promise=p")
     assert says in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_careful_ego_decides_driven_as_frozen(two_path: Path, tmp_path: Path) -> None:
+    """Alone it is as late as frozen scenes assume: the same policies, scene by scene, careful at
+    one threshold and not at the other.
+    """
+    two = load(two_path)
+    points = tuple(named_point(f"single-local:careful_nats={nats}") for nats in (0.9, 0.95))
+    run(spec_of(two, points=points, seeds=(0,)), tmp_path / "frozen")
+    live = live_spec_of(episodes=2, first_seed=two.manifest.seed, points=points, seeds=(0,))
+    run(live, tmp_path / "driven")
+    expected = policies(read(tmp_path / "frozen").decisions)
+    assert policies(read(tmp_path / "driven").decisions) == expected
+    assert {fused == (1.0, 0.0, 0.0) for fused in expected.values()} == {True, False}
+
+
+def policies(decisions: Decisions) -> dict[tuple[str, str], tuple[float, ...]]:
+    records = decisions.records(0, len(decisions))
+    return {(row.condition, row.scene): tuple(row.fused) for row in records}
 
 
 @pytest.mark.slow
