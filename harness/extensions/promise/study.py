@@ -198,14 +198,7 @@ def run_promise(
             f"{_percent(delta)} %); give a run on more, or a larger --at-most"
         )
     grid = grid_of(points, len(tune.run.actions), harm)
-    manifest = {
-        "sources": [run.manifest() for run in (*runs, tune)],
-        "harm": harm,
-        "at_most": list(needed),
-        "delta": delta,
-        "seeds": list(seeds),
-        "panels": described({"tune": [Setting(p.name, p, tune.vehicles) for p in grid.points]}),
-    }
+    manifest = manifest_of([*runs, tune], grid, harm, list(needed), delta, seeds)
     refuse_other(out, "promise", manifest)
     progress.more(len(grid.points) + len(runs) * (1 + len(points) + len(needed)))
     rules = counted([tune, report])
@@ -221,6 +214,29 @@ def run_promise(
     for run in (*runs, tune):
         run.settle()
     return replace(result, report=played, elsewhere=others)
+
+
+def manifest_of(
+    runs: Sequence[ReplayedRun],
+    grid: Grid,
+    harm: Harm,
+    levels: Sequence[float],
+    delta: float,
+    seeds: Sequence[int],
+) -> dict[str, Any]:
+    """Return what tells one study from another, as plain values by name, for its `promise.json`.
+
+    `runs` are those that it plays, that on tune layouts last.
+    """
+    vehicles = runs[-1].vehicles
+    return {
+        "sources": [run.manifest() for run in runs],
+        "harm": harm,
+        "at_most": list(levels),
+        "delta": delta,
+        "seeds": list(seeds),
+        "panels": described({"tune": [Setting(p.name, p, vehicles) for p in grid.points]}),
+    }
 
 
 def check(runs: Sequence[ReplayedRun], tune: ReplayedRun) -> None:
@@ -386,18 +402,13 @@ def promise_study(result: Result, out_runs: Sequence[ReplayedRun]) -> Study:
         [_table(result, result.report), *(_table(result, each) for each in result.elsewhere)],
         data,
         {
-            "sources": [run.manifest() for run in out_runs],
-            "harm": result.harm,
-            "at_most": [level.at_most for level in result.levels],
-            "delta": result.delta,
-            "seeds": list(result.seeds),
-            "panels": described(
-                {
-                    "tune": [
-                        Setting(point.name, point, result.tune.run.vehicles)
-                        for point in result.grid.points
-                    ]
-                }
+            **manifest_of(
+                out_runs,
+                result.grid,
+                result.harm,
+                [level.at_most for level in result.levels],
+                result.delta,
+                result.seeds,
             ),
             "versions": versions(),
         },
