@@ -181,8 +181,7 @@ def run_promise(
         Unanswered: too many questions got no answer; the runs keep all others.
     """
     report, *elsewhere = runs
-    names = conditions or [n for n, point in tune.points.items() if point.radio.profile is not None]
-    points = [point_of([tune], name) for name in names]
+    points = [point_of([tune], name) for name in conditions or usual(tune)]
     if not points:
         raise UserError(
             f"{printable(tune.run.path)}: no condition has a channel; give --condition 6g"
@@ -214,6 +213,18 @@ def run_promise(
     for run in (*runs, tune):
         run.settle()
     return replace(result, report=played, elsewhere=others)
+
+
+def usual(tune: ReplayedRun) -> list[str]:
+    """Return the names of a run's conditions whose thresholds can be varied.
+
+    They have a channel, and keep no promise already.
+    """
+    names = []
+    for name, point in tune.points.items():
+        if point.radio.profile is not None and not point.setting("promise"):
+            names.append(name)
+    return names
 
 
 def manifest_of(

@@ -18,6 +18,7 @@ from harness.coordination.trigger import entropy_nats
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, load
 from harness.extensions.promise.part import Careful
+from harness.extensions.promise.study import usual
 from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, read
 
@@ -76,6 +77,10 @@ def test_a_promise_is_its_thresholds(project: Path) -> None:
     assert named_point("6g:promise=p,tau=0.3,careful_nats=0.9") == replace(
         point, name="6g:promise=p,tau=0.3,careful_nats=0.9"
     )
+    kept: Any = SimpleNamespace(
+        points={name: named_point(name) for name in ("single-local", "6g", "6g:promise=p")}
+    )
+    assert usual(kept) == ["6g"]
     assert named_point("6g:promise=never").setting("careful_nats") is None
     assert point.changed(promise="never").setting("careful_nats") is None
     asks_more = point.changed(promise="", tau_nats=0.1)
