@@ -76,8 +76,7 @@ class Families(NamedTuple):
         None if a family has no value.
         """
         if metric == GAINS[BALANCED]:
-            families = [by_condition(run.grid, run.episodes) for run in self.runs.values()]
-            return mean_difference([(how, of[condition], of[BASELINE]) for how, of in families])
+            return self.difference(condition, BASELINE)
         over = "answers" if condition == ALL else "episodes"
         wanted = condition, metric, over
         scores = [
@@ -86,6 +85,11 @@ class Families(NamedTuple):
         ]
         found = [score.estimate for score in scores if score]
         return mean_of(found) if len(found) == len(scores) else None
+
+    def difference(self, condition: str, other: str) -> Estimate:
+        """Return balanced success in a condition less that in another one, paired by episode."""
+        families = [by_condition(run.grid, run.episodes) for run in self.runs.values()]
+        return mean_difference([(how, of[condition], of[other]) for how, of in families])
 
     def shown(self, condition: str, metric: str, sign: str = "") -> str:
         """Return the same in percent with its interval; empty if a family has no value."""
