@@ -100,6 +100,13 @@ class Until(StoppingRule):
                 "an interval of every look needs layouts that are drawn on their own; leave out "
                 "--until-width and --until-decided"
             )
+        for point in run.points:
+            if point.elsewhere:
+                raise UserError(
+                    f"{printable(point.name)}: its ego hears helpers of other layouts, and a run "
+                    "that stops has not played all of them; leave out --until-width and "
+                    "--until-decided"
+                )
         if self.against is not None:
             self._check_against(run, self.against)
 

@@ -154,7 +154,9 @@ class Cpms:
     def _loss(self, sent: Sequence[Sending]) -> Floats:
         """Return the probability that each CPM is lost on its way to the ego, (n,)."""
         n = sum(len(each.cpms) for _, each in sent)
-        if not n or not isinstance(self.channel, Physical):
+        if not n:
+            return np.zeros(0)
+        if not isinstance(self.channel, Physical):
             return np.full(n, _declared_loss(self.channel))
         links: list[tuple[WorldState, Cpm, WorldState]] = []  # in a scene, and when it was sent
         for scene, each in sent:

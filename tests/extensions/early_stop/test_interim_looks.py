@@ -5,6 +5,7 @@ intervals hold at every look, and the record says when.
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -314,6 +315,11 @@ def test_a_finished_run_is_taken_for_no_run_by_another_rule(small: Dataset, tmp_
         (("eval", "--until-width", "0"), "--until-width 0 is out of range; give 0.1 to 99 points"),
         (("eval", "--until-width", "4", "--until-decided", "x"), "give one of them"),
         (("eval", "--until-decided", "nowhere"), "nowhere"),
+        pytest.param(
+            ("eval", "--until-width", "4", "--condition", "6g:messages=shuffled"),
+            "6g:messages=shuffled: its ego hears helpers of other layouts, and a run that stops",
+            marks=pytest.mark.skipif(not find_spec("harness.extensions.controls"), reason="gone"),
+        ),
         pytest.param(
             ("eval", "--until-width", "4", "--dataset", "suite:v2v-safety-2"),
             "suite v2v-safety-2: runs that stop",

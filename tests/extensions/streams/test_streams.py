@@ -215,7 +215,9 @@ def test_many_scenes_at_once_hear_what_each_hears_alone(small: Dataset, text: st
     """Of a dataset that is read anew for each, so that nothing is known of the others."""
     stream, names = named_point(text).stream, small.courses()
     assert isinstance(stream, Cpms)
-    together = stream.heard(small.scenario, replace(small, _scenes={}).scenes(names))
+    scenes = replace(small, _scenes={}).scenes(names)
+    together = stream.heard(small.scenario, scenes)
+    assert stream.heard(small.scenario, scenes) == together, "as a second condition asks it"
     alone = []
     for name in names[-20:]:
         alone += stream.heard(small.scenario, replace(small, _scenes={}).scenes([name]))
