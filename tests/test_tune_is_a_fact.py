@@ -1,6 +1,7 @@
 """Layouts that numbers are reported of, under another purpose, teach and choose nothing."""
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -203,16 +204,23 @@ def test_a_start_is_that_of_another_scenario_wherever_it_lies_and_whoever_it_sho
     state = World.start(scenarios.get(NAME), SEED).state()
     start = Start.of("one", state)
 
-    def other(count: int, faster_mps: float = 0.0) -> Start:
-        """Return what another recording has of it, elsewhere, of so many of its vehicles."""
+    def other(count: int, faster_mps: float = 0.0, turned_rad: float = 0.3) -> Start:
+        """Return what another recording has of it, of so many of its vehicles: elsewhere, turned."""
+        cos, sin = math.cos(turned_rad), math.sin(turned_rad)
         ego, *others = state.vehicles[:count]
         vehicles = [replace(ego, speed_mps=ego.speed_mps + faster_mps), *others]
-        moved = tuple(replace(v, id=f"{v.id}0", x_m=v.x_m + 7, y_m=v.y_m - 9) for v in vehicles)
-        return Start.of("other", replace(state, vehicles=moved))
+        moved = []
+        for v in vehicles:
+            x_m, y_m = v.x_m * cos - v.y_m * sin + 7, v.x_m * sin + v.y_m * cos - 9
+            heading_rad = v.heading_rad + turned_rad
+            moved.append(replace(v, id=f"{v.id}0", x_m=x_m, y_m=y_m, heading_rad=heading_rad))
+        return Start.of("other", replace(state, vehicles=tuple(moved)))
 
     count = len(state.vehicles)
     assert count > 2
     assert start.is_part(other(count))
+    assert start.is_part(other(count, turned_rad=0.0))
+    assert start.is_part(other(count, turned_rad=3.0))
     assert other(2).is_part(start)
     assert not start.is_part(other(count, 0.1))
     assert not start.is_part(other(1)), "an ego alone says nothing"

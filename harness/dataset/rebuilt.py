@@ -9,6 +9,7 @@ or more, so that only a few are built. Which ones follows from the dataset and f
 machine: typing a command again draws no others, and who made the dataset does not know them.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from typing import NamedTuple
@@ -212,9 +213,14 @@ class Start(NamedTuple):
 
 
 def _moves(vehicle: VehicleState, ego: VehicleState) -> str:
-    """Return the digest of where a vehicle is from the ego, and how it drives, to 0.01."""
-    place = vehicle.x_m - ego.x_m, vehicle.y_m - ego.y_m
-    numbers = (*place, vehicle.heading_rad, vehicle.speed_mps)
+    """Return the digest of where a vehicle is as the ego sees it, and how it drives, to 0.01.
+
+    It is the same however the map is turned.
+    """
+    dx_m, dy_m = vehicle.x_m - ego.x_m, vehicle.y_m - ego.y_m
+    cos, sin = math.cos(ego.heading_rad), math.sin(ego.heading_rad)
+    turned_rad = math.remainder(vehicle.heading_rad - ego.heading_rad, math.tau)
+    numbers = (dx_m * cos + dy_m * sin, dy_m * cos - dx_m * sin, turned_rad, vehicle.speed_mps)
     return digest([vehicle.kind, *(round(number, 2) + 0.0 for number in numbers)])
 
 
