@@ -132,10 +132,11 @@ def as_asked(
         [graph] = shared_graphs(
             scenario, [(scene, answer.heard)], {each.id: each for each in (source, scene) if each}
         )
-    except KeyError as error:
+    except (KeyError, UserError) as error:
+        reason = f"{printable(error)} is not there" if isinstance(error, KeyError) else error
         raise UserError(
             f"answers.jsonl has an answer in scene {printable(scene.id)} that heard "
-            f"{printable(error)}, who is not there; make the run again"
+            f"{printable('+'.join(answer.heard), 100)}: {reason}; make the run again"
         ) from None
     return scene if graph is None else scene.changed(graphs={**scene.graphs, answer.viewer: graph})
 

@@ -312,7 +312,10 @@ class Details:
         if not scene or not messages_sent or source_of(name, answer.heard) != name:
             return None
         heard = messages_of(by_key, answer.heard, run.actions)
-        view = as_asked(scene.seat or self.runs.scenario, scene, answer)
+        try:
+            view = as_asked(scene.seat or self.runs.scenario, scene, answer)
+        except UserError as error:
+            raise UserError(f"{printable(run.path)}: {error}") from None
         messages = messages_sent(view, answer.viewer, heard)
         sha256 = digest(messages)
         if answer.prompt_sha256 != sha256:

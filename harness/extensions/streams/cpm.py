@@ -331,10 +331,7 @@ def heard_of(text: str) -> tuple[float, frozenset[int]]:
     match = HEARD.fullmatch(text)
     interval_s = float(match["interval"]) if match else 0.0
     if not match or not SHORTEST_S <= interval_s <= LONGEST_S:
-        raise UserError(
-            f"answers.jsonl has an answer that heard {printable(text)!r}, which is no stream; "
-            "make the run again"
-        )
+        raise UserError(f"{printable(text)!r} is no stream")
     return interval_s, frozenset(map(int, match["looks"].split(".")))
 
 
