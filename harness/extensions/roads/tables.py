@@ -264,21 +264,19 @@ def _scene(recording: Recording, name: str) -> Scene:
     lanes = recording.rows(LANES, name)
     houses = recording.rows(BUILDINGS, name)
     try:
-        scene = Scene(
-            name,
-            facts.file,
-            facts.sha256,
-            facts.lights,
-            _tracks_of(tracks),
-            {lane.id: lane for lane in _lanes_of(lanes)},
-            tuple(House(str(row["id"]), _line(row)) for row in houses.to_pylist()),
-        )
-        checked(scene)
-    except UserError as error:
-        raise UserError(
-            f"recording {printable(recording.folder)}: {error}; make it again: "
-            "`harness dataset import`"
-        ) from None
+        tracks_by_id = _tracks_of(tracks)
+    except ValueError as error:
+        raise _broken(recording.folder / TRACKS, str(error)) from None
+    scene = Scene(
+        name,
+        facts.file,
+        facts.sha256,
+        facts.lights,
+        tracks_by_id,
+        {lane.id: lane for lane in _lanes_of(lanes)},
+        tuple(House(str(row["id"]), _line(row)) for row in houses.to_pylist()),
+    )
+    checked(scene)
     for key, given in _computed_facts(scene).items():
         claim = getattr(facts, key)
         if claim != given:
@@ -299,7 +297,10 @@ def _computed_facts(scene: Scene) -> dict[str, float]:
 
 
 def _tracks_of(table: pa.Table) -> dict[str, Track]:
-    """Return the tracks of a scene's rows, which stand together, each in the order of time."""
+    """Return the tracks of a scene's rows, which stand together, each in the order of time.
+
+    Raises ValueError where those of one do not.
+    """
     if not len(table):
         return {}
     ids, kinds = _labels(table["id"]), _labels(table["kind"])
@@ -312,7 +313,7 @@ def _tracks_of(table: pa.Table) -> dict[str, Track]:
     for start, stop in runs_of(codes):
         key = ids.dictionary[int(codes[start])].as_py()
         if key in tracks:
-            raise UserError(f"track {printable(key)}: its rows do not stand together")
+            raise ValueError(f"the rows of track {printable(key)} do not stand together")
         kind = kinds.dictionary[int(kind_codes[start])].as_py()
         size = float(lengths[start]), float(widths[start])
         tracks[key] = Track(key, kind, *size, times[start:stop], poses[start:stop])
