@@ -20,13 +20,12 @@ from typing import NamedTuple
 
 from families import Row, finished
 from markupsafe import Markup
-from pages import harness, markdown, options, write_tables
+from pages import markdown, options, write_tables
 
 from harness.core.arrays import Floats
 from harness.core.figures import interval_of
 from harness.core.progress import Progress
 from harness.dataset import suites
-from harness.dataset.load import find, load
 from harness.extensions.contents.page import contents_study
 from harness.extensions.contents.study import (
     BASE,
@@ -46,7 +45,6 @@ from harness.runs.metrics import METRICS
 from harness.runs.success import Success, alike
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.study import Study, write_study
-from harness.world import scenarios
 
 SMALLEST = "--only proxy --layouts 1 --dataset blind-merge-v2"
 CONDITIONS = {
@@ -123,17 +121,11 @@ def drive(asked: Asked, here: Path, limit: int | None, study: Study) -> None:
     """Drive the layouts of a model's datasets with each content that it can play,
     unless it is done.
     """
+    if not asked.drives:
+        return
     conditions = [CONDITIONS[content] for content, *_ in study.tables[0].rows]
-    for name in asked.datasets if asked.drives else ():
-        dataset, out = load(find(name)), here / "driven" / name
-        layouts = min(limit or len(dataset.episodes), len(dataset.episodes))
-        if not (out / "run.json").exists():
-            points = [word for point in conditions for word in ("--condition", point)]
-            where = ("--episodes", str(layouts), "--first-seed", str(dataset.seeds[0]))
-            scenario = ("--scenario", scenarios.argument(dataset.scenario))
-            harness(
-                "drive", *asked.row.who, *scenario, *where, *points, "--out", str(out), "--quiet"
-            )
+    points = [word for point in conditions for word in ("--condition", point)]
+    asked.row._replace(limit=limit).drive(here / "driven", *points)
 
 
 def driven(asked: Asked, here: Path) -> dict[str, Outcome]:

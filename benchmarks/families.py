@@ -9,6 +9,8 @@ from pages import harness
 from harness.core.arrays import Floats
 from harness.core.figures import interval_of
 from harness.core.statistics import Estimate, known_mean, mean_of, paired_difference
+from harness.dataset import suites
+from harness.dataset.load import find, load
 from harness.runs import folder, suite
 from harness.runs.folder import Run
 from harness.runs.headline import BALANCED
@@ -16,6 +18,7 @@ from harness.runs.metric_names import ALL, BASELINE, GAINS
 from harness.runs.metric_values import by_episode
 from harness.runs.metrics import METRICS, entry
 from harness.runs.success import by_condition, mean_difference
+from harness.world import scenarios
 
 
 class Row(NamedTuple):
@@ -52,6 +55,19 @@ class Row(NamedTuple):
             few = () if self.limit is None else ("--limit", str(self.limit))
             words = (*self.who, "--dataset", self.dataset, *few, *options)
             harness("eval", *words, "--out", str(out), "--quiet")
+
+    def drive(self, out: Path, *options: str) -> None:
+        """Drive the layouts of each of its datasets, to a folder in `out` of the dataset's name,
+        unless that is done.
+        """
+        for name in suites.datasets(self.dataset):
+            dataset, place = load(find(name)), out / name
+            if not (place / "run.json").exists():
+                layouts = min(self.limit or len(dataset.episodes), len(dataset.episodes))
+                where = ("--episodes", str(layouts), "--first-seed", str(dataset.seeds[0]))
+                scenario = ("--scenario", scenarios.argument(dataset.scenario))
+                words = (*self.who, *scenario, *where, *options)
+                harness("drive", *words, "--out", str(place), "--quiet")
 
 
 def finished(out: Path) -> bool:

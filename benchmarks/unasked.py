@@ -13,15 +13,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from families import Families, Row
-from pages import harness, markdown, options, write_tables
+from pages import markdown, options, write_tables
 
 from harness.core.figures import Unit, interval_of
 from harness.dataset import suites
-from harness.dataset.load import find, load
 from harness.runs import folder
 from harness.runs.headline import BALANCED
 from harness.runs.metric_names import BASELINE, GAINS
-from harness.world import scenarios
 
 SMALLEST = "--only proxy-v4-json/6g --layouts 1"
 SEEDS = "0:2"
@@ -104,25 +102,13 @@ def main() -> None:
         if given.only in asked.name:
             row.evaluate(here / "frozen", *asked.options)
             if asked.drives:
-                drive(asked, row, here)
+                row.drive(here / "driven", *asked.options)
         if frozen := Families.read(here / "frozen"):
             tables.append(written(asked, frozen, driven(asked, here)))
     text = "\n\n".join(tables)
     print(text)
     if given.page:
         write_tables(given.page, text)
-
-
-def drive(asked: Asked, row: Row, here: Path) -> None:
-    """Drive the layouts of each family in every condition, unless it is done."""
-    for name in suites.datasets(row.dataset):
-        dataset, out = load(find(name)), here / "driven" / name
-        if not (out / "run.json").exists():
-            layouts = min(row.limit or len(dataset.episodes), len(dataset.episodes))
-            where = ("--episodes", str(layouts), "--first-seed", str(dataset.seeds[0]))
-            scenario = ("--scenario", scenarios.argument(dataset.scenario))
-            words = (*row.who, *scenario, *where, *asked.options)
-            harness("drive", *words, "--out", str(out), "--quiet")
 
 
 def driven(asked: Asked, here: Path) -> Families | None:
