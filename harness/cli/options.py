@@ -383,6 +383,19 @@ def _gathering(command: Any, name: str, added: Sequence[inspect.Parameter]) -> A
     return as_command(typed, command, [*parameters[:place], *added, *parameters[place + 1 :]])
 
 
+def check_new_file(option: str, path: Path, named: str = "it") -> None:
+    """Raise UserError unless a TOML file can be written that runs name afterwards.
+
+    `path` was given as `option`; `named` is what runs name, in words.
+    """
+    if path.suffix != ".toml":
+        raise UserError(f"{option} {printable(path)}: end it in .toml")
+    if path.exists():
+        raise UserError(
+            f"{option} {printable(path)} is there already; give a new name, since runs name {named}"
+        )
+
+
 def scenario_name(name: str | None, of_family: Mapping[str, str]) -> str:
     """Return the scenario's name that was typed, or that of a family by its options.
 

@@ -143,6 +143,12 @@ def worded(
         ) from error
 
 
+def label(kind: str, thing: object) -> str:
+    """Return what messages call a package's object: its `kind`, its class and that one's module."""
+    named = type(thing)
+    return f"{kind} {printable(named.__name__)} of {printable(named.__module__)}"
+
+
 def ends_the_program(error: BaseException) -> bool:
     """Return whether an exception would end the program without being an error.
 

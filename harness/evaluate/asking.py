@@ -466,15 +466,16 @@ class Asker:
         as without them. `codes`, `(K,)`, and `rewrites` say what each hears (`stream_sets`).
         """
         sets = stream_sets(self.spec.scenario, scenes, stream, codes, rewrites)
-        lacking = [each for each in sets if each[1] and not self._has(fusion_id(*each))]
+        # Who has heard nothing has the id of the plain question.
+        ids = [fusion_id(*each) for each in sets]
+        pairs = zip(sets, ids, strict=True)
+        lacking = [each for each, name in pairs if each[1] and not self._has(name)]
         if lacking:
             self.answer(list(stream_requests(self.spec, scenes, lacking)))
-        answers: list[list[Answer | None]] = []
-        for scene, senders in sets:
-            # Who has heard nothing has the id of the plain question.
-            answer = self.answers.get(fusion_id(scene, senders))
-            answers.append([answer, *[None] * (len(scene.viewers) - 1)])
         of_egos = [scene for scene, _ in sets]
+        answers: list[list[Answer | None]] = []
+        for scene, name in zip(of_egos, ids, strict=True):
+            answers.append([self.answers.get(name), *[None] * (len(scene.viewers) - 1)])
         laid_out = intents_of(self.spec, self.latency, of_egos, answers)
         sent = stream.sent(self.spec.scenario, of_egos)
         allowed_s = np.zeros((len(sets), max(len(scene.viewers) for scene in scenes) - 1))

@@ -7,7 +7,6 @@ import numpy as np
 
 from harness.core import strangers
 from harness.core.arrays import ROUNDING, Floats, Ints, check_shape, numbers, read_only
-from harness.core.errors import printable
 from harness.radio.channel import (
     REQUEST,
     Broadcast,
@@ -179,8 +178,7 @@ def busy_ratio(channel: Physical) -> float:
 
 def label(channel: Channel) -> str:
     """Return what messages call a channel of a package, by its class and module."""
-    kind = type(innermost(channel))
-    return f"channel {printable(kind.__name__)} of {printable(kind.__module__)}"
+    return strangers.label("channel", innermost(channel))
 
 
 @dataclass(frozen=True)

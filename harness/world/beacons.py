@@ -42,7 +42,7 @@ from msgspec.structs import replace
 
 from harness.core import noise
 from harness.core.arrays import Floats
-from harness.radio.fading import Trips
+from harness.radio.fading import NO_SEED, Trips
 from harness.radio.wrapped import link_loss
 from harness.world.parameters import Parameters, beacon_radio
 from harness.world.sight_lines import site
@@ -53,7 +53,6 @@ BITS = 8 * 190
 # T_GenCam_DCC, T_GenCamMax and N_GenCam of EN 302 637-2
 SHORTEST_S, LONGEST_S, UNMOVED = 0.1, 1.0, 3
 TURN_RAD, MOVE_M, CHANGE_MPS = math.radians(4), 4.0, 0.5
-NO_SEED = -1  # in place of the channel's seed, since beacons belong to the layout
 ROUNDING_S = 1e-9
 
 

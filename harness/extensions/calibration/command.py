@@ -8,7 +8,7 @@ import typer
 
 from harness.cli import options
 from harness.cli.terminal import echo_json
-from harness.core.errors import UserError, printable, unknown
+from harness.core.errors import printable, unknown
 
 
 def command(
@@ -37,12 +37,7 @@ def command(
 
     if level not in get_args(Level):
         raise unknown("--level", level, get_args(Level))
-    if out.suffix != ".toml":
-        raise UserError(f"--out {printable(out)}: end it in .toml")
-    if out.exists():
-        raise UserError(
-            f"--out {printable(out)} is there already; give a new name, since runs name it"
-        )
+    options.check_new_file("--out", out)
     calibration, fitted = calibrate(
         run, cast(Level, level), dataset, shlex.join(["harness", *sys.argv[1:]])
     )

@@ -71,7 +71,9 @@ def command(
             if not 0 < value < 100:
                 raise UserError(f"{name} {value:g}: give percent, between 0 and 100")
     if write is not None:
-        _check_file(write, at_most)
+        options.check_new_file("--write", write)
+        if len(at_most) != 1:
+            raise UserError("--write: a file has one promise; give one --at-most")
     with bar("settings", quiet=as_json or quiet, grows=True) as progress:
         cards = options.cards(model)
         played = [ReplayedRun(run, latency, progress, not no_model, models=cards) for run in runs]
@@ -89,15 +91,3 @@ def command(
         write_fit(promise_of(result, result.levels[0], line), write)
         if not (as_json or quiet):
             typer.echo(f"wrote {printable(write)}")
-
-
-def _check_file(write: Path, at_most: list[float]) -> None:
-    """Raise UserError for a file that cannot be written, or for none or several levels."""
-    if write.suffix != ".toml":
-        raise UserError(f"--write {printable(write)}: end it in .toml")
-    if write.exists():
-        raise UserError(
-            f"--write {printable(write)} is there already; give a new name, since runs name it"
-        )
-    if len(at_most) != 1:
-        raise UserError("--write: a file has one promise; give one --at-most")

@@ -41,12 +41,7 @@ def learn(
     from harness.extensions.schedules.learning import ROUNDS, run_learn
     from harness.studies.replayed_run import ReplayedRun
 
-    if out.suffix != ".toml":
-        raise UserError(f"--out {printable(out)}: end it in .toml")
-    if out.exists():
-        raise UserError(
-            f"--out {printable(out)} is there already; give a new name, since runs name schedules"
-        )
+    options.check_new_file("--out", out, "schedules")
     point, cards = named_point(condition), options.cards(model)
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:

@@ -188,11 +188,11 @@ class Cpms:
 
     def sent(self, scenario: Scenario, scenes: Sequence[Scene]) -> Sent:
         cpms, places = list[Cpm](), list[int]()
-        for n, scene in enumerate(scenes):
+        of_scenes = stretches(scenario, scenes, self.interval_s)
+        for n, (scene, each) in enumerate(zip(scenes, of_scenes, strict=True)):
             if scene.before():
-                of_scene = stretch(scenario, scene, self.interval_s).cpms
-                cpms += of_scene
-                places += [n] * len(of_scene)
+                cpms += each.cpms
+                places += [n] * len(each.cpms)
         bits, place = self.bits(cpms), np.array(places, dtype=int)
         sums = []
         for of_each in (np.ones(len(cpms)), bits, self._airtime_s(bits)):
@@ -207,9 +207,10 @@ class Cpms:
         if not self.between_s:
             return [{} for _ in scenes]
         by_sender: list[Mapping[str, float]] = []
-        for scene in scenes:
-            last_s, now_s = stretch(scenario, scene, self.interval_s).last_s, scene.state.time_s
-            until_s = {sender: at_s + self.between_s - now_s for sender, at_s in last_s.items()}
+        of_scenes = stretches(scenario, scenes, self.interval_s)
+        for scene, each in zip(scenes, of_scenes, strict=True):
+            now_s = scene.state.time_s
+            until_s = {name: at_s + self.between_s - now_s for name, at_s in each.last_s.items()}
             by_sender.append({sender: max(wait_s, 0.0) for sender, wait_s in until_s.items()})
         return by_sender
 

@@ -18,9 +18,9 @@ from harness.coordination.sent import SentIntents
 from harness.core import noise
 from harness.core.arrays import Bools, Floats, Ints, check_distributions, check_shape, read_only
 from harness.core.errors import UserError
-from harness.core.strangers import is_ours, worded
+from harness.core.strangers import is_ours, label, worded
 from harness.evaluate.draws import OF_ANOTHER_AGENT
-from harness.extensions.trust.attacks import Attack, Turn, attackers, label
+from harness.extensions.trust.attacks import Attack, Turn, attackers
 from harness.radio.channel import Draws
 from harness.radio.fading import Trips
 
@@ -100,7 +100,7 @@ def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:
     """
     if is_ours(attack):
         return attack.act(sent, turn)
-    with worded(label(attack)):
+    with worded(label("attack", attack)):
         after = attack.act(read_only(sent), read_only(turn))
         if after.voice_of is None:
             after = replace(after, site=sent.site, outlook=sent.outlook, plans=sent.plans)

@@ -508,12 +508,6 @@ ATTACKS: Plugins[Attack] = Plugins(
 
 
 @lru_cache(maxsize=256)
-def label(attack: Attack) -> str:
-    """Return what messages call a package's attack, by its class and module."""
-    kind = type(attack)
-    return f"attack {kind.__name__} of {printable(kind.__module__)}"
-
-
 def attacks_of(text: str) -> tuple[Attack, ...]:
     """Return the attacks that a text such as `liar:share=1/3+spoof` names, in the order they act.
 

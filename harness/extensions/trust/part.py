@@ -13,7 +13,7 @@ from harness.coordination.rules import EGO_PROMPT
 from harness.coordination.sent import Speaker
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import unknown
-from harness.core.strangers import is_ours
+from harness.core.strangers import is_ours, label
 from harness.extensions.trust.attacks import (
     ATTACKS,
     Attack,
@@ -21,7 +21,6 @@ from harness.extensions.trust.attacks import (
     Spoof,
     attacks_of,
     in_question,
-    label,
 )
 from harness.extensions.trust.changes import MESSAGES, AttackersMessage
 
@@ -174,7 +173,7 @@ class Guard(Part, frozen=True, kw_only=True):
             attacks = attacks_of(text)
             change = AttackersMessage(attacks)
             of_packages = [attack for attack in attacks if not is_ours(attack)]
-            return ChangeOfPart(label(of_packages[0]), change) if of_packages else change
+            return ChangeOfPart(label("attack", of_packages[0]), change) if of_packages else change
         return None
 
     def after_call(self, fused: Floats, intents: Floats, heard: Bools) -> Floats:
