@@ -27,6 +27,7 @@ from harness.coordination.consensus import Fused, Messages, linear_pool
 from harness.coordination.trigger import entropy_nats, normalised_entropy
 from harness.core.arrays import Bools, Floats
 
+CERTAIN = 1e9  # evidence that nothing outweighs
 CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, time
 
 
@@ -149,6 +150,17 @@ class Trust:
         )
         weights = np.where(weights > 0, weights, 0.0)
         return np.asarray(weights / np.sum(weights, axis=-1, keepdims=True))
+
+
+def trusting_only(trusted: Bools, actions: int) -> Floats:
+    """Return a memory of the rule that trusts some helpers, whatever they say, and no others.
+
+    It bounds what the rule could be brought to do. `trusted` is a mask of n decisions and H
+    helpers, `(n, H)`, and A is the number of `actions`; the result is `(n, K)`.
+    """
+    state = np.full((*trusted.shape, 2 + actions + CLAIM), np.nan)
+    state[..., :2] = np.where(trusted[..., None], (CERTAIN, 0.0), (0.0, CERTAIN))
+    return state.reshape(len(trusted), -1)
 
 
 def _claims_of(messages: Messages) -> Floats:

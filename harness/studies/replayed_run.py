@@ -143,6 +143,11 @@ class ReplayedRun:
         )
         refuse_others(self.run)
 
+    @property
+    def asks(self) -> bool:
+        """Return whether the run's model may be asked what the run has no answer to."""
+        return self._asks
+
     def _set_left(self, count: int) -> None:
         self._left = count
         self._progress.more(count)

@@ -56,12 +56,13 @@ class Attackers:
                 "attacks need layouts, and the paper's study has none; leave attack out"
             )
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
+        of_step = _of_helpers(uniforms[..., 1], draws.trips)
         first, past = self._remembered(truth, episodes)
-        present, sent = np.isfinite(truth.range_m), truth
+        sent = truth
         attacking = np.zeros(truth.valid.shape, dtype=bool)
         for attack in self._attacks:
-            drawn = _of_helpers(attackers(attack.share, present, uniforms[..., 0]), draws.trips)
-            turn = Turn(truth, drawn, first, past, _of_helpers(uniforms[..., 1], draws.trips))
+            drawn = attackers_among(attack.share, truth, draws)
+            turn = Turn(truth, drawn, first, past, of_step)
             sent = _acted(attack, sent, turn)
             attacking |= drawn
         for intents, place in zip(truth.helpers, episodes, strict=True):
@@ -89,6 +90,18 @@ class Attackers:
             if steps:
                 first[decision, : len(steps[0])] = steps[0][: first.shape[1]]
         return first, past
+
+
+def attackers_among(share: float, truth: Intents, draws: Draws) -> Bools:
+    """Return which of H helpers attack in n decisions, `(n, H)`, of a share of those present.
+
+    `truth` says who is present, and `draws` have the keys of the channel's random numbers. The
+    same helpers attack in all decisions of an episode, as long as the same are present.
+    """
+    assert draws.trips is not None
+    uniforms = _uniforms(draws.trips, truth.valid.shape[1])
+    drawn = attackers(share, np.isfinite(truth.range_m), uniforms[..., 0])
+    return np.asarray(_of_helpers(drawn, draws.trips))
 
 
 def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:

@@ -6,7 +6,7 @@ have the same episodes, channel draws and attackers, so differences are paired b
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property, lru_cache, partial
 from itertools import product
@@ -31,6 +31,13 @@ from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.spec import files_of
 from harness.evaluate.walk import Decided
+from harness.extensions.trust.strongest_lies import StrongestLies, strongest_lies
+from harness.extensions.trust.worst_page import (
+    worst_headline,
+    worst_mapping,
+    worst_rows,
+    worst_tables,
+)
 from harness.report.document import Table, strong
 from harness.runs.alike import setup
 from harness.runs.estimates import over_episodes
@@ -256,6 +263,9 @@ class Bench:
     # why no rule changes anything here, in words; None where rules do. The linear pool is then the
     # only rule, in name
     unfused: str | None = None
+    # what the strongest lies by the first share of helpers do, by rule; empty where they were not
+    # looked for
+    strongest_lies: Mapping[str, StrongestLies] = field(default_factory=dict)
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
@@ -466,6 +476,15 @@ def run_bench(
     for key in every:
         cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)
+    lies = dict[str, StrongestLies]()
+    if run.asks and not unfused:
+        progress.more(len(every_rule))
+        for rule in every_rule:
+            honest = under(point, rule, PEACE, 0.0)
+            find = partial(_found_lies, run, honest, shares[0], seeds)
+            lies[rule] = StrongestLies.of(kept.part((rule, "worst", shares[0]), find))
+            run.settle()
+            progress(1)
     [[alone]] = run.walked(
         [Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds
     )
@@ -480,7 +499,12 @@ def run_bench(
         Success(run.dataset.dangerous, run.dataset.clusters),
         run.caveats,
         unfused,
+        lies,
     )
+
+
+def _found_lies(*options: Any) -> dict[str, Floats]:
+    return strongest_lies(*options).values()
 
 
 def trust_study(bench: Bench) -> Study:
@@ -493,6 +517,7 @@ def trust_study(bench: Bench) -> Study:
     import pandas as pd
 
     rows = [row for cell in bench.cells.values() for row in _rows(bench, cell)]
+    rows += worst_rows(bench)
     cells = [_cell(bench, cell) for cell in bench.cells.values()]
     means = [
         {"rule": rule, "share": share, **as_mapping(bench.mean(rule, share))}
@@ -511,7 +536,8 @@ def trust_study(bench: Bench) -> Study:
             f"{bench.success_rule.words} from linear while nobody attacks, in points. All figures "
             "are in figures.csv."
         ],
-        [table for share in bench.shares for table in _tables(bench, share)]
+        [*worst_tables(bench)]
+        + [table for share in bench.shares for table in _tables(bench, share)]
         + [*_detections(bench)],
         {"figures": pd.DataFrame(rows)},
         {
@@ -531,6 +557,7 @@ def trust_study(bench: Bench) -> Study:
             "cells": cells,
             "alone": as_mapping(bench.success_rule.estimate(bench.alone)),
             "means": means,
+            "worst": worst_mapping(bench),
         },
         lambda draws: {"heat-map": _heat_map(draws, bench)},
         bench.caveats,
@@ -581,6 +608,7 @@ def headline(bench: Bench) -> list[str]:
             f"{bench.unfused}; what is called linear is the ego's own answer.",
         ]
     sentences = [
+        *worst_headline(bench),
         f"While nobody attacks, {words} is {interval_of(peace)} % under the linear pool, and "
         f"{interval_of(alone)} % with an ego that never asks.",
         f"If {100 * share:.0f} % of the helpers attack, {_worst(bench, share)}",

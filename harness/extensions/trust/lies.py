@@ -1,0 +1,75 @@
+"""The space of lies that a search for the strongest one goes through.
+
+A lie is what liars say in one decision: a message, or silence. With a false place or several voices
+they also claim who and where they are, the same in the whole episode.
+"""
+
+from dataclasses import replace
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from harness.coordination.intents import Intents
+from harness.core.arrays import Bools, Floats
+
+# What liars may claim of who and where they are, the same in a whole episode: attacks, by the name
+# of the space, which has the spaces before it, too. At the false place Eq. 2 gives the most weight.
+WORDS, PLACES, VOICES = "worst", "worst+place", "worst+voices"
+CLAIMS = {
+    WORDS: ("",),
+    PLACES: ("spoof:distance_m=0",),
+    VOICES: ("sybil", "spoof:distance_m=0+sybil"),
+}
+# Rules for which certainty of an action is the lie that brings it about, if any does: a voice's
+# probability of an action only raises its share, and lowers no other's.
+ONE_HOT_SUFFICES = frozenset(
+    ("linear", "log-pool", "median", "trimmed-mean", "trimmed-heads", "bayes")
+)
+MOST_POINTS = 130  # of a lattice of messages
+STEPS = (10, 5, 4, 2)  # parts of 1 in which a lattice divides probabilities
+TOWARDS = (0.2, 0.4, 0.6, 0.8)
+
+
+def certain(actions: int) -> list[Floats]:
+    """Return the messages that are certain of one of `actions` actions, `(A,)` each."""
+    return list(np.eye(actions))
+
+
+def lattice(actions: int) -> Floats:
+    """Return all messages whose probabilities of `actions` actions have equal steps, `(k, A)`.
+
+    A step is a tenth with three actions, a fifth with five: k is at most `MOST_POINTS`.
+    """
+    for steps in STEPS:
+        every = combinations_with_replacement(range(actions), steps)
+        counts = [np.bincount(parts, minlength=actions) for parts in every]
+        if len(counts) <= MOST_POINTS:
+            break
+    return np.array(counts) / steps
+
+
+def near_others(voices: Floats) -> list[Floats]:
+    """Return messages near what others say, which a rule that compares them lets pass, `(n, A)`.
+
+    `voices` `(n, 1+H, A)` is what the ego and H helpers intend, probabilities of A actions. The
+    messages are each of these, and points on the way from each to certainty of an action.
+    """
+    messages = list[Floats]()
+    for voice in range(voices.shape[1]):
+        other = voices[:, voice]
+        messages.append(other)
+        for sure in certain(voices.shape[-1]):
+            messages += [other + share * (sure - other) for share in TOWARDS]
+    return messages
+
+
+def with_message(truth: Intents, liars: Bools, message: Floats) -> Intents:
+    """Return what helpers send if liars, `(n, H)`, all say a message, `(A,)` or `(n, A)`,
+    or each its own, `(n, H, A)`.
+
+    `truth` has what they would send, in n decisions. A message with a NaN changes nothing.
+    """
+    every = message if message.ndim == 3 else np.expand_dims(message, -2)
+    lies = liars[..., None] & ~np.isnan(every).any(axis=-1, keepdims=True)
+    helpers = np.where(lies, every, truth.helpers)
+    return replace(truth, helpers=helpers)

@@ -1,0 +1,134 @@
+"""Say in a study of trust what the strongest lies leave of each rule."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from harness.core.arrays import Floats
+from harness.core.figures import as_mapping, interval_of, some_of
+from harness.core.statistics import Estimate
+from harness.extensions.trust.lies import CLAIMS, PLACES, VOICES, WORDS
+from harness.extensions.trust.strongest_lies import space_of
+from harness.report.document import Table
+from harness.runs.estimates import over_episodes
+from harness.studies.study import ends
+
+if TYPE_CHECKING:
+    from harness.extensions.trust.study import Bench
+
+NAMES = {WORDS: "words", PLACES: "and a false place", VOICES: "and three voices"}
+
+
+def left(bench: "Bench", rule: str, space: str) -> Floats:
+    """Return which episodes succeed under the strongest lie of a space, (S, E), by one rule.
+
+    Of attacks that ship, those of the space that were played are among the lies.
+    """
+    success = bench.strongest_lies[rule].success[space]
+    spaces = list(CLAIMS)[: list(CLAIMS).index(space) + 1]
+    for attack in bench.attacks:
+        if space_of(attack) in spaces:
+            success = np.fmin(success, bench.at(rule, attack, bench.shares[0]).success)
+    return success
+
+
+def worst_headline(bench: "Bench") -> Iterator[str]:
+    """Yield a sentence on what the strongest lies leave, if they were looked for."""
+    if not bench.strongest_lies:
+        return
+    success_rule, share = bench.success_rule, bench.shares[0]
+    losses = {rule: left(bench, rule, WORDS) for rule in bench.strongest_lies}
+    best, *close = success_rule.most(losses)
+    most = interval_of(success_rule.estimate(losses[best]))
+    first = next(iter(losses))
+    linear = interval_of(success_rule.estimate(losses[first]))
+    alike = f", not told from {some_of(close)}" if close else ""
+    yield (
+        f"If {100 * share:.0f} % of the helpers say, from true places, what harms most, "
+        f"{success_rule.words} is {linear} % under {first}, and {most} % at the most, under {best}"
+        f"{alike}; with an ego that never asks it is "
+        f"{interval_of(success_rule.estimate(bench.alone))} %."
+    )
+
+
+def worst_tables(bench: "Bench") -> Iterator[Table]:
+    """Yield what the strongest lies leave of each rule, and how many liars it withstands."""
+    if not bench.strongest_lies:
+        return
+    words, share = bench.success_rule.words, bench.shares[0]
+    alone = interval_of(bench.success_rule.estimate(bench.alone))
+    rows = []
+    for rule in bench.strongest_lies:
+        estimates = _estimates(bench, rule)
+        values = [interval_of(estimates[name]) for name in (*CLAIMS, "at_least", "worst_unsafe")]
+        rows.append((rule, interval_of(bench.success(rule)), *values))
+    rows.append(("never asks", *[alone] * 5, ""))
+    heads = ("rule", "nobody lies", *NAMES.values(), "at least", "unsafe by words")
+    yield Table(
+        f"{100 * share:.0f} % of the helpers lie as well as they can: {words}, %",
+        heads,
+        rows,
+        "Liars know all: each answer, the rule, its memory, and where each action leads. They say "
+        "what loses most episodes: words alone, from their true places; or claim to be on the "
+        "ego's way, 0 m before the zone; or to be three. All say the same. For linear, log-pool, "
+        "median, trimmed-mean, trimmed-heads and bayes no other message does more; for other rules "
+        "without memory messages go in steps of a tenth (a fifth with five actions); for trust "
+        "those near others' messages, and 'at least' is what it keeps whatever is said from true "
+        "places. Unsafe: episodes that end so by words that aim at this.",
+        terminal=range(4),
+    )
+    rows = []
+    for rule in bench.strongest_lies:
+        withstands = [interval_of(estimate) for estimate in _withstands(bench, rule)]
+        rows.append((rule, *withstands))
+    counts = ("no liar", "any one liar", "any two liars")[: len(rows[0]) - 1]
+    yield Table(
+        f"Certificates: {words} whatever liars say from true places, whoever they are, %",
+        ("rule", *counts),
+        rows,
+        "Every helper, and every pair, is tried as the liars, who say what harms most.",
+        terminal=range(len(counts) + 1),
+    )
+
+
+def worst_rows(bench: "Bench") -> Iterator[dict[str, Any]]:
+    """Yield the rows of `figures.csv` on the strongest lies."""
+    for rule in bench.strongest_lies:
+        place = {"rule": rule, "attack": WORDS, "share": bench.shares[0]}
+        for name, estimate in _estimates(bench, rule).items():
+            is_space = name in CLAIMS
+            metric = bench.success_rule.metric if is_space else name
+            attack = name if is_space else WORDS
+            yield {**place, "attack": attack, "metric": metric, **ends(estimate)}
+        for count, estimate in enumerate(_withstands(bench, rule)):
+            yield {**place, "metric": f"withstands_{count}_liars", **ends(estimate)}
+
+
+def worst_mapping(bench: "Bench") -> dict[str, Any]:
+    """Return the figures on the strongest lies for `--json`, by rule."""
+    rules = dict[str, Any]()
+    for rule in bench.strongest_lies:
+        figures = {name: as_mapping(each) for name, each in _estimates(bench, rule).items()}
+        withstands = [as_mapping(each) for each in _withstands(bench, rule)]
+        rules[rule] = {**figures, "withstands": withstands}
+    return rules
+
+
+def _estimates(bench: "Bench", rule: str) -> dict[str, Estimate]:
+    """Return the means with intervals of a rule's worst case, by name."""
+    case, success_rule = bench.strongest_lies[rule], bench.success_rule
+    estimates = {space: success_rule.estimate(left(bench, rule, space)) for space in CLAIMS}
+    estimates["at_least"] = success_rule.estimate(np.fmin(case.at_least, left(bench, rule, WORDS)))
+    unsafe = over_episodes("unsafe_rate", case.unsafe, success_rule.clusters)
+    return {**estimates, "worst_unsafe": unsafe}
+
+
+def _withstands(bench: "Bench", rule: str) -> list[Estimate]:
+    """Return how much success there is with 0, 1, … liars, whoever they are, under a rule."""
+    most = max(int(np.max(case.liars)) for case in bench.strongest_lies.values())
+    estimates = []
+    for count in range(most):
+        withstands = (bench.strongest_lies[rule].liars > count).astype(float)
+        estimates.append(bench.success_rule.estimate(withstands))
+    return estimates

@@ -1,0 +1,173 @@
+"""The strongest lies: no other message does more, brute force agrees, and bounds hold."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evaluating import Watched, run, spec_of
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from harness.coordination.consensus import Messages, inverse_distance_weights
+from harness.coordination.coordinate import FusionInputs, fuse
+from harness.coordination.exchange import exchange
+from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.rules import RULES
+from harness.dataset.load import Dataset
+from harness.evaluate.draws import channel_draws, tie_draws
+from harness.extensions.trust import lies
+from harness.extensions.trust.attackers import attackers_among
+from harness.extensions.trust.strongest_lies import space_of, strongest_lies
+from harness.extensions.trust.study import PEACE, Bench, run_bench, trust_study, under
+from harness.extensions.trust.worst_page import left
+from harness.studies.replayed_run import ReplayedRun
+from harness.studies.sweep import point_of
+
+EXACT = (*sorted(lies.ONE_HOT_SUFFICES), "linear:weight_cap=0.3")
+IN_STEPS = ("geometric-median", "centred-clipping")
+ATTACKS = (
+    "liar", "brake", "random", "stuck", "stale", "replay", "silent", "overconfident",
+    "spoof", "liar+spoof", "jump", "liar+jump", "sybil", "liar+sybil", "flood",
+)  # fmt: skip
+THIRD = 1 / 3
+
+
+@pytest.fixture(scope="module")
+def stored(small: Dataset, tmp_path_factory: pytest.TempPathFactory) -> ReplayedRun:
+    return ReplayedRun(run(spec_of(small), tmp_path_factory.mktemp("worst") / "run").out)
+
+
+@pytest.fixture(scope="module")
+def bench(stored: ReplayedRun, tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    rules, out = (*EXACT, *IN_STEPS, "trust"), tmp_path_factory.mktemp("worst") / "bench"
+    return run_bench(stored, "6g", rules, ATTACKS, (THIRD,), stored.seeds, out, Watched())
+
+
+def distributions(voices: int) -> st.SearchStrategy[np.ndarray]:
+    weights = arrays(float, (voices, 3), elements=st.floats(0.01, 1))
+    return weights.map(lambda each: each / each.sum(axis=-1, keepdims=True))
+
+
+@pytest.mark.parametrize("name", sorted(lies.ONE_HOT_SUFFICES))
+@given(
+    p=distributions(5), metres=arrays(float, 5, elements=st.floats(1, 60)), said=distributions(1)
+)
+def test_whatever_a_liar_says_certainty_of_that_action_does_as_well(
+    name: str, p: np.ndarray, metres: np.ndarray, said: np.ndarray
+) -> None:
+    heard = np.ones(4, dtype=bool)
+    weights = inverse_distance_weights(metres, heard, 1.0)
+    rule = RULES[name]
+
+    def policy(message: np.ndarray) -> np.ndarray:
+        intents = np.concatenate([p[:-1], message])
+        messages = Messages(intents, weights, heard, np.zeros(4), metres, metres[1:])
+        return rule.fuse(messages, rule.start((), 4, 3)).policy
+
+    by_any = policy(said)
+    action = int(np.argmax(by_any))
+    if np.sort(by_any)[-2] < by_any[action] - 1e-6:
+        assert np.argmax(policy(np.eye(3)[[action]])) == action
+
+
+@pytest.mark.parametrize("name", [*sorted(lies.ONE_HOT_SUFFICES), *IN_STEPS])
+def test_brute_force_over_all_messages_of_a_lattice_finds_no_more_and_no_less(
+    stored: ReplayedRun, bench: Bench, name: str
+) -> None:
+    point = under(point_of([stored], "6g"), name, PEACE, 0.0)
+    forest = stored.dataset.forest
+    for tree, root in enumerate(forest.root.tolist()):
+        lost = loses(stored, point, root)
+        found = bench.strongest_lies[name].success[lies.WORDS][0, tree]
+        assert lost == (found == 0), forest.ids[root]
+
+
+def loses(stored: ReplayedRun, point: OperatingPoint, node: int) -> bool:
+    """Return whether some message at a decision point, or later, loses the episode."""
+    forest = stored.dataset.forest
+    tree = forest.tree[node]
+    [scene] = stored.dataset.scenes([forest.ids[node]])
+    messages = np.concatenate([lies.lattice(3), [[np.nan] * 3]])
+    n = len(messages)
+    truth = stored.whole([scene]).take(np.zeros(n, dtype=int))
+    seed, layout = np.full(n, stored.seeds[0]), np.full(n, forest.seeds[tree])
+    steps = stored.dataset.scenario.parameters.decisions
+    draws = channel_draws(seed, layout, np.full(n, forest.step[node]), steps, truth.valid.shape[1])
+    liars = attackers_among(THIRD, truth, draws)
+    heard = exchange(point, truth, draws)
+    ties = FusionInputs(None, None, tie_draws(draws, stored.spec.ties))
+    spoken = fuse(point, heard, lies.with_message(truth, liars, messages), ties).action
+    heard.on_time[liars] = False
+    actions = {*spoken.tolist(), *fuse(point, heard, truth, ties).action.tolist()}
+    for action in actions:
+        child = forest.child[node, action]
+        if not forest.safe[node, action] or (child >= 0 and loses(stored, point, child)):
+            return True
+    return False
+
+
+def test_without_a_liar_an_episode_ends_as_it_does_in_peace(bench: Bench) -> None:
+    for rule, case in bench.strongest_lies.items():
+        assert np.array_equal(case.liars > 0, bench.at(rule).success == 1), rule
+
+
+def test_no_attack_that_ships_does_more(bench: Bench) -> None:
+    for rule in (*EXACT, *IN_STEPS):
+        case = bench.strongest_lies[rule]
+        for attack in ATTACKS:
+            if space_of(attack) == lies.WORDS:
+                cell = bench.at(rule, attack, THIRD)
+                assert np.all(case.success[lies.WORDS] <= cell.success), (rule, attack)
+                assert np.all(case.unsafe >= cell.unsafe), (rule, attack)
+    for rule in bench.strongest_lies:
+        for attack in ATTACKS:
+            worst = left(bench, rule, space_of(attack))
+            assert np.all(worst <= bench.at(rule, attack, THIRD).success), (rule, attack)
+
+
+def test_what_trust_keeps_in_any_case_no_lie_and_no_attack_takes(bench: Bench) -> None:
+    case = bench.strongest_lies["trust"]
+    assert np.all(case.at_least <= case.success[lies.WORDS])
+    for attack in ATTACKS:
+        if space_of(attack) == lies.WORDS:
+            assert np.all(case.at_least <= bench.at("trust", attack, THIRD).success), attack
+
+
+def test_rules_that_count_heads_withstand_one_liar_where_all_others_agree(bench: Bench) -> None:
+    linear, median = (bench.strongest_lies[rule] for rule in ("linear", "geometric-median"))
+    assert (median.liars > 1).sum() > (linear.liars > 1).sum()
+    assert (linear.liars == 1).any()
+
+
+def test_claims_only_add_to_words(bench: Bench) -> None:
+    for case in bench.strongest_lies.values():
+        assert np.all(case.success[lies.PLACES] <= case.success[lies.WORDS])
+        assert np.all(case.success[lies.VOICES] <= case.success[lies.PLACES])
+
+
+def test_the_study_begins_with_the_strongest_lies(bench: Bench) -> None:
+    study = trust_study(bench)
+    assert "say, from true places, what harms most" in study.headline[0]
+    first, second = study.tables[:2]
+    assert first.title.startswith("33 % of the helpers lie as well as they can")
+    assert second.title.startswith("Certificates")
+    assert len(first.rows) == len(bench.rules) + 1
+    assert set(study.answer["worst"]) == set(bench.rules)
+
+
+def test_without_a_model_nothing_is_looked_for(small: Dataset, tmp_path: Path) -> None:
+    whole = run(spec_of(small, ask="all", seeds=(0,)), tmp_path / "run")
+    silent = ReplayedRun(whole.out, asks=False)
+    played = run_bench(
+        silent, "6g", ("linear",), ("silent",), (THIRD,), (0,), tmp_path / "bench", Watched()
+    )
+    assert not played.strongest_lies
+    assert "harms most" not in " ".join(trust_study(played).headline)
+
+
+def test_a_worst_case_is_kept_as_it_was_found(stored: ReplayedRun) -> None:
+    point = point_of([stored], "6g")
+    case = strongest_lies(stored, point, THIRD, (0,))
+    again = type(case).of(case.values())
+    assert all(np.array_equal(value, again.values()[k]) for k, value in case.values().items())
