@@ -210,10 +210,7 @@ class ReplayedRun:
             UserError: an operating point needs a fusion call, in which the ego's model reads
                 messages, and the run's model cannot make it.
         """
-        every_point = tuple(dict.fromkeys(setting.point for setting in settings))
-        # which checks that they go together
-        spec = replace(self._asker.spec, points=every_point)
-        spec.check_models(self.run.manifest.identity)
+        self.check([setting.point for setting in settings])
         at_once = max(1, WALKS // (len(seeds) * len(self.dataset.episodes)))
         for vehicles, same in groupby(settings, lambda setting: setting.vehicles):
             points = [setting.point for setting in same]
@@ -221,6 +218,11 @@ class ReplayedRun:
             starts = (0, *range(few, len(points), at_once))
             for first, after in pairwise((*starts, len(points))):
                 yield from self._walked(points[first:after], vehicles, seeds, read)
+
+    def check(self, points: Sequence[OperatingPoint]) -> None:
+        """Raise UserError if the run's model cannot make what conditions need, a fusion call."""
+        spec = replace(self._asker.spec, points=tuple(dict.fromkeys(points)))
+        spec.check_models(self.run.manifest.identity)
 
     def _walked(
         self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int], read: Read

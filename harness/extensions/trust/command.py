@@ -46,7 +46,7 @@ def command(
         help="Consensus rules, separated by commas: linear, log-pool, median, trimmed-mean, "
         "trimmed-heads, "
         "geometric-median, centred-clipping, bayes or trust; linear:weight_cap=0.3 changes a "
-        "setting.",
+        "setting. Against ego-prompt the strongest messages alone are looked for.",
     ),
     share: str = typer.Option(
         "0,1/3,2/3", help="Shares of the helpers that attack, 0 to 1; 0 is always played as well."
@@ -75,7 +75,7 @@ def command(
     from harness.backends.cache import default_file
     from harness.backends.registry import open_backend
     from harness.coordination.contents import INTENTS
-    from harness.coordination.rules import RULES, reads
+    from harness.coordination.rules import EGO_PROMPT, RULES, reads
     from harness.evaluate.run import read_or_evaluate
     from harness.extensions.trust.attacks import ATTACKS
     from harness.extensions.trust.study import names_of, run_bench, shares_of, trust_study
@@ -83,7 +83,9 @@ def command(
 
     attack_names = names_of("--attacks", attacks, tuple(ATTACKS))
     rule_names, shares = (
-        names_of("--rules", rules, tuple(rule for rule in RULES if INTENTS in reads(rule))),
+        names_of(
+            "--rules", rules, (*(rule for rule in RULES if INTENTS in reads(rule)), EGO_PROMPT)
+        ),
         shares_of(share),
     )
     if (run is None and model is None) or (run and prompt):

@@ -10,7 +10,10 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from harness.coordination.intents import Intents
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.arrays import Bools, Floats
+from harness.core.errors import UserError
+from harness.extensions.trust.attacks import ATTACKS, INSTRUCTIONS
 
 # What liars may claim of who and where they are, the same in a whole episode: attacks, by the name
 # of the space, which has the spaces before it, too. At the false place Eq. 2 gives the most weight.
@@ -27,6 +30,12 @@ ONE_HOT_SUFFICES = frozenset(
 )
 MOST_POINTS = 130  # of a lattice of messages
 STEPS = (10, 5, 4, 2)  # parts of 1 in which a lattice divides probabilities
+# further settings of attacks, of which a model is asked
+MORE = {
+    "liar": ("liar:says=permuted",),
+    "injection": tuple(f"injection:language={language}" for language in INSTRUCTIONS),
+    "shift": ("shift:offset_m=-6",),
+}
 TOWARDS = (0.2, 0.4, 0.6, 0.8)
 
 
@@ -46,6 +55,26 @@ def lattice(actions: int) -> Floats:
         if len(counts) <= MOST_POINTS:
             break
     return np.array(counts) / steps
+
+
+def messages_to_ask(point: OperatingPoint) -> list[str]:
+    """Return the attacks whose messages a model is asked about, where it reads messages.
+
+    They are those that ship and that `point`, the condition, allows, each with some settings: all
+    that change what one message says or lists, by the scene alone.
+    """
+    texts = []
+    for name, attack in ATTACKS.items():
+        if attack.by_scene and (attack.in_text or attack.in_objects):
+            texts += [name, *MORE.get(name, ())]
+    allowed = []
+    for text in texts:
+        try:
+            point.changed(attack=text)
+        except UserError:
+            continue
+        allowed.append(text)
+    return allowed
 
 
 def near_others(voices: Floats) -> list[Floats]:

@@ -3,14 +3,12 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, combinations
+from itertools import combinations
 
 import numpy as np
 
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
-from harness.coordination.rules import RULES
-from harness.coordination.trust import Trust
 from harness.core.arrays import Bools, Floats
 from harness.evaluate.walk import walk
 from harness.extensions.trust.attackers import attackers_among
@@ -22,6 +20,7 @@ from harness.studies.replayed_run import ReplayedRun
 
 MOST = 2  # liars of whom every choice is tried, if there are few
 MOST_CHOICES = 20  # sets of liars that are tried
+TRUST = "trust"  # the rule with a bound of its own
 UNHARMED, BOUND = "unharmed", "bound"  # names of searches
 
 
@@ -33,25 +32,27 @@ class StrongestLies:
     places, or to be several (`lies.CLAIMS`). Arrays are (S, E).
     """
 
-    success: Mapping[str, Floats]  # which episodes still succeed, 1 or 0, by the space of lies
+    # which episodes still succeed, 1 or 0, by the space of lies; of words alone where the ego's
+    # model reads messages
+    success: Mapping[str, Floats]
     unsafe: Floats  # which episodes end unsafely by words that are to do this, 1 or 0
-    # which episodes succeed whatever liars say; less than what lies leave for the rule `trust`
-    # alone, with which not every lie is tried
-    at_least: Floats
     # how many liars it takes to lose an episode by words, if they are the right ones: 0 if it is
     # lost without; one more than are tried if these do not suffice
     liars: Floats
+    # which episodes succeed whatever liars say; less than what lies leave for the rule `trust`
+    # alone, with which not every lie is tried. None where a model reads messages
+    at_least: Floats | None
 
     def values(self) -> dict[str, Floats]:
         """Return the arrays by name, flat."""
-        names = ("unsafe", "at_least", "liars")
-        return {**self.success, **{name: getattr(self, name) for name in names}}
+        values = {**self.success, "unsafe": self.unsafe, "liars": self.liars}
+        return values if self.at_least is None else {**values, "at_least": self.at_least}
 
     @classmethod
     def of(cls, values: Mapping[str, Floats]) -> "StrongestLies":
-        """Return the worst case whose `values` these are."""
-        success = {space: values[space] for space in CLAIMS}
-        return cls(success, values["unsafe"], values["at_least"], values["liars"])
+        """Return the strongest lies whose `values` these are."""
+        success = {space: values[space] for space in CLAIMS if space in values}
+        return cls(success, values["unsafe"], values["liars"], values.get("at_least"))
 
 
 def space_of(attack: str) -> str:
@@ -73,22 +74,25 @@ def strongest_lies(
     searches = dict[str, Search]()
     for name, search in _searches(run, point, share):
         searches[name] = replace(search, point=point.changed(name=name))
-    courses = Courses(run.dataset, list(searches.values()), seeds, run.spec.ties)
     conditions = [search.point for search in searches.values()]
+    run.check(conditions)
+    courses = Courses(run.dataset, list(searches.values()), seeds, run.spec.ties, run)
     for _ in walk(courses, conditions, run, run.spec.ties):
         pass
     lost, success = courses.lost, {}
     any_lie = np.zeros_like(lost[UNHARMED])
-    for space, claims in CLAIMS.items():
-        for each in claims:
+    for space in _spaces(point):
+        for each in CLAIMS[space]:
             any_lie = any_lie | lost[_name(each)]
         success[space] = 1.0 - any_lie
-    at_least = 1.0 - lost[BOUND] if BOUND in lost else success[WORDS]
+    at_least = None if point.has_fusion_call else success[WORDS]
+    if BOUND in lost:
+        at_least = 1.0 - lost[BOUND]
     choices = _choices(run.vehicles - 1)
     liars = np.full(any_lie.shape, 1.0 + max(len(chosen) for chosen in choices))
     for chosen in reversed(choices):
         liars[lost[_name(chosen)]] = len(chosen)
-    return StrongestLies(success, lost[UNHARMED].astype(float), at_least, liars)
+    return StrongestLies(success, lost[UNHARMED].astype(float), liars, at_least)
 
 
 def _searches(
@@ -98,13 +102,19 @@ def _searches(
     succeeds, unharmed = forest.safe, forest.avoids_harm
     if run.dataset.scenario.parameters.limits == 1:  # of old datasets, where each failure is unsafe
         unharmed = np.isfinite(forest.earliest_s)
-    for claims in chain(*CLAIMS.values()):
-        yield _name(claims), Search(point, liars, succeeds, claims)
+    for space in _spaces(point):
+        for claims in CLAIMS[space]:
+            yield _name(claims), Search(point, liars, succeeds, claims)
     yield UNHARMED, Search(point, liars, unharmed)
-    if isinstance(RULES[point.fusion.consensus], Trust):
+    if point.fusion.consensus == TRUST and not point.has_fusion_call:
         yield BOUND, Search(point, liars, succeeds, bounds=True)
     for chosen in _choices(run.vehicles - 1):
         yield _name(chosen), Search(point, partial(_named, chosen), succeeds)
+
+
+def _spaces(point: OperatingPoint) -> list[str]:
+    """Return the spaces of lies that are searched: of words alone, where a model reads messages."""
+    return [WORDS] if point.has_fusion_call else list(CLAIMS)
 
 
 def _name(liars: str | tuple[int, ...]) -> str:

@@ -409,12 +409,10 @@ def run_bench(
     point = point_of([run], condition)
     if why := point.idle("attack"):
         raise UserError(f"--condition {printable(condition)}: no attack changes anything: {why}")
-    if point.setting("attack") or EGO_PROMPT in rules:
-        asked_again = f"{condition}{',' if ':' in condition else ':'}consensus={EGO_PROMPT}"
+    if point.setting("attack"):
         raise UserError(
-            "harness study trust: give a condition without attack, and rules that are arithmetic; "
-            f"a fusion call is attacked by `harness eval --condition {printable(asked_again)} "
-            "--attack injection`"
+            f"--condition {printable(condition)}: it has an attack; leave it out, and name attacks "
+            "with --attacks"
         )
     attacks = attacks or [str(name) for name in usual_at(axis_of("attack"), point) if name != NONE]
     if not attacks:
@@ -427,7 +425,13 @@ def run_bench(
             f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out"
         )
     usual = [rule for rule in RULES if INTENTS in reads(rule)]
-    every_rule = dict.fromkeys([BASE, *(rules or (() if unfused else (*usual, CAPPED)))])
+    of_model = [rule for rule in rules if rule == EGO_PROMPT]  # which lies are looked for alone
+    arithmetic = [rule for rule in rules if rule != EGO_PROMPT]
+    default = () if unfused or rules else (*usual, CAPPED)
+    every_rule = dict.fromkeys([BASE, *(arithmetic or default)])
+    if of_model and not run.asks:
+        raise UserError(f"--no-model: {EGO_PROMPT} asks the model about messages; leave it out")
+    run.check([under(point, rule, PEACE, 0.0) for rule in of_model])
     every: list[Key] = list(
         dict.fromkeys(
             [
@@ -447,7 +451,7 @@ def run_bench(
             "dataset": run.run.source,
             "condition": condition,
             "seeds": list(seeds),
-            "rules": list(every_rule),
+            "rules": [*every_rule, *of_model],
             "attacks": list(attacks),
             "shares": list(shares),
         },
@@ -477,9 +481,9 @@ def run_bench(
         cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)
     lies = dict[str, StrongestLies]()
-    if run.asks and not unfused:
-        progress.more(len(every_rule))
-        for rule in every_rule:
+    if run.asks:
+        progress.more(len(every_rule) + len(of_model))
+        for rule in (*every_rule, *of_model):
             honest = under(point, rule, PEACE, 0.0)
             find = partial(_found_lies, run, honest, shares[0], seeds)
             lies[rule] = StrongestLies.of(kept.part((rule, "worst", shares[0]), find))
@@ -545,7 +549,7 @@ def trust_study(bench: Bench) -> Study:
             "dataset": bench.source,
             "condition": bench.condition,
             "seeds": list(bench.seeds),
-            "rules": list(bench.rules),
+            "rules": list(dict.fromkeys([*bench.rules, *bench.strongest_lies])),
             "attacks": list(bench.attacks),
             "shares": list(bench.shares),
             "versions": versions(),
@@ -601,6 +605,7 @@ def headline(bench: Bench) -> list[str]:
     words = bench.success_rule.words
     if bench.unfused:
         return [
+            *worst_headline(bench),
             f"While nobody attacks, {words} is {interval_of(peace)} %, and {interval_of(alone)} % "
             "with an ego that never asks.",
             f"If {100 * share:.0f} % of the helpers attack, {worst} harms most: {words} is "

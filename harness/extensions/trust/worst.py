@@ -24,7 +24,8 @@ from harness.coordination.trust import trusting_only
 from harness.core.arrays import Bools, Floats, Ints
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.draws import channel_draws, tie_draws
-from harness.evaluate.walk import Decided, Due, SceneWorld
+from harness.evaluate.fusion import codes_of
+from harness.evaluate.walk import Ask, Decided, Due, SceneWorld
 from harness.extensions.trust import lies
 from harness.extensions.trust.attacks import Turn, attacks_of
 from harness.radio.channel import Draws
@@ -82,10 +83,24 @@ class Courses(SceneWorld):
     """
 
     def __init__(
-        self, dataset: Dataset, searches: Sequence[Search], seeds: Sequence[int], ties: str
+        self,
+        dataset: Dataset,
+        searches: Sequence[Search],
+        seeds: Sequence[int],
+        ties: str,
+        ask: Ask[Scene],
     ) -> None:
+        """Begin at the first decision of each layout.
+
+        Args:
+            dataset: the recorded scenes.
+            searches: what is looked for.
+            seeds: the channel's seeds.
+            ties: which of equally likely actions is taken: the `first`, or one that is `drawn`.
+            ask: asks the ego's model again with lies, where conditions do so.
+        """
         self.scenario, self._dataset, self._forest = dataset.scenario, dataset, dataset.forest
-        self._seeds, self._ties = np.array(seeds), ties
+        self._seeds, self._ties, self._ask = np.array(seeds), ties, ask
         self._searches = {search.point: search for search in searches}
         self._at_stake = {search.point: self._decides(search.keeps) for search in searches}
         shape = len(seeds), len(self._forest.root)
@@ -131,7 +146,11 @@ class Courses(SceneWorld):
         lost, gives_away = self.lost[part.point.name], ~search.keeps[front.at]
         reached = np.zeros(gives_away.shape, dtype=bool)
         plays = []
-        for play in _plays(search, part, front, self._ties, reached, gives_away):
+        if part.point.has_fusion_call:
+            every_play = _asked_plays(search, part, front, self._ties, self._ask)
+        else:
+            every_play = _plays(search, part, front, self._ties, reached, gives_away)
+        for play in every_play:
             reached[play.rows, play.action] = True
             plays.append(play)
         ended = (reached & gives_away).any(axis=1)
@@ -205,6 +224,30 @@ def _plays(
         rows = np.flatnonzero(is_open)
         if len(rows):
             yield decide(heard, lies.with_message(intents, liars, message), rows)
+
+
+def _asked_plays(
+    search: Search, part: Decided[Scene], front: Front, ties: str, ask: Ask[Scene]
+) -> Iterator[Play]:
+    """Yield what the ego's model answers to each of a set of messages of liars, and to none."""
+    truth, draws, at = part.said.intents, part.due.draws, part.due.at
+    liars, drawn_ties = search.liars(truth, draws), tie_draws(draws, ties)
+    rows, nobody = np.arange(len(at)), np.zeros_like(search.liars(truth, draws))
+    for attack, silent in (
+        ("", nobody),
+        ("", liars),
+        *product(lies.messages_to_ask(part.point), [nobody]),
+    ):
+        point = part.point.changed(attack=attack)
+        sent, _, _ = with_claims(attack, truth, liars, draws)
+        heard = exchange(point, sent, draws)
+        heard = replace(heard, on_time=heard.on_time & ~silent)
+        attackers = liars if point.rewrites.changes.of_attackers else None
+        codes = codes_of(heard.on_time, at, attackers)[heard.on_time.any(axis=1)]
+        fuses = ask.fusion_call(part.decision_points, np.unique(codes), point.rewrites)
+        inputs = FusionInputs(fuses(at, attackers), front.state, drawn_ties)
+        result = fuse(point, heard, sent, inputs)
+        yield Play(rows, result.action, result.state, np.zeros(len(at)))
 
 
 def _agreed(heard: Exchange, intents: Intents, liars: Bools) -> Bools:

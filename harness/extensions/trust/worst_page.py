@@ -28,8 +28,9 @@ def left(bench: "Bench", rule: str, space: str) -> Floats:
     success = bench.strongest_lies[rule].success[space]
     spaces = list(CLAIMS)[: list(CLAIMS).index(space) + 1]
     for attack in bench.attacks:
-        if space_of(attack) in spaces:
-            success = np.fmin(success, bench.at(rule, attack, bench.shares[0]).success)
+        key = rule, attack, bench.shares[0]
+        if space_of(attack) in spaces and key in bench.cells:
+            success = np.fmin(success, bench.at(*key).success)
     return success
 
 
@@ -38,16 +39,18 @@ def worst_headline(bench: "Bench") -> Iterator[str]:
     if not bench.strongest_lies:
         return
     success_rule, share = bench.success_rule, bench.shares[0]
-    losses = {rule: left(bench, rule, WORDS) for rule in bench.strongest_lies}
-    best, *close = success_rule.most(losses)
-    most = interval_of(success_rule.estimate(losses[best]))
-    first = next(iter(losses))
-    linear = interval_of(success_rule.estimate(losses[first]))
-    alike = f", not told from {some_of(close)}" if close else ""
+    successes = {rule: left(bench, rule, WORDS) for rule in bench.strongest_lies}
+    first, *others = successes
+    best, *close = success_rule.most(successes)
+    shares = {rule: interval_of(success_rule.estimate(each)) for rule, each in successes.items()}
+    if others:
+        alike = f", not told from {some_of(close)}" if close else ""
+        rules = f"{shares[first]} % under {first}, and {shares[best]} % at most, by {best}{alike}"
+    else:
+        rules = f"{shares[first]} %"
     yield (
         f"If {100 * share:.0f} % of the helpers say, from true places, what harms most, "
-        f"{success_rule.words} is {linear} % under {first}, and {most} % at the most, under {best}"
-        f"{alike}; with an ego that never asks it is "
+        f"{success_rule.words} is {rules}; with an ego that never asks it is "
         f"{interval_of(success_rule.estimate(bench.alone))} %."
     )
 
@@ -61,8 +64,9 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
     rows = []
     for rule in bench.strongest_lies:
         estimates = _estimates(bench, rule)
-        values = [interval_of(estimates[name]) for name in (*CLAIMS, "at_least", "worst_unsafe")]
-        rows.append((rule, interval_of(bench.success(rule)), *values))
+        names = (*CLAIMS, "at_least", "worst_unsafe")
+        values = [interval_of(estimates[name]) if name in estimates else "–" for name in names]
+        rows.append((rule, interval_of(_withstands(bench, rule)[0]), *values))
     rows.append(("never asks", *[alone] * 5, ""))
     heads = ("rule", "nobody lies", *NAMES.values(), "at least", "unsafe by words")
     yield Table(
@@ -75,7 +79,8 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
         "median, trimmed-mean, trimmed-heads and bayes no other message does more; for other rules "
         "without memory messages go in steps of a tenth (a fifth with five actions); for trust "
         "those near others' messages, and 'at least' is what it keeps whatever is said from true "
-        "places. Unsafe: episodes that end so by words that aim at this.",
+        "places. Where the ego's model reads messages, it is asked about those of the attacks that "
+        "ship. Unsafe: episodes that end so by words that aim at this.",
         terminal=range(4),
     )
     rows = []
@@ -118,8 +123,10 @@ def worst_mapping(bench: "Bench") -> dict[str, Any]:
 def _estimates(bench: "Bench", rule: str) -> dict[str, Estimate]:
     """Return the means with intervals of a rule's worst case, by name."""
     case, success_rule = bench.strongest_lies[rule], bench.success_rule
-    estimates = {space: success_rule.estimate(left(bench, rule, space)) for space in CLAIMS}
-    estimates["at_least"] = success_rule.estimate(np.fmin(case.at_least, left(bench, rule, WORDS)))
+    estimates = {space: success_rule.estimate(left(bench, rule, space)) for space in case.success}
+    if case.at_least is not None:
+        at_least = np.fmin(case.at_least, left(bench, rule, WORDS))
+        estimates["at_least"] = success_rule.estimate(at_least)
     unsafe = over_episodes("unsafe_rate", case.unsafe, success_rule.clusters)
     return {**estimates, "worst_unsafe": unsafe}
 

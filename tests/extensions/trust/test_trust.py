@@ -280,8 +280,27 @@ def test_what_no_message_holds_cannot_be_attacked(
     assert not [*tmp_path.iterdir()]
 
 
-def test_fusion_calls_are_attacked_elsewhere(done: Evaluated, tmp_path: Path) -> None:
-    stored = ReplayedRun(done.out)
-    for condition, rules in (("6g", ("ego-prompt",)), ("6g:attack=liar", ("linear",))):
-        with pytest.raises(UserError, match="harness eval"):
-            run_bench(stored, condition, rules, (), (THIRD,), (0,), tmp_path, Watched())
+@pytest.mark.parametrize(
+    ("condition", "rules", "said"),
+    [
+        ("6g", ("ego-prompt",), "proxy is no language model and cannot fuse messages"),
+        ("6g:attack=liar", ("linear",), "it has an attack; leave it out"),
+    ],
+)
+def test_a_bench_that_cannot_be_played_is_one_line(
+    done: Evaluated, tmp_path: Path, condition: str, rules: Any, said: str
+) -> None:
+    with pytest.raises(UserError, match=said):
+        run_bench(ReplayedRun(done.out), condition, rules, (), (THIRD,), (0,), tmp_path, Watched())
+
+
+def test_of_objects_a_model_is_asked_about_lists_of_liars(done: Evaluated, tmp_path: Path) -> None:
+    options = ("6g:content=objects", (), ("ghost", "hide"), (1.0,), (0,))
+    bench = run_bench(ReplayedRun(done.out), *options, tmp_path, Watched())
+    case = bench.strongest_lies["linear"]
+    assert set(case.success) == {"worst"}
+    assert np.array_equal(case.liars > 0, bench.at("linear").success == 1)
+    for attack in bench.attacks:
+        assert np.all(case.success["worst"] <= bench.at("linear", attack, 1.0).success)
+    assert "harms most" in headline(bench)[0]
+    assert write_study(trust_study(bench), tmp_path).is_file()

@@ -1,0 +1,92 @@
+"""What do the strongest lies leave of each consensus rule, over six families?
+
+    python benchmarks/strongest_lies.py [--only TEXT] [--layouts N] [--out reports/strongest-lies]
+                                        [--page benchmarks/measured/trust.md]
+
+It evaluates `proxy` on the report layouts of a suite, looks for the strongest lies against every
+rule in each family (`harness study trust`), and joins the families' episodes. It ends with the CPU
+seconds that the search took for 1 000 decisions. What is finished is read and not made again.
+"""
+
+import json
+from time import process_time
+
+import numpy as np
+from families import Row
+from pages import markdown, options, write_tables
+
+from harness.core.progress import Progress
+from harness.dataset import suites
+from harness.extensions.trust.strongest_lies import StrongestLies
+from harness.extensions.trust.study import Bench, Cell, run_bench
+from harness.extensions.trust.worst_page import worst_tables
+from harness.runs.success import Success
+from harness.studies.replayed_run import ReplayedRun
+
+SMALLEST = "--layouts 2 --only blind-merge"
+PROXY = Row("proxy", "v4", "json")
+SEEDS = "0:5"
+SHARE = 1 / 3
+
+
+def main() -> None:
+    """Make what is missing, and print the tables of all families together."""
+    given = options(__doc__, "strongest-lies").parse_args()
+    row = PROXY.asked(layouts=given.layouts)
+    run = given.out / row.name
+    row.evaluate(run, "--condition", "single-local", "--condition", "6g", "--seeds", SEEDS)
+    benches, started = [], process_time()
+    for name in suites.datasets(row.dataset):
+        if given.only in name:
+            replayed = ReplayedRun(run / name)
+            out = given.out / "study" / name
+            seeds = replayed.seeds
+            bench = run_bench(replayed, "6g", (), (), (SHARE,), seeds, out, Progress())
+            benches.append(bench)
+    taken_s = process_time() - started
+    bench = joined(benches)
+    tables = []
+    for table in worst_tables(bench):
+        tables.append(f"**{table.title}**\n\n{markdown(table.heads, table.rows)}")
+    success = [bench.success("linear", attack, SHARE) for attack in bench.attacks]
+    least = min(success, key=lambda estimate: estimate.value)
+    print(f"linear under the strongest attack that ships: {100 * least.value:.1f}")
+    text = "\n\n".join(tables)
+    print(text)
+    if given.page:
+        write_tables(given.page, text)
+    print(json.dumps({"cpu_s": round(taken_s, 1), "episodes": bench.alone.size}))
+
+
+def joined(benches: list[Bench]) -> Bench:
+    """Return a study whose episodes are those of several."""
+    cells = {}
+    for key in benches[0].cells:
+        of_key = [bench.cells[key] for bench in benches]
+        success = np.hstack([cell.success for cell in of_key])
+        unsafe = np.hstack([cell.unsafe for cell in of_key])
+        nats = np.hstack([cell.nats for cell in of_key])
+        cells[key] = Cell(*key, success, unsafe, nats, flagged=None, first=[])
+    lies = {}
+    for rule in benches[0].strongest_lies:
+        of_rule = [bench.strongest_lies[rule].values() for bench in benches]
+        values = {name: np.hstack([each[name] for each in of_rule]) for name in of_rule[0]}
+        lies[rule] = StrongestLies.of(values)
+    dangerous = [bench.success_rule.dangerous for bench in benches]
+    alone = np.hstack([bench.alone for bench in benches])
+    success_rule = Success(np.concatenate(dangerous))
+    first = benches[0]
+    return Bench(
+        first.name,
+        "all",
+        first.condition,
+        first.seeds,
+        cells,
+        alone,
+        success_rule,
+        strongest_lies=lies,
+    )
+
+
+if __name__ == "__main__":
+    main()
