@@ -48,9 +48,7 @@ def main() -> None:
     tables = []
     for table in worst_tables(bench):
         tables.append(f"**{table.title}**\n\n{markdown(table.heads, table.rows)}")
-    success = [bench.success("linear", attack, SHARE) for attack in bench.attacks]
-    least = min(success, key=lambda estimate: estimate.value)
-    print(f"linear under the strongest attack that ships: {100 * least.value:.1f}")
+
     text = "\n\n".join(tables)
     print(text)
     if given.page:

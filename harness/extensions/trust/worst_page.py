@@ -66,9 +66,13 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
         estimates = _estimates(bench, rule)
         names = (*CLAIMS, "at_least", "worst_unsafe")
         values = [interval_of(estimates[name]) if name in estimates else "–" for name in names]
+        more = bench.success_rule.difference(left(bench, rule, WORDS), bench.alone)
+        values.insert(1, interval_of(more, sign="+"))
         rows.append((rule, interval_of(_withstands(bench, rule)[0]), *values))
-    rows.append(("never asks", *[alone] * 5, ""))
-    heads = ("rule", "nobody lies", *NAMES.values(), "at least", "unsafe by words")
+    rows.append(("never asks", alone, alone, "", *[alone] * 3, ""))
+    words_head, *claims_heads = NAMES.values()
+    more_head = "over never asks, points"
+    heads = ("rule", "nobody lies", words_head, more_head, *claims_heads, "at least", "unsafe")
     yield Table(
         f"{100 * share:.0f} % of the helpers lie as well as they can: {words}, %",
         heads,
@@ -80,7 +84,8 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
         "without memory messages go in steps of a tenth (a fifth with five actions); for trust "
         "those near others' messages, and 'at least' is what it keeps whatever is said from true "
         "places. Where the ego's model reads messages, it is asked about those of the attacks that "
-        "ship. Unsafe: episodes that end so by words that aim at this.",
+        "ship. Over never asks: words, less the success of an ego that never asks, paired. Unsafe: "
+        "episodes that end so by words that aim at this.",
         terminal=range(4),
     )
     rows = []
