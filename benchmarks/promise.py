@@ -29,8 +29,9 @@ from harness.dataset.load import load
 from harness.extensions.calibration.calibrations import COOLEST, Calibration, Correction
 from harness.extensions.calibration.calibrations import FOLDER as CALIBRATIONS
 from harness.extensions.promise.grid import Grid, grid_of
+from harness.extensions.promise.outcomes import play
 from harness.extensions.promise.risk import best, p_values
-from harness.extensions.promise.study import DELTA, play
+from harness.extensions.promise.study import DELTA
 from harness.runs.fit import question_of, weights_of, write
 from harness.runs.folder import read
 from harness.studies.replayed_run import ReplayedRun

@@ -59,8 +59,9 @@ def command(
     """
     from typing import cast, get_args
 
+    from harness.extensions.promise.page import promise_study
     from harness.extensions.promise.promises import Harm
-    from harness.extensions.promise.study import promise_of, promise_study, run_promise
+    from harness.extensions.promise.study import promise_of, run_promise
     from harness.runs.fit import write as write_fit
     from harness.studies.replayed_run import ReplayedRun, name_apart
 

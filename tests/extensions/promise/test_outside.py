@@ -8,7 +8,8 @@ import pytest
 
 from harness.coordination.named_points import named_point
 from harness.core.statistics import Estimate
-from harness.extensions.promise.study import Level, needs, outside, typed, unable
+from harness.extensions.promise.outcomes import Level, unable
+from harness.extensions.promise.page import needs, outside, typed
 
 POINT = named_point("6g")
 

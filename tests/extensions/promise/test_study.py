@@ -16,8 +16,9 @@ from harness.core.progress import Progress
 from harness.core.resources import MARKER
 from harness.dataset.load import load
 from harness.extensions.promise.grid import SHARES, grid_of
+from harness.extensions.promise.outcomes import Outcome, play
 from harness.extensions.promise.promises import promise
-from harness.extensions.promise.study import Outcome, play, run_promise
+from harness.extensions.promise.study import run_promise
 from harness.runs.folder import read
 from harness.studies.replayed_run import ReplayedRun
 
