@@ -2,6 +2,7 @@
 and no model is asked what the run has.
 """
 
+import gc
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,6 +32,7 @@ from harness.coordination.streams import Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import alone, canonical_json
+from harness.core.memory import uncollected
 from harness.core.progress import Progress
 from harness.dataset.load import Scene
 from harness.evaluate import stated_times
@@ -83,6 +85,7 @@ class ReplayedRun:
 
     same_episodes = True
 
+    @uncollected()
     def __init__(
         self,
         folder: Path,
@@ -198,13 +201,18 @@ class ReplayedRun:
         }
 
     def walked(
-        self, settings: Sequence[Setting], seeds: Sequence[int], read: Read = metric_columns
+        self,
+        settings: Sequence[Setting],
+        seeds: Sequence[int],
+        read: Read = metric_columns,
+        few: int = FEW,
     ) -> Iterator[Sequence[WalkResult]]:
         """Yield the results of each grid point of `settings`, of all episodes at once.
 
         A grid point is an operating point with a number of vehicles: the ego and the helpers
         nearest to it. `seeds` are those of the channel, and `read` returns the columns of decisions
-        to keep.
+        to keep. The first points are walked alone, one in `few` of those that are walked together;
+        1 is for who needs no result before the others.
 
         Raises:
             UserError: an operating point needs a fusion call, in which the ego's model reads
@@ -214,8 +222,7 @@ class ReplayedRun:
         at_once = max(1, WALKS // (len(seeds) * len(self.dataset.episodes)))
         for vehicles, same in groupby(settings, lambda setting: setting.vehicles):
             points = [setting.point for setting in same]
-            few = max(1, at_once // FEW)
-            starts = (0, *range(few, len(points), at_once))
+            starts = (0, *range(max(1, at_once // few), len(points), at_once))
             for first, after in pairwise((*starts, len(points))):
                 yield from self._walked(points[first:after], vehicles, seeds, read)
 
@@ -438,6 +445,8 @@ class ReplayedRun:
         check_prompts(self.run, spec)
         cards = [find_own(card, self._models, folder, _GIVE_IT) for card in spec.cards]
         opens = partial(open_backend, **spec.opening)
+        if any(agent.can.language_model for agent in spec.agents):
+            gc.enable()  # what an engine leaves behind in cycles might not fit into memory
         models = open_each(cards, opens)
         identity = together(cards, models).identity()
         stored, now = self.run.manifest.identity, msgspec.json.decode(canonical_json(identity))

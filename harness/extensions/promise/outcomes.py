@@ -144,7 +144,7 @@ def play(
     """
     settings = [Setting(point.name, point, run.vehicles) for point in points]
     outcomes = {}
-    for point, [walk] in zip(points, run.walked(settings, seeds, _columns), strict=True):
+    for point, [walk] in zip(points, run.walked(settings, seeds, _columns, few=1), strict=True):
         if run.left_out:
             raise UserError(
                 f"{printable(run.run.path)}: no stored answer at {len(run.left_out)} decision "
