@@ -30,6 +30,7 @@ from harness.extensions.calibration.calibrations import COOLEST, Calibration, Co
 from harness.extensions.calibration.calibrations import FOLDER as CALIBRATIONS
 from harness.extensions.promise.grid import Grid, grid_of
 from harness.extensions.promise.outcomes import play
+from harness.extensions.promise.page import BLIND
 from harness.extensions.promise.risk import best, p_values
 from harness.extensions.promise.study import DELTA
 from harness.runs.fit import question_of, weights_of, write
@@ -216,6 +217,8 @@ def elsewhere_table() -> str:
     )  # fmt: skip
     rows = []
     for each in json.loads(said):
+        if each["run"] == BLIND:
+            continue
         interval = [each[f"harm_{name}"] for name in ("value", "ci_low", "ci_high")]
         careful = each["careful_nats"]
         rows.append(

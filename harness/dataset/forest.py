@@ -302,6 +302,17 @@ class Forest:
         """
         return self._in_time(self.cleared_s[edge], self.limit_s[tree])
 
+    def unsafe(self, edge: Ints, limits: int) -> Bools:
+        """Return whether episodes that end at some edges end unsafely, (...).
+
+        `edge`, (...), are indices in `edges`; an edge is what an action does, up to the next
+        decision or the end. `limits` is the scenario's version of limits: with 1 an ego that does
+        not reach its goal is unsafe, too.
+        """
+        if limits == 1:
+            return ~np.isfinite(self.cleared_s[edge])
+        return np.asarray(self.harms[edge])
+
     @staticmethod
     def _in_time(goal_s: Floats, limit_s: Floats) -> Bools:
         return np.asarray(np.isfinite(goal_s) & (goal_s <= limit_s))
@@ -364,13 +375,16 @@ class Forest:
         """
         return self.chance(np.ones(self.child.shape))
 
-    def chance(self, policy: Floats) -> Floats:
+    def chance(self, policy: Floats, ends: Bools | None = None) -> Floats:
         """Return the exact probability of success after each action under a policy, (N, A).
 
         `policy` has the weights of A actions at each of N decision points, (N, A), by which later
-        actions are drawn; they need not sum to 1.
+        actions are drawn; they need not sum to 1. `ends`, (N, A), says of actions that end the
+        episode what is asked for in place of success.
         """
-        chance = self.succeeds(self.edge, self.tree[:, None]).astype(float)
+        if ends is None:
+            ends = self.succeeds(self.edge, self.tree[:, None])
+        chance = ends.astype(float)
         for rows in self._levels_backwards():
             child = self.child[rows]
             after = np.average(chance[child], axis=-1, weights=policy[child])

@@ -282,9 +282,7 @@ class FrozenWorld(SceneWorld):
         walks, trees = self._walks[point], np.arange(len(self._forest.root))
         cleared = np.isfinite(self._forest.cleared_s[walks.last])
         success = self._forest.succeeds(walks.last, trees)
-        unsafe = (
-            ~cleared if self.scenario.parameters.limits == 1 else self._forest.harms[walks.last]
-        )
+        unsafe = self._forest.unsafe(walks.last, self.scenario.parameters.limits)
         ends = {"success_rate": success, "unsafe_rate": unsafe, "late_rate": cleared & ~success}
         ends_or_nan = {
             name: np.where(walks.dropped, np.nan, values) for name, values in ends.items()

@@ -34,7 +34,8 @@ class Outcome:
 
     harm: Floats  # 1 where an episode did harm, else 0, (S, E)
     success: Floats  # 1 where it succeeded, else 0, (S, E)
-    costs: Mapping[str, float]  # means by name of `COSTS`: per episode, or of decisions
+    # means by name of `COSTS`: per episode, or of decisions; none of an ego that looks at nothing
+    costs: Mapping[str, float]
 
     def units(self, clusters: Ints | None) -> Floats:
         """Return the mean harm of each of n units that are drawn independently, (n,).
@@ -53,16 +54,22 @@ class Played:
     """Hold the outcomes of some settings on the layouts of one run."""
 
     run: ReplayedRun
-    outcomes: Mapping[OperatingPoint, Outcome]  # by setting, as a condition
+    # by setting, as a condition, and of egos that look at nothing, by name
+    outcomes: Mapping[OperatingPoint | str, Outcome]
     success_rule: Success  # how success is averaged over episodes
 
-    def harm(self, point: OperatingPoint) -> Estimate:
-        """Return the mean harm under a setting, 0 to 1, with its 95 % interval over layouts."""
-        return over_episodes(SUCCESS, self.outcomes[point].harm, self.run.clusters)
+    @property
+    def blind(self) -> list[str]:
+        """Return the names of the egos that look at nothing."""
+        return [each for each in self.outcomes if isinstance(each, str)]
 
-    def success(self, point: OperatingPoint) -> Estimate:
+    def harm(self, setting: OperatingPoint | str) -> Estimate:
+        """Return the mean harm under a setting, 0 to 1, with its 95 % interval over layouts."""
+        return over_episodes(SUCCESS, self.outcomes[setting].harm, self.run.clusters)
+
+    def success(self, setting: OperatingPoint | str) -> Estimate:
         """Return success under a setting, 0 to 1, with its 95 % interval over layouts."""
-        return self.success_rule.estimate(self.outcomes[point].success)
+        return self.success_rule.estimate(self.outcomes[setting].success)
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,7 @@ class Level:
     needed: int  # number of tune layouts, all without harm, that a promise needs
     certified: int  # number of settings that may promise it
     chosen: OperatingPoint | None  # the best of them; None if there is none
+    blind: str | None  # the best ego that may promise it looking at nothing; None if there is none
 
     @property
     def label(self) -> str:

@@ -25,6 +25,7 @@ from harness.studies.study import Study, ends
 if TYPE_CHECKING:
     import pandas as pd
 
+BLIND = "blind"  # in place of a run, of egos that look at nothing
 HEADS = (
     "setting",
     "tau",
@@ -94,7 +95,7 @@ def needs(result: Result) -> str:
 def sentence(result: Result, level: Level) -> str:
     """Return what a level promises and costs, on report layouts, or that it cannot be promised."""
     if level.chosen is None:
-        return f"{unable(result, level)}."
+        return f"{unable(result, level)}; {_beside(result, level)}."
     report, point = result.report, level.chosen
     base = next(each for each in result.conditions if each.name == point.name)
     before, after = report.outcomes[base], report.outcomes[point]
@@ -106,8 +107,16 @@ def sentence(result: Result, level: Level) -> str:
         f"{WORDS[result.harm].capitalize()} ≤ {percent(level.at_most)} % costs {requests:+.1f} "
         f"requests an episode, {late_ms:+.1f} ms a decision and {interval_of(change, sign='+')} "
         f"points of {report.success_rule.words}{careful}: {interval_of(report.harm(point))} % on "
-        f"report layouts, by {typed(point)}."
+        f"report layouts, by {typed(point)}; {_beside(result, level)}."
     )
+
+
+def _beside(result: Result, level: Level) -> str:
+    """Return in words what promises a level without a model, and its success on report layouts."""
+    if level.blind is None:
+        return "no ego that looks at nothing can promise it"
+    success = interval_of(result.report.success(level.blind))
+    return f"without a model, {level.blind} promises it, with {success} % success"
 
 
 def is_always(point: OperatingPoint) -> bool:
@@ -142,7 +151,7 @@ def typed(point: OperatingPoint) -> str:
 
 def _table(result: Result, played: Played) -> Table:
     inside = played is result.report
-    rows = []
+    rows = list[list[str]]()
     for label, point in result.rows.items():
         costs = played.outcomes[point].costs
         careful_nats = point.setting("careful_nats")
@@ -161,6 +170,11 @@ def _table(result: Result, played: Played) -> Table:
                 PERCENT.text(costs["asked"]),
             ]
         )
+    for name in played.blind:
+        on_tune = result.tune.outcomes.get(name)
+        harm, success = interval_of(played.harm(name)), interval_of(played.success(name))
+        tune_harm = PERCENT.text(on_tune.harm.mean()) if on_tune else DASH
+        rows.append([name, DASH, DASH, harm, tune_harm, success, *[DASH] * 4])
     return Table(
         f"{played.run.name} on {played.run.dataset.name}"
         f"{'' if inside else ': outside of every promise'}",
@@ -168,7 +182,8 @@ def _table(result: Result, played: Played) -> Table:
         rows,
         "Nats: tau, above which the ego asks, and careful, from which it takes the first action. "
         f"Harm is the share of {WORDS[result.harm]}. Requests are an episode's, ms a decision's; "
-        "careful %: decisions with the first action, asked %: that ask.",
+        "careful %: decisions with the first action, asked %: that ask. The last rows "
+        "are of egos that look at nothing; what uniform comes to is computed by the trees.",
         terminal=[0, 1, 2, 3, 5, 6, 7],
     )
 
@@ -176,7 +191,8 @@ def _table(result: Result, played: Played) -> Table:
 def tables(result: Result) -> "dict[str, pd.DataFrame]":
     """Return the data frames `promise` and `settings`, by these names, to write as files.
 
-    `promise` has a row for each shown setting and each run; `settings` one for each setting that
+    `promise` has a row for each shown setting and each run, and for each ego that looks at nothing,
+    whose run is `BLIND`; `settings` one for each setting that
     was tried on tune layouts, with its p-value for each level.
     """
     import pandas as pd
@@ -191,17 +207,17 @@ def tables(result: Result) -> "dict[str, pd.DataFrame]":
                 "promised": played is result.report and label in labels,
                 "setting": label,
                 **_thresholds(point),
+                **_estimates(played, point),
             }
-            for name, estimate in (
-                ("harm", played.harm(point)),
-                ("success", played.success(point)),
-            ):
-                row |= {f"{name}_{key}": value for key, value in ends(estimate).items()}
             base = next(each for each in result.conditions if each.name == point.name)
             outcomes, rule = played.outcomes, played.success_rule
             over = rule.difference(outcomes[point].success, outcomes[base].success)
             row |= {f"success_over_{key}": value for key, value in ends(over).items()}
             rows.append({**row, **outcomes[point].costs})
+        for name in played.blind:
+            of_levels = played is result.report and name in [each.blind for each in result.levels]
+            row = {"run": BLIND, "dataset": played.run.dataset.name, "promised": of_levels}
+            rows.append({**row, "setting": name, **_estimates(played, name)})
     means, n = result.units.mean(axis=1), result.units.shape[1]
     for place, point in enumerate(result.grid.points):
         outcome = result.tune.outcomes[point]
@@ -212,6 +228,14 @@ def tables(result: Result) -> "dict[str, pd.DataFrame]":
             row[f"p_{percent(level.at_most)}"] = float(p)
         settings.append(row)
     return {"promise": pd.DataFrame(rows), "settings": pd.DataFrame(settings)}
+
+
+def _estimates(played: Played, setting: OperatingPoint | str) -> dict[str, Any]:
+    row = dict[str, Any]()
+    estimates = {"harm": played.harm(setting), "success": played.success(setting)}
+    for name, estimate in estimates.items():
+        row |= {f"{name}_{key}": value for key, value in ends(estimate).items()}
+    return row
 
 
 def _thresholds(point: OperatingPoint) -> dict[str, Any]:

@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.memory import uncollected
 from harness.core.progress import Progress
 from harness.core.seeds import purposes, seeds_text
 from harness.dataset import rebuilt
+from harness.extensions.promise.blind import blind_outcomes
 from harness.extensions.promise.grid import Grid, grid_of
 from harness.extensions.promise.outcomes import (
     Level,
@@ -32,6 +34,7 @@ from harness.extensions.promise.risk import best, p_values, units_needed
 from harness.runs.alike import different, setup
 from harness.runs.fit import check_answerers, check_seeds, question_of, weights_of
 from harness.runs.run_dataset import check_scenes
+from harness.runs.success import Success
 from harness.studies.axes import Setting, described
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import refuse_other
@@ -93,18 +96,27 @@ def run_promise(
     refuse_other(out, "promise", manifest)
     progress.more(len(grid.points) + len(runs) * (1 + len(points) + len(needed)))
     rules = counted([tune, report])
-    on_tune = Played(tune, play(tune, grid.points, harm, seeds, progress), rules[tune])
+    on_tune = _played(tune, grid.points, harm, seeds, progress, rules[tune])
     result = Result(harm, delta, grid, points, seeds, on_tune, on_tune, (), ())
     result = replace(result, levels=[choose(result, level, needed[level]) for level in needed])
     rows = tuple(dict.fromkeys(result.rows.values()))
-    played = Played(report, play(report, rows, harm, seeds, progress), rules[report])
-    others = [
-        Played(run, play(run, rows, harm, seeds, progress), counted([run])[run])
-        for run in elsewhere
-    ]
+    played = _played(report, rows, harm, seeds, progress, rules[report])
+    others = [_played(run, rows, harm, seeds, progress, counted([run])[run]) for run in elsewhere]
     for run in (*runs, tune):
         run.settle()
     return replace(result, report=played, elsewhere=others)
+
+
+def _played(
+    run: ReplayedRun,
+    points: Sequence[OperatingPoint],
+    harm: Harm,
+    seeds: Sequence[int],
+    progress: Progress,
+    rule: Success,
+) -> Played:
+    outcomes = play(run, points, harm, seeds, progress)
+    return Played(run, outcomes | blind_outcomes(run.dataset, harm), rule)
 
 
 def usual(tune: ReplayedRun) -> list[str]:
@@ -192,7 +204,21 @@ def choose(result: Result, at_most: float, needed: int) -> Level:
     requests = np.array([outcome.costs["requests"] for outcome in outcomes])
     place = int(best(certified, success, requests))
     chosen = None if place < 0 else result.grid.points[place]
-    return Level(at_most, needed, int(certified.sum()), chosen)
+    return Level(at_most, needed, int(certified.sum()), chosen, _best_blind(result, at_most))
+
+
+def _best_blind(result: Result, at_most: float) -> str | None:
+    """Return which ego that looks at nothing may promise a share of harm, with the most success.
+
+    Each is tested at delta by how many there are, so that all are right together.
+    """
+    tune, names = result.tune, result.tune.blind
+    outcomes = [tune.outcomes[name] for name in names]
+    means = np.array([outcome.units(tune.run.clusters).mean() for outcome in outcomes])
+    p = p_values(means, result.units.shape[1], at_most, binary=False)
+    success = np.array([tune.success_rule.mean(outcome.success) for outcome in outcomes])
+    place = int(best(p <= result.delta / len(names), success, np.zeros(len(names))))
+    return None if place < 0 else names[place]
 
 
 def promise_of(result: Result, level: Level, command: str) -> Promise:

@@ -26,7 +26,7 @@ def result_of(harms: Mapping[str, Estimate], **more: Any) -> Any:
     return SimpleNamespace(elsewhere=elsewhere, **fields)
 
 
-LEVEL = Level(0.05, 59, 3, POINT)
+LEVEL = Level(0.05, 59, 3, POINT, None)
 FEW, MANY = Estimate(0.01, 0.001, 0.04, 100, 0), Estimate(0.95, 0.86, 0.98, 60, 0)
 SOME = Estimate(0.06, 0.03, 0.12, 100, 0)
 
@@ -46,15 +46,15 @@ def test_the_road_with_the_most_harm_is_named(harms: Mapping[str, Estimate], say
 
 
 def test_a_level_without_a_setting_has_none_elsewhere() -> None:
-    assert outside(result_of({"far": MANY}), Level(0.01, 299, 0, None)) == ""
+    assert outside(result_of({"far": MANY}), Level(0.01, 299, 0, None, None)) == ""
 
 
 def test_too_few_layouts_are_no_fault_of_the_model() -> None:
     result = result_of({}, units=SimpleNamespace(shape=(1, 100)), levels=[LEVEL])
-    assert unable(result, Level(0.01, 299, 0, None)) == (
+    assert unable(result, Level(0.01, 299, 0, None, None)) == (
         "unsafe episodes ≤ 1 %: too few tune layouts to promise it"
     )
-    assert unable(result, Level(0.05, 59, 0, None)) == (
+    assert unable(result, Level(0.05, 59, 0, None, None)) == (
         "No setting of model can promise unsafe episodes ≤ 5 %"
     )
     assert needs(result) == (
