@@ -26,6 +26,7 @@ from harness.backends import base
 from harness.core import web
 from harness.core.errors import Unanswered, UserError, one_line, printable
 from harness.extensions.decide import decisions, systemone
+from harness.extensions.decide.acts import Acts
 from harness.extensions.decide.asked import Answered, Enquiry, Refusal, answered
 from harness.extensions.decide.desk import AGAIN_S, PLACES, Desk
 from harness.extensions.decide.model import ServedModel
@@ -76,6 +77,7 @@ class Service:
         batch_size: int = 1,
         token: str | None = None,
         local: bool = True,
+        acts: Acts | None = None,
         places: int = PLACES,
         answer_s: float = ANSWER_S,
     ) -> None:
@@ -86,10 +88,12 @@ class Service:
             batch_size: most questions that the model is asked together.
             token: the API key that clients must give; None asks for none.
             local: whether only this machine is served.
+            acts: says how to act on answers under a condition; None without one.
             places: most questions that may wait.
             answer_s: seconds within which a request must be answered.
         """
         self._model, self._token, self._local, self._answer_s = model, token, local, answer_s
+        self._acts = acts
         self._desk = Desk(model.backend, batch_size, places)
 
     def app(self) -> Starlette:
@@ -177,7 +181,10 @@ class Service:
         for completion in completions:
             _raise(completion)
         pairs = zip(enquiry.questions, completions, strict=True)
-        return shape.write(self._model.name, [answered(*pair) for pair in pairs])
+        answers = [answered(*pair) for pair in pairs]
+        if self._acts:
+            answers = [self._acts.of(answer) for answer in answers]
+        return shape.write(self._model.name, answers)
 
     def _read(self, shape: Shape, body: bytes) -> tuple[Enquiry, list[base.Request]]:
         try:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from harness.backends.base import Completion
 from harness.core.errors import printable
@@ -69,12 +69,23 @@ class Enquiry:
     images: tuple[str, ...] = ()  # URLs of the pictures before the state
 
 
+class Act(NamedTuple):
+    """Hold how to act on an answer: alone, carefully, or after helpers are asked.
+
+    `choice` is the index of the option to take, also where helpers are asked and nobody is heard.
+    """
+
+    word: str  # `alone`, `careful` or `ask`
+    choice: int  # index of the option to take
+
+
 @dataclass(frozen=True)
 class Answered:
     """Hold the answer to one question: a probability for each of its K options.
 
     `shares`, (K,), are in the order of the question's options, as the model states them, and None
-    if it refused. `tokens` is the number of prompt tokens, None if nobody counts them.
+    if it refused. `tokens` is the number of prompt tokens, None if nobody counts them. `act` says
+    how to act on the answer, None where the server keeps no condition.
     """
 
     # the question, with its options
@@ -82,11 +93,18 @@ class Answered:
     # probability of each option, as the model states it; None where the model refused
     shares: tuple[float, ...] | None
     tokens: int | None  # number of prompt tokens; None if nobody counts them
+    act: Act | None = None  # how to act on it; None where no condition says
 
     @property
-    def likeliest(self) -> int:
+    def choice(self) -> int:
+        """Return the index of the option to take, the likeliest unless a condition says another."""
         assert self.shares is not None
-        return self.shares.index(max(self.shares))
+        return self.act.choice if self.act else self.shares.index(max(self.shares))
+
+    @property
+    def acted(self) -> dict[str, str]:
+        """Return how to act as a field of the response, `act`; empty where no condition says."""
+        return {"act": self.act.word} if self.act else {}
 
     @property
     def confidence(self) -> float:

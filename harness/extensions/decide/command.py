@@ -30,6 +30,14 @@ def command(
         None,
         help=f"What clients must give as their API key. Default: the value of {TOKEN}, if any.",
     ),
+    condition: str | None = typer.Option(
+        None,
+        help="Condition that says of each choice of action how to act on it: decide alone, ask "
+        "helpers, or be careful. As 6g:promise=NAME it keeps a promise.",
+    ),
+    scenario: str | None = typer.Option(
+        None, help="Scenario whose actions are chosen from under the --condition."
+    ),
 ) -> None:
     """Serve a model's decisions to other programs.
 
@@ -38,9 +46,12 @@ def command(
     """
     from harness.backends.cards import resolve
     from harness.backends.registry import open_backend
+    from harness.coordination.named_points import named_point
     from harness.core import web
+    from harness.extensions.decide.acts import Acts
     from harness.extensions.decide.app import CONNECTIONS, Service
     from harness.extensions.decide.model import ServedModel, served
+    from harness.world import scenarios
 
     in_range("--port", port, 0, 65535)
     local, token = web.is_loopback(host), token or os.environ.get(TOKEN) or None
@@ -53,9 +64,17 @@ def command(
         raise UserError("--token: it has characters that no key has; give letters and digits")
     if token is not None and len(token) < LEAST:
         raise UserError(f"--token: it has {len(token)} characters; give {LEAST} or more")
+    if (condition is None) != (scenario is None):
+        raise UserError("--condition and --scenario: give both, or neither")
+    kept = None
+    if condition is not None and scenario is not None:
+        kept = named_point(condition), scenarios.get(scenario)
     agent = served(resolve(model, engine), letters)
     backend = open_backend(agent.card, device=device, dtype=dtype, batch_size=batch_size)
-    service = Service(ServedModel(agent, backend), batch_size, token, local)
+    acts = None
+    if kept:
+        acts = Acts(*kept, agent, backend.identity())
+    service = Service(ServedModel(agent, backend), batch_size, token, local, acts)
 
     def listening(url: str) -> None:
         # Some clients add /v1 to the address that they are given.

@@ -214,5 +214,5 @@ def _answer(answer: Answered) -> dict[str, Any]:
         }
         return {"type": "score", **name, **score}
     listed = [{"value": value, "probability": p} for value, p in pairs]
-    chosen = {"choice": values[answer.likeliest], "confidence": answer.confidence}
-    return {"type": "choice", **name, **chosen, "probabilities": listed}
+    chosen = {"choice": values[answer.choice], "confidence": answer.confidence}
+    return {"type": "choice", **name, **chosen, "probabilities": listed, **answer.acted}

@@ -126,4 +126,4 @@ def _answer(answer: Answered) -> dict[str, Any]:
     if kind == "score":
         legend = dict(answer.asked.question.meanings)
         return {"type": kind, "score": answer.mean_level, "legend": legend, **spread}
-    return {"type": kind, "choice": options[answer.likeliest], **spread}
+    return {"type": kind, "choice": options[answer.choice], **spread, **answer.acted}
