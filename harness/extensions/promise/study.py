@@ -30,7 +30,7 @@ from harness.extensions.promise.outcomes import (
     unable,
 )
 from harness.extensions.promise.promises import WHAT, Harm, Promise, settings_of
-from harness.extensions.promise.risk import best, p_values, units_needed
+from harness.extensions.promise.risk import Order, best, p_values, units_needed
 from harness.runs.alike import different, setup
 from harness.runs.fit import check_answerers, check_seeds, question_of, weights_of
 from harness.runs.run_dataset import check_scenes
@@ -210,14 +210,17 @@ def choose(result: Result, at_most: float, needed: int) -> Level:
 def _best_blind(result: Result, at_most: float) -> str | None:
     """Return which ego that looks at nothing may promise a share of harm, with the most success.
 
-    Each is tested at delta by how many there are, so that all are right together.
+    As of a model's settings, one is tested first: that which is always careful, or where failing is
+    the harm the best sequence, the last before `uniform`. So all are right together.
     """
     tune, names = result.tune, result.tune.blind
     outcomes = [tune.outcomes[name] for name in names]
     means = np.array([outcome.units(tune.run.clusters).mean() for outcome in outcomes])
     p = p_values(means, result.units.shape[1], at_most, binary=False)
     success = np.array([tune.success_rule.mean(outcome.success) for outcome in outcomes])
-    place = int(best(p <= result.delta / len(names), success, np.zeros(len(names))))
+    first = 0 if result.harm == "unsafe" else len(names) - 2
+    order = Order(first, tuple((place,) for place in range(len(names)) if place != first))
+    place = int(best(order.certified(p, result.delta), success, np.zeros(len(names))))
     return None if place < 0 else names[place]
 
 

@@ -60,7 +60,9 @@ def result_of(blind: dict[str, tuple[float, float]]) -> Any:
     order = SimpleNamespace(certified=lambda p, delta: p <= delta)
     grid = SimpleNamespace(points=[SIX_G], order=order)
     units = np.zeros((1, 100))
-    return SimpleNamespace(tune=played, grid=grid, units=units, delta=0.05, seeds=(0,))
+    return SimpleNamespace(
+        tune=played, grid=grid, units=units, delta=0.05, seeds=(0,), harm="unsafe"
+    )
 
 
 def outcome(harm: float, success: float) -> Outcome:
@@ -77,9 +79,11 @@ def outcome(harm: float, success: float) -> Outcome:
     [
         ({"stands": (0.0, 0.0), "goes": (0.5, 0.9)}, "stands"),
         ({"stands": (0.0, 0.0), "creeps": (0.0, 0.3), "goes": (0.5, 0.9)}, "creeps"),
-        ({"goes": (0.5, 0.9)}, None),
-        # .95^100 is .0059, below .05 / 2 and not below .05 / 9
-        ({f"stands {n}": (0.0, 0.0) for n in range(9)}, None),
+        # .95^100 is .0059, below .05 and .05 / 2, and not below .05 / 9
+        ({"stands": (0.0, 0.0), **{f"creeps {n}": (0.0, 0.3) for n in range(2)}}, "creeps 0"),
+        ({"stands": (0.0, 0.0), **{f"creeps {n}": (0.0, 0.3) for n in range(9)}}, "stands"),
+        # what is tested first fails
+        ({"goes": (0.5, 0.9), "stands": (0.0, 0.0)}, None),
     ],
 )
 def test_the_best_blind_ego_that_passes_is_named(blind: Any, best: str | None) -> None:
