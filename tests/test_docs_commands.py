@@ -212,7 +212,7 @@ ONCE = {
 # Pages that `make test` follows, each with how the lines begin that it leaves out.
 FOLLOWED = {
     "docs/answers.md": ("harness init", "cd ", "harness dataset", "harness eval", "harness model",
-        "harness study"),
+        "harness study", "import harness"),
     "docs/comparing.md": ("harness eval", "harness compare", "harness run history", 
         "harness plan reports/"),
     "docs/radio.md": ("harness eval", "harness radio check"),
@@ -357,13 +357,14 @@ class Followed:
         self.wrong: list[str] = []
 
     def all_but(self, left_out: tuple[str, ...], few: Path) -> None:
-        """Follow it, but for the lines that begin so."""
+        """Follow it, but for the lines and blocks of Python that begin so."""
         for file, stands_for in {**READER_HAS, "few": few}.items():
             Path(file).symlink_to(stands_for)
         known: dict[str, Any] = {}
         for language, block in blocks(self.page):
             if language == "python":
-                exec(compile(block, self.page.name, "exec"), known)
+                if not block.startswith(left_out):
+                    exec(compile(block, self.page.name, "exec"), known)
                 continue
             lines = typed(block)
             for (line, shown), (then, code_shown) in zip(
