@@ -77,7 +77,7 @@ def asked_key(viewer: str, question: str) -> str:
 FinishReason = Literal["stop", "length", "refusal", "error"]  # why a model's text ends
 
 
-class FirstTurn(Struct, frozen=True, kw_only=True):
+class FirstTurn(Struct, frozen=True, kw_only=True, gc=False):
     """Hold a failed answer that was followed by a repair turn: a second question after the failure.
 
     `raw` is its text, `status` the outcome of parsing it, such as `bad_sum`, and `finish_reason`
@@ -95,7 +95,7 @@ class FirstTurn(Struct, frozen=True, kw_only=True):
     slow_s: float  # declared seconds that it takes beyond its card's latency
 
 
-class Answer(Struct, frozen=True, kw_only=True):
+class Answer(Struct, frozen=True, kw_only=True, gc=False):
     """Hold one answer of a model, a line of `answers.jsonl`.
 
     The vehicle `viewer` was asked as `role` (ego, helper, or ego after it `heard` helpers) in the
@@ -368,7 +368,7 @@ class Message(Struct, frozen=True, rename={"sender": "from"}):
     attacker: bool | None
 
 
-class Decision(Struct, frozen=True, kw_only=True):
+class Decision(Struct, frozen=True, kw_only=True, gc=False):
     """Hold one decision, a row of `decisions.parquet`, for reports; None where unknown.
 
     It is about the decision point `scene`, number `step` of `episode`, under one condition (named
@@ -415,7 +415,7 @@ class Decision(Struct, frozen=True, kw_only=True):
     agent: str | None = None  # id of who decided; None if only the ego decides
 
 
-class Episode(Struct, frozen=True, kw_only=True):
+class Episode(Struct, frozen=True, kw_only=True, gc=False):
     """Hold the outcome of one layout under one condition and seed, a line of `episodes.csv`.
 
     A layout is one start situation, which `layout_seed` draws; a condition is a named set of

@@ -18,11 +18,13 @@ Seed = Annotated[int, Meta(ge=0, le=LAST_SEED + LAST_EPISODE)]
 VehicleId = Annotated[str, Meta(pattern="^v[1-9][0-9]?$")]
 
 
-class Closed(Struct, frozen=True, forbid_unknown_fields=True):
+class Closed(Struct, frozen=True, forbid_unknown_fields=True, gc=False):
     """Refuse unknown members when a record is decoded from a file; a base class of msgspec records.
 
     The bounds of `Annotated` field types are checked at decoding, too.
     """
+
+    # gc=False: a record from a file has no cycles, and the collector would walk each of its parts.
 
     def __getitem__(self, key: str) -> Any:
         """Return a member by its name in a file:
