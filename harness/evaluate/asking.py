@@ -65,6 +65,7 @@ from harness.runs.records import (
 from harness.runs.unanswered import Tally
 
 CHUNK = 64  # fewest requests that are asked, and kept, together
+OF_RULES_ALONE = 1024  # the same where no model reads: a rule takes less time for each of many
 FIRST = 8  # fewest questions that a server is asked before it has answered any
 # questions without an answer, one after the other, after which nothing more is asked
 IN_A_ROW = CHUNK
@@ -178,7 +179,8 @@ class Asker:
         # all, and all but the last are equally long. So what a resumed run lacks falls into the
         # same chunks.
         backend, batch = self._backend(), first_at_once(self.spec.settings.batch_size)
-        size = batch * math.ceil(CHUNK / batch)
+        reads = any(agent.can.language_model for agent in self.spec.agents)
+        size = batch * math.ceil((CHUNK if reads else OF_RULES_ALONE) / batch)
         chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
             # a short last chunk would not fill a batch
