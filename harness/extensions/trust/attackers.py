@@ -35,8 +35,8 @@ class Attackers:
 
     def __init__(self, attacks: Sequence[Attack]) -> None:
         self._attacks = attacks
-        self._steps = max((attack.steps for attack in attacks), default=0)
-        self._intended: dict[tuple[int, int], list[Floats]] = {}
+        steps = max((attack.steps for attack in attacks), default=0)
+        self._memory = _Memory(steps)
 
     def said(self, truth: Intents, draws: Draws, episode: Ints, seed: Ints) -> SentIntents:
         """Return what every vehicle sends in n decisions of one step, after the attacks.
@@ -57,7 +57,7 @@ class Attackers:
             )
         uniforms = _uniforms(draws.trips, truth.valid.shape[1])
         of_step = _of_helpers(uniforms[..., 1], draws.trips)
-        first, past = self._remembered(truth, episodes)
+        first, past = self._memory.recall(truth.helpers, episodes)
         sent = truth
         attacking = np.zeros(truth.valid.shape, dtype=bool)
         for attack in self._attacks:
@@ -65,31 +65,48 @@ class Attackers:
             turn = Turn(truth, drawn, first, past, of_step)
             sent = _acted(attack, sent, turn)
             attacking |= drawn
-        for intents, place in zip(truth.helpers, episodes, strict=True):
-            intended = self._intended.setdefault(place, [])
-            intended.append(intents)
-            # keep the first step and those that an attack looks at
-            del intended[1 : -self._steps or None]
         if sent.voice_of is None:
             return SentIntents(sent, draws, attacking)
         voices = np.take_along_axis(attacking, sent.voice_of, axis=-1)
         return SentIntents(sent, draws.of_helpers(sent.voice_of), voices)
 
-    def _remembered(
-        self, truth: Intents, episodes: Sequence[tuple[int, int]]
-    ) -> tuple[Floats, Floats]:
+
+class _Memory:
+    """What helpers intended at the first step of each play of an episode, and at its last K."""
+
+    def __init__(self, steps: int) -> None:
+        self._steps = steps
+        self._rows: dict[tuple[int, int], int] = {}
+        # of each row the first intents, then those of K past steps, the last one first
+        self._intended = np.empty((0, 1 + steps, 0, 0))
+        self._helpers = np.empty(0, dtype=int)  # how many there were at the first step
+
+    def recall(self, intents: Floats, episodes: Sequence[tuple[int, int]]) -> tuple[Floats, Floats]:
         """Return the first intents (n, H, A) and those of K past steps (n, K, H, A);
-        NaN without a step.
+        NaN without a step. Those of this step, `intents`, are remembered.
         """
-        first = truth.helpers.copy()
-        past = np.full((len(first), self._steps, *first.shape[1:]), np.nan)
-        for decision, episode in enumerate(episodes):
-            steps = self._intended.get(episode, [])
-            for past_step, intents in enumerate(steps[: -self._steps - 1 : -1]):
-                past[decision, past_step, : len(intents)] = intents[: past.shape[2]]
-            if steps:
-                first[decision, : len(steps[0])] = steps[0][: first.shape[1]]
-        return first, past
+        here = intents.shape[1]
+        rows = np.array([self._rows.setdefault(place, len(self._rows)) for place in episodes], int)
+        self._grow(*intents.shape[1:])
+        intended, was_there = self._intended[rows], np.arange(here) < self._helpers[rows, None]
+        first = np.where(was_there[..., None], intended[:, 0, :here], intents)
+        if self._steps:
+            self._intended[rows, 2:] = intended[:, 1:-1]
+            self._intended[rows, 1] = np.nan
+            self._intended[rows, 1, :here] = intents
+        new = self._helpers[rows] == 0
+        self._intended[rows[new], 0, :here] = intents[new]
+        self._helpers[rows[new]] = here
+        return first, intended[:, 1:, :here]
+
+    def _grow(self, helpers: int, actions: int) -> None:
+        rows, _, most, _ = self._intended.shape
+        shape = len(self._rows), 1 + self._steps, max(most, helpers), actions
+        if shape != self._intended.shape:
+            intended = np.full(shape, np.nan)
+            intended[:rows, :, :most] = self._intended if rows else np.nan
+            self._intended = intended
+            self._helpers = np.append(self._helpers, np.zeros(shape[0] - rows, dtype=int))
 
 
 def attackers_among(share: float, truth: Intents, draws: Draws) -> Bools:

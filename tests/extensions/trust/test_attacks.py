@@ -21,6 +21,7 @@ from harness.coordination.parts import Changes
 from harness.coordination.sent import SentIntents, Speaker
 from harness.core.errors import UserError
 from harness.evaluate.fusion import key_of, messages_of
+from harness.extensions.trust.attackers import _Memory as Memory
 from harness.extensions.trust.attacks import (
     ATTACKS,
     INSTRUCTIONS,
@@ -105,6 +106,33 @@ def test_stale_says_what_it_intended_before_and_at_first_the_oldest_there_is():
         said("stale:decisions=2", past=past, first=np.array([[BOLD] * 3])).helpers[0, 0].tolist()
         == BOLD
     )
+
+
+STEPS = st.lists(st.tuples(st.integers(1, 3), st.sets(st.integers(0, 3), min_size=1)), min_size=1)
+
+
+@given(st.integers(0, 2), STEPS)
+def test_what_is_remembered_is_what_was_intended_at_the_first_step_and_the_last_ones(most, steps):
+    """Episodes end and begin, some steps have fewer helpers, and some answers failed."""
+    memory, history = Memory(most), dict[int, list[Any]]()
+    for number, (helpers, episodes) in enumerate(steps):
+        now = number + np.random.default_rng(number).random((len(episodes), helpers, 2))
+        now[0, 0] = NAN
+        places = [(episode, 0) for episode in sorted(episodes)]
+        first, past = memory.recall(now, places)
+        assert past.shape == (len(places), most, helpers, 2)
+        for row, (episode, _) in enumerate(places):
+            before = history.setdefault(episode, [])
+            oldest = now[row].copy()
+            for there in before[:1]:
+                oldest[: len(there)] = there[:helpers]
+            np.testing.assert_array_equal(first[row], oldest)
+            for ago in range(most):
+                expected = np.full((helpers, 2), NAN)
+                for there in before[len(before) - 1 - ago :][:1] if ago < len(before) else ():
+                    expected[: len(there)] = there[:helpers]
+                np.testing.assert_array_equal(past[row, ago], expected)
+            before.append(now[row])
 
 
 def test_a_replay_is_what_the_next_helper_said_at_the_last_step():
