@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol, get_type_hints
 
 import numpy as np
@@ -176,6 +177,11 @@ class RunFacts(Protocol):
         """Return whether the run's scenes are recorded (`harness eval`), not simulated."""
 
 
+@cache
+def _hints(kind: type["Part"]) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
 class Part(Struct, frozen=True, kw_only=True):
     """Hold one group of an operating point's settings, checked when made; a base class.
 
@@ -200,7 +206,7 @@ class Part(Struct, frozen=True, kw_only=True):
     usual: ClassVar[Mapping[str, str]] = {}
 
     def __post_init__(self) -> None:
-        hints = get_type_hints(type(self), include_extras=True)
+        hints = _hints(type(self))
         for key in self.__struct_fields__:
             hint, value = hints[key], getattr(self, key)
             try:

@@ -441,8 +441,8 @@ def run_bench(
             ]
         )
     )
-    for key in every:
-        under(point, *key)  # which checks that they go together
+    # which checks that they go together
+    points = {key: under(point, *key) for key in every}
     refuse_other(
         out,
         "trust",
@@ -462,13 +462,13 @@ def run_bench(
         sha256_file(run.run.path / "answers.jsonl", "rows"),
         point.record(),
         list(seeds),
-        files_of([under(point, *key) for key in every]),
+        files_of([*points.values()]),
         versions(),
     ]
     kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
 
     missing = [key for key in every if key not in kept]
-    settings = [Setting(point.name, under(point, *key), run.vehicles) for key in missing]
+    settings = [Setting(point.name, points[key], run.vehicles) for key in missing]
     walks = run.walked(settings, seeds, partial(_judged, run))
 
     def compute(key: Key) -> dict[str, Any]:
