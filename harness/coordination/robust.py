@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from harness.coordination.consensus import Fused, Messages, Pool, linear_pool, scaled
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, summed
 
 CLIP = 0.3  # radius of centred clipping, as a distance between distributions (at most sqrt 2)
 CLIP_ROUNDS = 5
@@ -111,7 +111,8 @@ def geometric_median(p: Floats, weights: Floats) -> Floats:
     points = np.where((weights > 0)[..., None], p, 0.0)
     middle: Floats = linear_pool(p, weights)
     for _ in range(WEISZFELD_ROUNDS):
-        distance = np.linalg.norm(points - middle[..., None, :], axis=-1)
+        away = points - middle[..., None, :]
+        distance = np.sqrt(summed(away * away, -1))
         pull = weights / np.maximum(distance, SMOOTHING)
         middle = linear_pool(points, pull / np.sum(pull, axis=-1, keepdims=True))
     return middle
