@@ -161,6 +161,7 @@ class Dataset:
     sha256: str  # hex digest of the manifest, which pins every file
     trees: Trees  # the decision trees of its layouts, in the order of the episodes
     trusted: bool = False  # whether it is a released dataset, whose digests vouch for its scenes
+    kept: int = SCENES_KEPT  # how many scenes stay in memory, the last ones read
     # scenes that were read, by id
     _scenes: dict[str, Scene] = field(default_factory=dict, repr=False, compare=False)
     # ids of scenes whose content was found sound
@@ -289,7 +290,7 @@ class Dataset:
                         before = partial(self._before, record.scene)
                         self._scenes[record.scene] = Scene(record, seat=seat, before=before)
         scenes = [self._scenes[name] for name in ids]
-        for name in list(islice(self._scenes, max(0, len(self._scenes) - SCENES_KEPT))):
+        for name in list(islice(self._scenes, max(0, len(self._scenes) - self.kept))):
             del self._scenes[name]
         return scenes
 

@@ -55,6 +55,8 @@ from harness.studies.play import Read, WalkResult, metric_columns, walk_through
 
 SILENT = Progress()
 WALKS = 1 << 15  # most that are walked together, unless one grid point has more: some 30 MB
+# Scenes that stay in memory, some 24 kB each: every grid point comes to most of them again.
+KEPT = 1 << 14
 FEW = 8  # share of them that is walked first, so that who waits sees results soon
 _GIVE_IT = (
     "to ask it, give --model with its folder, .gguf file or hub id, or write a card "
@@ -122,7 +124,8 @@ class ReplayedRun:
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
         self.points = points_of(self.run)
-        self.dataset = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
+        frozen = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
+        self.dataset = replace(frozen, kept=KEPT)
         self.episodes = len(self.dataset.episodes)
         self.clusters = self.dataset.clusters
         self.vehicles = max(len(scene.viewers) for scene in self.dataset.scenes(self._roots()))

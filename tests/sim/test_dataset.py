@@ -182,8 +182,7 @@ def test_trees_and_scenes_that_were_forgotten_are_read_again_as_they_were(
     small, small_folder, monkeypatch
 ):
     monkeypatch.setattr("harness.dataset.load.TREES_KEPT", 2)
-    monkeypatch.setattr("harness.dataset.load.SCENES_KEPT", 3)
-    data = load(small_folder)
+    data = replace(load(small_folder), kept=3)
     assert list(data.trees) == list(small.trees)
     ids, records = (
         small.forest.ids[::7],
@@ -194,7 +193,8 @@ def test_trees_and_scenes_that_were_forgotten_are_read_again_as_they_were(
         assert len(data._scenes) == 3
 
 
-def test_a_dataset_knows_which_ids_are_its_own(small):
+def test_a_dataset_knows_which_ids_are_its_own(small_folder):
+    small = load(small_folder)
     one = small.of_episodes({2})
     [mine, *_] = one.forest.ids
     assert mine in one
