@@ -143,6 +143,7 @@ class Asker:
         self._kept = KeptAnswers(kept) if kept else None
         self._earlier = KeptAnswers(earlier) if earlier else None
         self._progress, self._more = progress, more
+        self._of_rules = not any(agent.can.language_model for agent in spec.agents)
         self._given, self.served = frozenset(answers or {}), list[Served]()
         recalled = {**(sent or {}), **self._recalled()}
         agents, actions = spec.agents, spec.actions
@@ -179,8 +180,7 @@ class Asker:
         # all, and all but the last are equally long. So what a resumed run lacks falls into the
         # same chunks.
         backend, batch = self._backend(), first_at_once(self.spec.settings.batch_size)
-        reads = any(agent.can.language_model for agent in self.spec.agents)
-        size = batch * math.ceil((CHUNK if reads else OF_RULES_ALONE) / batch)
+        size = batch * math.ceil((OF_RULES_ALONE if self._of_rules else CHUNK) / batch)
         chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
             # a short last chunk would not fill a batch
@@ -416,8 +416,10 @@ class Asker:
         """
         if not any(self._lacking(scenes, self._has, question, places)):
             return
-        # Only the prompts of scenes whose answers were not all given are rendered.
-        lacks = list(self._lacking(scenes, self._given.__contains__, question, places))
+        # Only the prompts of scenes whose answers were not all given are rendered, or with rules,
+        # whose answers depend on no batch, of those that still lack one.
+        is_there = self._has if self._of_rules else self._given.__contains__
+        lacks = list(self._lacking(scenes, is_there, question, places))
         scenes = list(compress(scenes, lacks))
         lacking_places = None if places is None else list(compress(places, lacks))
         self.answer(list(requests(self.spec, scenes, question, lacking_places)))
