@@ -93,7 +93,7 @@ class Scene:
         graphs = self.record.graphs
         return {v.id: graphs[v.id] for v in self.state.vehicles if v.id in graphs}
 
-    @property
+    @cached_property
     def viewers(self) -> tuple[str, ...]:
         return tuple(self.graphs)
 
