@@ -3,22 +3,25 @@
     python benchmarks/strongest_lies.py [--only TEXT] [--layouts N] [--out reports/strongest-lies]
                                         [--page benchmarks/measured/trust.md]
 
-It evaluates `proxy` on the report layouts of a suite, looks for the strongest lies against every
-rule in each family (`harness study trust`), and joins the families' episodes. It ends with the CPU
-seconds that the search took for 1 000 decisions. What is finished is read and not made again.
+It evaluates `proxy` on the report layouts of a suite, or reads the runs in a folder, looks for the
+strongest lies against each rule in each of them (`harness study trust`), and joins their episodes.
+It ends with the CPU seconds of that. What is finished is read and not made again.
 """
 
 import json
+from pathlib import Path
 from time import process_time
 
 import numpy as np
 from families import Row
 from pages import markdown, options, write_tables
 
+from harness.coordination.contents import INTENTS
+from harness.coordination.rules import RULES, reads
 from harness.core.progress import Progress
 from harness.dataset import suites
 from harness.extensions.trust.strongest_lies import StrongestLies
-from harness.extensions.trust.study import Bench, Cell, run_bench
+from harness.extensions.trust.study import CAPPED, Bench, Cell, run_bench
 from harness.extensions.trust.worst_page import worst_tables
 from harness.runs.success import Success
 from harness.studies.replayed_run import ReplayedRun
@@ -27,21 +30,30 @@ SMALLEST = "--layouts 2 --only blind-merge"
 PROXY = Row("proxy", "v4", "json")
 SEEDS = "0:5"
 SHARE = 1 / 3
+OURS = "trimmed-mean:weight_cap=0.25"  # chosen on tune layouts
+RULES_PLAYED = (*(rule for rule in RULES if INTENTS in reads(rule)), CAPPED, OURS)
 
 
 def main() -> None:
     """Make what is missing, and print the tables of all families together."""
-    given = options(__doc__, "strongest-lies").parse_args()
+    parser = options(__doc__, "strongest-lies")
+    parser.add_argument("--runs", type=Path, help="folder whose folders are runs, such as on tune")
+    parser.add_argument("--rules", default=",".join(RULES_PLAYED), help="rules, by commas")
+    given = parser.parse_args()
     row = PROXY.asked(layouts=given.layouts)
     run = given.out / row.name
-    row.evaluate(run, "--condition", "single-local", "--condition", "6g", "--seeds", SEEDS)
+    if given.runs is None:
+        row.evaluate(run, "--condition", "single-local", "--condition", "6g", "--seeds", SEEDS)
+        folders = [run / name for name in suites.datasets(row.dataset)]
+    else:
+        folders = sorted(folder.parent for folder in given.runs.glob("*/run.json"))
     benches, started = [], process_time()
-    for name in suites.datasets(row.dataset):
-        if given.only in name:
-            replayed = ReplayedRun(run / name)
-            out = given.out / "study" / name
+    for folder in folders:
+        if given.only in folder.name:
+            replayed = ReplayedRun(folder)
+            out, rules = given.out / "study" / folder.name, given.rules.split(",")
             seeds = replayed.seeds
-            bench = run_bench(replayed, "6g", (), (), (SHARE,), seeds, out, Progress())
+            bench = run_bench(replayed, "6g", rules, (), (SHARE,), seeds, out, Progress())
             benches.append(bench)
     taken_s = process_time() - started
     bench = joined(benches)
