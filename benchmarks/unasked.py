@@ -86,7 +86,7 @@ ROWS = (
     Asked(RULE, "mode4:density_per_km=100"),
     Asked(RULE, "mode4:density_per_km=300"),
     Asked(RULE, "mode2:density_per_km=100"),
-    Asked(RULE, "mode2:density_per_km=200"),
+    Asked(RULE, "mode2:density_per_km=200", drives=True),
     Asked(SMALL, "its-g5:density_per_km=120", drives=True),
     Asked(RULE._replace(dataset="sumo-crossing-v1"), "its-g5:density_per_km=120"),
     Asked(RULE._replace(dataset="sumo-merge-v1"), "its-g5:density_per_km=120"),
