@@ -74,11 +74,17 @@ def planned(spec: Spec, scenes: Sequence[Scene]) -> Iterator[Request]:
     asking = spec.points if spec.asks_all else intents
     for question in {point.question for point in asking if point.question != PLAIN}:
         yield from requests(spec, scenes, question)
+    yield from stream_requests(spec, scenes, list(_stream_questions(spec, scenes).values()))
+
+
+def _stream_questions(spec: Spec, scenes: Sequence[Scene]) -> dict[str, tuple[Scene, list[str]]]:
+    """Return what egos have heard unasked, as `stream_sets`, by the id of the question."""
     sets = {}
     for point in spec.points:
-        for each in _unasked(spec, scenes, point):
-            sets[fusion_id(*each)] = each
-    yield from stream_requests(spec, scenes, list(sets.values()))
+        for scene, senders in _unasked(spec, scenes, point):
+            if senders:
+                sets[fusion_id(scene, senders)] = scene, senders
+    return sets
 
 
 def streamed(spec: Spec, scenes: Sequence[Scene]) -> dict[str, int]:
@@ -126,7 +132,9 @@ def lacking(
         Counter[str](),
         any(point.asks and point.content.asks_helpers for point in spec.points),
     )
-    for scene in dataset.scenes(scenes):
+    asked_about = dataset.scenes(scenes)
+    lacks["ego"] += sum(name not in answers for name in _stream_questions(spec, asked_about))
+    for scene in asked_about:
         viewers = spec.viewers(scene)
         viewers_by_role = {"ego": viewers[:1], "helper": viewers[1:] if sends else ()}
         for role, those in viewers_by_role.items():

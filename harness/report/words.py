@@ -19,7 +19,7 @@ from harness.runs.folder import Run
 from harness.runs.headline import ANY_TIME, IN_WORDS, SUCCESS, best_of, headline_of
 from harness.runs.metric_names import ADJUSTED, ALL, BASELINE, GAINS, LATENCY
 from harness.runs.metrics import entry
-from harness.runs.records import Score, role_word
+from harness.runs.records import Score
 from harness.runs.success import half_difference, mean_difference, p_of_mean
 from harness.runs.suite import SuiteRun, plays
 
@@ -103,16 +103,17 @@ def gain(run: Run | SuiteRun, best: str, base: str) -> tuple[Estimate, bool]:
 def questions(run: Run) -> str:
     """Return how many questions each role was asked, and how many answers could be read, as text.
 
-    A role is `ego`, `helper` or `merge` (the ego after it heard messages).
+    A role is `ego`, `helper` or `merge`, the ego with messages that it heard, unasked or in reply.
     """
     counts = run.answered.count
+    words = {role: "ego with messages" if role == "merge" else role for role in counts}
     failed = {role: sum(run.answered.failed.get(role, {}).values()) for role in counts}
     if not any(failed.values()):
-        numbers = ", ".join(f"{role_word(role)} {n}" for role, n in counts.items())
+        numbers = ", ".join(f"{words[role]} {n}" for role, n in counts.items())
         return f"asked: {numbers}; all answers could be read"
     parts = []
     for role, n in counts.items():
-        parts.append(f"{role_word(role)} {n} ({PERCENT.text(1 - failed[role] / n)} read)")
+        parts.append(f"{words[role]} {n} ({PERCENT.text(1 - failed[role] / n)} read)")
     return f"asked: {', '.join(parts)}"
 
 

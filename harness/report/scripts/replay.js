@@ -97,7 +97,7 @@ class Replay {
     });
     const facts = [
       ["its own answer", distribution(actions, own?.intent)],
-      ["heard", decision.messages.length ? decision.messages.map((m) => h("div", {}, reply(m))) : "nobody"],
+      ["heard", decision.messages.length ? decision.messages.map((m) => h("div", {}, reply(m))) : "no reply"],
       ["both together", distribution(actions, decision.fused)],
     ];
     this.shown.replaceChildren();

@@ -21,7 +21,7 @@ from harness.coordination.named_points import named_point
 from harness.coordination.streams import Hearing
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Earlier, Scene, load
-from harness.evaluate.dry_run import count
+from harness.evaluate.dry_run import count, lacking
 from harness.evaluate.requests import stream_sets
 from harness.evaluate.sharing import shared_graphs
 from harness.extensions.devices import profiles as devices
@@ -32,6 +32,7 @@ from harness.extensions.streams.cpm import KEPT_S, Cpms, aged
 from harness.extensions.streams.motion import moments
 from harness.radio.channel import Broadcast
 from harness.radio.profiles import CHANNELS
+from harness.report.words import questions
 from harness.runs.folder import read
 from harness.world import lockstep, scenarios
 from harness.world.perception.sensors import Detection
@@ -451,6 +452,21 @@ def test_a_dry_run_counts_what_a_stream_adds(small: Dataset) -> None:
     assert name == points[1].name
     assert counted["requests_by_role"]["ego"] == without["requests_by_role"]["ego"] + more
     assert "streamed" not in without
+
+
+def test_what_a_stream_lacks_is_counted_until_it_is_answered(
+    small: Dataset, tmp_path: Path
+) -> None:
+    texts = ["6g:stream=cpm,tau_nats=9"]
+    heard = evaluated(small, tmp_path / "heard", texts, [0])
+    alone = evaluated(small, tmp_path / "alone", ["single-local"], [0])
+    spec = spec_of(small, points=tuple(map(named_point, ("single-local", *texts))))
+    scenes = sorted({a.scene for a in alone.answers} & {a.scene for a in heard.answers})
+    unasked = [a.scene for a in heard.answers if a.heard]
+    more = sum(scene in scenes for scene in unasked)
+    assert lacking(spec, small, scenes, {a.id for a in alone.answers})["ego"] == more > 0
+    assert lacking(spec, small, scenes, {a.id for a in heard.answers})["ego"] == 0
+    assert f"ego with messages {len(unasked)}" in questions(heard)
 
 
 def test_congestion_control_thins_the_radio_and_the_stream() -> None:
