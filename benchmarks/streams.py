@@ -21,9 +21,9 @@ from harness.coordination.streams import Hearing
 from harness.core.seeds import FIRST
 from harness.dataset.load import Earlier, Scene, find, load
 from harness.evaluate.live_world import look
-from harness.extensions.streams.cpm import Cpms
 from harness.extensions.streams.motion import moments
 from harness.extensions.streams.sending import stretch
+from harness.extensions.streams.services import Services
 from harness.world import lockstep
 from harness.world.scenario import Scenario
 from harness.world.scene_graph import AgedNode
@@ -82,9 +82,9 @@ def load_of(name: str, layouts: int) -> tuple[float, ...]:
     """Return what is sent and held at a dataset's decision points, by the columns of `main`."""
     dataset = load(find(name), layouts)
     scenario, stream = dataset.scenario, named_point("6g:stream=cpm").stream
-    assert isinstance(stream, Cpms)
+    assert isinstance(stream, Services)
     scenes = [scene for scene in dataset.scenes(dataset.courses()) if scene.before()]
-    cpms = [cpm for s in scenes for cpm in stretch(scenario, s, stream.interval_s).cpms]
+    cpms = [cpm for s in scenes for cpm in stretch(scenario, s, stream.interval_s).messages]
     seconds = sum(len(s.state.helpers) for s in scenes) * scenario.parameters.decision_period_s
     heard = stream.heard(scenario, scenes)
     pairs = zip(scenes, heard, strict=True)

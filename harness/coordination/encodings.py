@@ -14,7 +14,7 @@ from harness.core.arrays import Floats
 from harness.core.plugins import Shipped
 
 JSON = "json"
-Held = Literal["intent", "objects", "request"]
+Held = Literal["intent", "objects", "request", "beacon"]
 
 
 @runtime_checkable
@@ -30,7 +30,8 @@ class Encoding(Protocol):
         The result has the shape of `counts`.
 
         Args:
-            holds: what they are: an `intent` with its words, a list of `objects`, or a `request`.
+            holds: what they are: an `intent` with its words, a list of `objects`, a `request`, or a
+                `beacon`, the sender's pose.
             headers: whether those of network and transport count.
             counts: how much each holds, a number or an array with one value for each message:
                 `actions` and `text_bytes` of an intent, `objects` that are listed, `helpers` whom a

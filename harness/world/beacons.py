@@ -280,16 +280,18 @@ def _sent(
         return
     last, due = before[-1] if before else None, list[tuple[int, int, Beacon]]()
     for number, frame in reversed(list(checks())):
-        if cam := _cam(sent(number, frame), poses[frame - first_frame].tolist(), last):
+        if cam := due_cam(sent(number, frame), poses[frame - first_frame].tolist(), last):
             due.append((number, frame, cam))
             last = cam
     for number, frame, cam in reversed(due):
         yield replace(cam, heard_by=hear(number, frame))
 
 
-def _cam(beacon: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
-    """Return the CAM if one is due by the last one and the vehicle's true pose (EN 302 637-2,
-    6.1.3).
+def due_cam(beacon: Beacon, pose: Sequence[float], last: Beacon | None) -> Beacon | None:
+    """Return a vehicle's CAM, its message about itself, if one is due (EN 302 637-2, 6.1.3).
+
+    `beacon` is what it would send now, `pose` its true x and y (m), heading (rad) and speed (m/s),
+    and `last` its last CAM; None before the first.
     """
     if last is None or last.interval_s is None:
         return replace(beacon, interval_s=LONGEST_S, unmoved=0)

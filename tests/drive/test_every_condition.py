@@ -41,7 +41,7 @@ Place = tuple[int, int]  # episode and seed
 AT_THE_LAG = Latency("card", "declared: for this test", 0.145, 0.145, 0.0)
 NUMBERS = {bool: ("true", "false"), int: ("0", "1", "2"), float: ("0", "0.05", "0.5", "1", "40")}
 WORDS: Mapping[str, Sequence[str]] = {
-    "stream": ("none", "cpm"),
+    "stream": ("none", "cam", "cpm", "cam+cpm"),
     "congestion": ("none", "reactive", "adaptive"),
     "edge": ("none", "relay", "fusion"),
     "encoding": (JSON, *ENCODINGS),

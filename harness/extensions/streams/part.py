@@ -8,9 +8,9 @@ from msgspec import Meta
 from harness.coordination.parts import Part, RunFacts, Text, wrong
 from harness.core.errors import unknown
 from harness.extensions.streams.congestion import NONE, RULES, Settled, settled
-from harness.extensions.streams.cpm import KEPT_S, Cpms, heard_of
 from harness.extensions.streams.inclusion import LONGEST_S, SHORTEST_S, interval_s
-from harness.extensions.streams.sending import NAME
+from harness.extensions.streams.sending import CAM, CPM
+from harness.extensions.streams.services import KEPT_S, Services, heard_of
 from harness.radio.channel import Channel, Physical
 from harness.radio.constant import Radio
 from harness.radio.wrapped import Wrapped, innermost
@@ -18,7 +18,7 @@ from harness.radio.wrapped import Wrapped, innermost
 if TYPE_CHECKING:
     from harness.coordination.operating_point import OperatingPoint
 
-STREAMS = (NONE, NAME)
+STREAMS = (NONE, CAM, CPM, f"{CAM}+{CPM}")
 Interval = Annotated[
     float,
     Meta(
@@ -51,8 +51,9 @@ class Streams(Part, frozen=True, kw_only=True):
     of_ego: ClassVar[bool] = True
     of_radio: ClassVar[bool] = True
 
-    # what helpers send unasked: `cpm`, the objects that they see, by the rules of a standard; the
-    # ego's model is then asked with all that the ego has heard. `none` is nothing.
+    # what helpers send unasked, by the rules of standards: `cpm`, the objects that they see; `cam`,
+    # their pose, in place of the scenario's beacons; or `cam+cpm`. The ego's model is then asked
+    # with all that the ego has heard. `none` is nothing.
     stream: Text = NONE
     # seconds between two looks of a helper, and the least between two of its messages
     stream_interval_s: Interval = 0.1
@@ -73,6 +74,9 @@ class Streams(Part, frozen=True, kw_only=True):
             return
         if point.asks_again:
             raise wrong("stream", self.stream, f"{NONE} where {point.asks_twice}")
+        if self.stream == CAM and point.rewrites.changes.of_attackers:
+            allowed = f"one with {CPM} where helpers attack, since a CAM lists no objects"
+            raise wrong("stream", self.stream, allowed)
         channel = point.channel
         if point.radio.profile is None or isinstance(channel, Physical):
             return
@@ -101,19 +105,24 @@ class Streams(Part, frozen=True, kw_only=True):
         name = f"congestion {self.congestion}: channel {point.radio.profile}"
         return settled(innermost(channel), self.congestion, name)
 
-    def unasked(self, point: "OperatingPoint") -> Cpms | None:
+    def unasked(self, point: "OperatingPoint") -> Services | None:
         if self.stream == NONE or point.radio.profile is None:
             return None
         between_s, encoding = 0.0, point.radio.encoding
         if self.congestion != NONE:
             uncontrolled = point.changed(congestion=NONE).channel
             between_s = self._settled(point, uncontrolled).allowed_s
-        every_s = interval_s(max(self.stream_interval_s, between_s))
-        return Cpms(every_s, self.stream_delay_s, point.channel, encoding, between_s)
+        # All that a station sends goes through one gate.
+        kinds = tuple(self.stream.split("+"))
+        every_s = interval_s(max(self.stream_interval_s, between_s * len(kinds)))
+        return Services(every_s, self.stream_delay_s, point.channel, encoding, between_s, kinds)
 
     @classmethod
-    def unasked_of(cls, text: str) -> Cpms | None:
-        return Cpms(heard_of(text)[0]) if text.startswith(f"{NAME}:") else None
+    def unasked_of(cls, text: str) -> Services | None:
+        if not text.startswith((f"{CAM}:", f"{CPM}:")):
+            return None
+        _, every_s, _ = heard_of(text)[0]
+        return Services(every_s)
 
 
 def with_rate(channel: Channel, rate_hz: float) -> Channel:

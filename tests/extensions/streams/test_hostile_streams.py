@@ -15,7 +15,7 @@ from harness.core.arrays import Floats
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Earlier, Scene
 from harness.extensions.streams.congestion import settled
-from harness.extensions.streams.cpm import Cpms
+from harness.extensions.streams.services import Services
 from harness.radio.profiles import CHANNELS
 from harness.radio.wrapped import busy_ratio
 from harness.world.state import WorldState
@@ -43,7 +43,9 @@ def test_scenes_of_other_times_are_refused_in_one_line(small: Dataset, time_s: f
     scene, before = second(small)
     for channel in (replace(CHANNELS["6g"]), CHANNELS["its-g5"]):
         with pytest.raises(UserError, match=r"of \d+ s at most; build the dataset again$") as error:
-            Cpms(0.1, 0.0, channel).heard(small.scenario, [in_state(scene, before, time_s=time_s)])
+            Services(0.1, 0.0, channel).heard(
+                small.scenario, [in_state(scene, before, time_s=time_s)]
+            )
         assert "\n" not in str(error.value)
 
 
@@ -58,7 +60,7 @@ def test_an_ego_that_becomes_another_is_refused_and_a_helper_that_does_sends_not
     small: Dataset,
 ) -> None:
     scene, before = second(small)
-    stream = Cpms(0.1, 0.0, CHANNELS["its-g5"])
+    stream = Services(0.1, 0.0, CHANNELS["its-g5"])
     other = renamed(scene.state, scene.state.ego.id, "v99")
     with pytest.raises(UserError, match="has another ego than the one before it"):
         stream.heard(small.scenario, [in_state(scene, before, **other)])
@@ -73,7 +75,7 @@ def test_intervals_are_whole_microseconds_as_their_keys_are() -> None:
     """Else two conditions could share keys, and what is asked would depend on which is first."""
     alike = [named_point(f"6g:stream=cpm,stream_interval_s=0.123456{n}").stream for n in (1, 4)]
     assert alike[0] == alike[1]
-    assert isinstance(alike[0], Cpms)
+    assert isinstance(alike[0], Services)
     assert alike[0].interval_s == 0.123456
 
 
@@ -126,7 +128,7 @@ def fall(site: Any) -> Floats:
 def test_a_packages_channel_cannot_write_or_lose_the_impossible(
     small: Dataset, lose: Callable[[Any], Any], reason: str
 ) -> None:
-    stream = Cpms(0.1, 0.0, Strange(lose=lose))
+    stream = Services(0.1, 0.0, Strange(lose=lose))
     with pytest.raises(UserError, match=f"channel Strange of test_hostile_streams .*{reason}"):
         stream.heard(small.scenario, scenes_of(small))
 
@@ -134,7 +136,7 @@ def test_a_packages_channel_cannot_write_or_lose_the_impossible(
 def test_what_a_packages_channel_loses_is_lost(small: Dataset) -> None:
     scenes = scenes_of(small)
     for lost, channel in ((0.0, Strange()), (1.0, Strange(lose=lambda s: np.ones(s.sight.shape)))):
-        heard = Cpms(0.1, 0.0, channel).heard(small.scenario, scenes)
+        heard = Services(0.1, 0.0, channel).heard(small.scenario, scenes)
         assert any(heard) == (lost < 1)
 
 

@@ -24,7 +24,7 @@ from harness.evaluate.fusion import codes_of, source_of
 from harness.evaluate.requests import fusion_id, stream_sets
 from harness.evaluate.sharing import shared_graphs
 from harness.evaluate.spec import Spec
-from harness.extensions.streams.cpm import Cpms
+from harness.extensions.streams.services import Services
 from harness.runs import folder
 from harness.world.perception.shared import NOBODY, invented
 from harness.world.scene_graph import AgedNode, SceneGraph
@@ -99,7 +99,7 @@ def test_a_shuffled_stream_puts_what_is_there_at_its_place_there(pair: Dataset) 
     scenes, point = scenes_of(dataset), named_point(f"{STREAM},messages=shuffled")
     by_id, checked = {scene.id: scene for scene in scenes}, 0
     there = replace(pair.scenario, parameters=exact)
-    assert isinstance(point.stream, Cpms)
+    assert isinstance(point.stream, Services)
     for scene, senders, _ in heard(pair, point, scenes):
         source = by_id[source_of(scene.id, senders)]
         assert source.id != scene.id
@@ -322,3 +322,9 @@ def test_a_lied_to_ego_drives_as_in_frozen_scenes(pair: Dataset, tmp_path: Path)
         told_by.append([(d.episode, d.scene, d.action, d.fused, d.latency_ms) for d in rows])
     assert told_by[0] == told_by[1]
     assert any("&ghost" in key for answer in driven.answers for key in answer.heard)
+
+
+def test_cams_have_no_objects_to_lie_about() -> None:
+    with pytest.raises(UserError, match=r"one with cpm where helpers attack"):
+        named_point("6g:stream=cam,attack=ghost")
+    named_point("6g:stream=cam+cpm,attack=ghost")

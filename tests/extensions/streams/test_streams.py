@@ -28,8 +28,8 @@ from harness.extensions.devices import profiles as devices
 from harness.extensions.devices.timer import Computer, transmit_watts
 from harness.extensions.schedules.choices import refuse
 from harness.extensions.streams import sending
-from harness.extensions.streams.cpm import KEPT_S, Cpms, aged
 from harness.extensions.streams.motion import moments
+from harness.extensions.streams.services import KEPT_S, Services, aged
 from harness.radio.channel import Broadcast
 from harness.radio.profiles import CHANNELS
 from harness.report.words import questions
@@ -41,7 +41,7 @@ from harness.world.scene_graph import AgedNode, SceneGraph
 from harness.world.world import World
 
 LOSSLESS = replace(CHANNELS["6g"], loss=0.0)
-AT_ONCE = Cpms(0.1, 0.0, LOSSLESS)
+AT_ONCE = Services(0.1, 0.0, LOSSLESS)
 BANDWIDTH_BPS = 200e6  # of 6g
 
 
@@ -128,7 +128,7 @@ def test_ages_are_those_of_the_looks_and_bounded(small: Dataset) -> None:
     """A look every 0.1 s; an object is sent again within a second, and takes the delay."""
     ages = list[float]()
     for delay_s in (0.0, 0.3):
-        stream = Cpms(0.1, delay_s, LOSSLESS)
+        stream = Services(0.1, delay_s, LOSSLESS)
         scenes = scenes_of(small)
         heard = stream.heard(small.scenario, scenes)
         graphs = stream.graphs(small.scenario, as_sent(scenes, heard))
@@ -183,8 +183,8 @@ def test_a_look_at_the_decision_tells_what_a_list_that_is_asked_for_does(
     small: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Looks a second apart fall on decisions, and have all objects: the two differ by rounding."""
-    monkeypatch.setattr(sending, "phase", lambda seed, sender: 0.0)
-    stream, compared = Cpms(1.0, 0.0, LOSSLESS), 0
+    monkeypatch.setattr(sending, "phase", lambda seed, sender, kind: 0.0)
+    stream, compared = Services(1.0, 0.0, LOSSLESS), 0
     for scene in small.scenes(small.courses()):
         scene = replace(scene, notes={})
         own, *helpers = (scene.graphs[viewer] for viewer in scene.viewers)
@@ -206,16 +206,22 @@ def test_a_look_at_the_decision_tells_what_a_list_that_is_asked_for_does(
 
 def test_a_lost_or_late_stream_is_none(small: Dataset) -> None:
     scenes = scenes_of(small)
-    for stream in (Cpms(0.1, 0.0, replace(LOSSLESS, loss=1.0)), Cpms(0.1, KEPT_S + 1, LOSSLESS)):
+    for stream in (
+        Services(0.1, 0.0, replace(LOSSLESS, loss=1.0)),
+        Services(0.1, KEPT_S + 1, LOSSLESS),
+    ):
         assert not any(stream.heard(small.scenario, scenes))
     assert all(AT_ONCE.heard(small.scenario, scenes))
 
 
-@pytest.mark.parametrize("text", ["6g:stream=cpm", "its-g5:density_per_km=600,stream=cpm"])
+@pytest.mark.parametrize(
+    "text",
+    ["6g:stream=cpm", "its-g5:density_per_km=600,stream=cpm", "its-g5:stream=cam+cpm"],
+)
 def test_many_scenes_at_once_hear_what_each_hears_alone(small: Dataset, text: str) -> None:
     """Of a dataset that is read anew for each, so that nothing is known of the others."""
     stream, names = named_point(text).stream, small.courses()
-    assert isinstance(stream, Cpms)
+    assert isinstance(stream, Services)
     scenes = replace(small, _scenes={}).scenes(names)
     together = stream.heard(small.scenario, scenes)
     assert stream.heard(small.scenario, scenes) == together, "as a second condition asks it"
@@ -274,7 +280,7 @@ def test_a_lost_stream_leaves_every_decision_as_it_was(small: Dataset, tmp_path:
 OF_CPMS = [175, 195, 215, 237, 257, 278, 298]  # bytes as ETSI encodes and signs them, by objects
 
 
-def _as_json_bits(cpm: sending.Cpm) -> float:
+def _as_json_bits(cpm: sending.Message) -> float:
     listed = []
     for d in cpm.objects:
         numbers = [round(d.x_m, 1), round(d.y_m, 1), round(d.speed_mps, 1)]
@@ -296,11 +302,11 @@ def test_what_is_sent_is_counted_whoever_hears_it(
     """By own arithmetic, of the CPMs whose looks lie between two decisions."""
     encoding = "json" if profile == "6g" else "etsi"
     stream = named_point(f"{profile}:loss={loss},encoding={encoding},stream=cpm").stream
-    assert isinstance(stream, Cpms)
+    assert isinstance(stream, Services)
     scenes = scenes_of(small)
     counted = stream.sent(small.scenario, scenes)
     for scene, *row in zip(scenes, *counted, strict=True):
-        cpms, before = sending.stretch(small.scenario, scene, 0.1).cpms, scene.before()
+        cpms, before = sending.stretch(small.scenario, scene, 0.1).messages, scene.before()
         since_s = before.state.time_s if before else scene.state.time_s
         expected = [0.0, 0.0, 0.0]
         for cpm in cpms:
@@ -320,7 +326,7 @@ def test_time_on_air_is_unknown_where_a_radio_does_not_know_it(small: Dataset) -
 
     scenes = scenes_of(small)
     known = AT_ONCE.sent(small.scenario, scenes)
-    sent = Cpms(0.1, 0.0, Unknown(**vars(LOSSLESS))).sent(small.scenario, scenes)
+    sent = Services(0.1, 0.0, Unknown(**vars(LOSSLESS))).sent(small.scenario, scenes)
     assert np.array_equal(sent.bits, known.bits)
     assert np.array_equal(np.isnan(sent.airtime_s), known.messages > 0)
 
@@ -395,14 +401,14 @@ OBEYING = f"{CROWDED},congestion=reactive"  # a message every 200 ms (`radio con
 def test_a_reply_waits_as_long_as_after_any_packet(small: Dataset) -> None:
     """By own arithmetic: since a helper's last CPM of all the course, and not after the scene."""
     crowded, obeying = named_point(CROWDED).stream, named_point(OBEYING).stream
-    assert isinstance(crowded, Cpms)
-    assert isinstance(obeying, Cpms)
+    assert isinstance(crowded, Services)
+    assert isinstance(obeying, Services)
     scenes, waits_s = scenes_of(small), list[float]()
     assert not any(crowded.allowed_s(small.scenario, scenes))
     for scene, allowed_s in zip(scenes, obeying.allowed_s(small.scenario, scenes), strict=True):
         last_s, at = dict[str, float](), scene
         while at is not None:
-            for cpm in sending.stretch(small.scenario, at, 0.2).cpms:
+            for cpm in sending.stretch(small.scenario, at, 0.2).messages:
                 last_s[cpm.sender] = max(cpm.look.time_s, last_s.get(cpm.sender, -9))
             at = at.before()
         assert {*last_s} == {helper.id for helper in scene.state.helpers}
@@ -430,7 +436,7 @@ def test_replies_of_a_run_wait(small: Dataset, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_frozen_and_driven_send_alike(small: Dataset, tmp_path: Path) -> None:
     """Up to a decision that is later than frozen scenes assume."""
-    texts = ("6g:stream=cpm", "its-g5:encoding=etsi,density_per_km=120,stream=cpm", OBEYING)
+    texts = ("6g:stream=cpm", "its-g5:encoding=etsi,density_per_km=120,stream=cam+cpm", OBEYING)
     same: Any = {"points": tuple(map(named_point, texts)), "latency": "paper", "seeds": (0,)}
     frozen = read(run(spec_of(load(small.path, 2), **same), tmp_path / "frozen").out)
     driven = read(run(live_spec_of(episodes=2, first_seed=100, **same), tmp_path / "driven").out)
@@ -473,8 +479,8 @@ def test_congestion_control_thins_the_radio_and_the_stream() -> None:
     """At 600 vehicles a km reactive control lets each send every 200 ms (`radio congestion`)."""
     crowded = named_point("its-g5:density_per_km=600,stream=cpm")
     obeying = named_point("its-g5:density_per_km=600,stream=cpm,congestion=reactive")
-    assert isinstance(crowded.stream, Cpms)
-    assert isinstance(obeying.stream, Cpms)
+    assert isinstance(crowded.stream, Services)
+    assert isinstance(obeying.stream, Services)
     assert (crowded.stream.interval_s, obeying.stream.interval_s) == (0.1, 0.2)
     assert obeying.channel.rate_hz == 5  # type: ignore[attr-defined]
     assert obeying.physical.busy_ratio() < crowded.physical.busy_ratio()
@@ -507,7 +513,7 @@ def test_schedules_are_not_compared_as_if_nothing_were_heard() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("6g:stream=cam", "unknown stream 'cam'; did you mean 'cpm'?"),
+        ("6g:stream=cps", "unknown stream 'cps'; did you mean 'cpm'?"),
         ("6g:stream=cpm,stream_interval_s=0.05", "seconds from 0.1 to 1 (ETSI TS 103 324)"),
         ("6g:stream=cpm,stream_interval_s=2", "seconds from 0.1 to 1 (ETSI TS 103 324)"),
         ("6g:stream=cpm,content=objects", "it must be none where content is objects"),
@@ -525,7 +531,16 @@ def test_what_cannot_be_sent_is_refused_in_one_line(text: str, message: str) -> 
 
 @pytest.mark.parametrize(
     "text",
-    ["cpm:", "cpm:0.1:", "cpm:x:1", "cpm:1e-9:1", "cpm:0.00001:1", "cpm:9:1", "cpm:0.1:1..2"],
+    [
+        "cpm:",
+        "cpm:0.1:",
+        "cpm:x:1",
+        "cpm:1e-9:1",
+        "cpm:0.00001:1",
+        "cpm:9:1",
+        "cpm:0.1:1..2",
+        "cam:0.1:1;",
+    ],
 )
 def test_a_key_that_is_no_stream_is_refused_in_one_line(small: Dataset, text: str) -> None:
     """As a stranger's file may have it: an interval could make a program look for ever."""
@@ -538,7 +553,7 @@ def test_streams_of_two_intervals_are_each_shown_by_its_own(small: Dataset) -> N
     """A dry run has the questions of several conditions at once."""
     scenes, sets = scenes_of(small)[:6], []
     for interval_s in (0.1, 0.5):
-        stream = Cpms(interval_s, 0.0, LOSSLESS)
+        stream = Services(interval_s, 0.0, LOSSLESS)
         sets += stream_sets(small.scenario, scenes, stream, np.arange(6))
     together = shared_graphs(small.scenario, sets, {})
     alone = [shared_graphs(small.scenario, [each], {})[0] for each in sets]
