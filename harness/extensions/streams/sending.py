@@ -30,7 +30,7 @@ from harness.world.state import Beacon, VehicleState, WorldState
 
 CAM, CPM = "cam", "cpm"  # kinds of messages
 LEAD_S = 2.0  # how long streams run before an episode starts
-AT_ONCE = 32  # looks whose rays fit into the processor's cache
+AT_ONCE = 64  # looks whose rays fit into the processor's cache
 SCENES_KEPT = 2048  # whose CPMs stay in memory, some 10 kB each
 ROUNDING_S = 1e-9
 
