@@ -4,11 +4,12 @@
                                  [--page benchmarks/measured/unasked.md]
 
 For each row of `ROWS` it evaluates a model on report layouts, frozen, and drives the same layouts
-where the row says so, in each of `CONTENTS` over a radio. It writes the tables of the page between
-its marks; costs, and differences to intents, are driven where it drives. What is finished is read
-and not made again; a stopped one goes on with the same command.
+where the row says so, in each of its contents over a radio. It writes the tables of the page
+between its marks; costs, and differences to intents, are driven where it drives. What is finished
+is read and not made again; a stopped one goes on with the same command.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,6 +36,13 @@ CONTENTS = {
     "a stream, every 1 s": f"stream=cpm,stream_interval_s=1,{NEVER}",
     "a stream, and intents": "stream=cpm",
 }
+CAMS = {
+    INTENTS: "",
+    "CAMs": f"stream=cam,{NEVER}",
+    "CAMs, and intents": "stream=cam",
+    "CAMs and CPMs": f"stream=cam+cpm,{NEVER}",
+    "CAMs and CPMs, every 1 s": f"stream=cam+cpm,stream_interval_s=1,{NEVER}",
+}
 HEADS = (
     "what is sent", "balanced, %", "over nothing", "with a danger", "without",
     "driven, %", "driven, over nothing", "over intents", "kbit", "airtime, ms", "late, %",
@@ -50,20 +58,23 @@ class Asked(NamedTuple):
     row: Row
     radio: str
     drives: bool = False
+    contents: Mapping[str, str] = CONTENTS
 
     def __str__(self) -> str:
-        return f"{self.row} over {self.radio}, {self.row.dataset}"
+        cams = ", CAMs for beacons" if self.contents is CAMS else ""
+        return f"{self.row} over {self.radio}, {self.row.dataset}{cams}"
 
     @property
     def name(self) -> str:
         """Its folder."""
-        return f"{self.row.name}/{self.radio}-{self.row.dataset}".replace(":", "-")
+        cams = "-cams" if self.contents is CAMS else ""
+        return f"{self.row.name}/{self.radio}-{self.row.dataset}{cams}".replace(":", "-")
 
     @property
     def conditions(self) -> dict[str, str]:
         """What is sent, and the condition in which it is."""
         points = {"nothing": BASELINE}
-        for content, settings in CONTENTS.items():
+        for content, settings in self.contents.items():
             name, _, changed = self.radio.partition(":")
             parts = [part for part in (changed, "encoding=etsi", settings) if part]
             points[content] = f"{name}:{','.join(parts)}"
@@ -87,6 +98,8 @@ ROWS = (
     Asked(RULE, "mode4:density_per_km=300"),
     Asked(RULE, "mode2:density_per_km=100"),
     Asked(RULE, "mode2:density_per_km=200", drives=True),
+    Asked(RULE, "its-g5:density_per_km=120", drives=True, contents=CAMS),
+    Asked(RULE, "mode4:density_per_km=200", drives=True, contents=CAMS),
     Asked(SMALL, "its-g5:density_per_km=120", drives=True),
     Asked(RULE._replace(dataset="sumo-crossing-v1"), "its-g5:density_per_km=120"),
     Asked(RULE._replace(dataset="sumo-merge-v1"), "its-g5:density_per_km=120"),
