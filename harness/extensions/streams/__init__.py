@@ -1,5 +1,5 @@
-"""Have stations send what they see unasked, as standards say: what, how often, and how much the
-channel lets them.
+"""Have stations send where they are and what they see unasked, as standards say: what, how often,
+and how much the channel lets them.
 """
 
 from harness.core.extensions import Extension
