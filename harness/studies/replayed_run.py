@@ -32,7 +32,6 @@ from harness.coordination.streams import Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import alone, canonical_json
-from harness.core.memory import uncollected
 from harness.core.progress import Progress
 from harness.dataset.load import Scene
 from harness.evaluate import stated_times
@@ -87,7 +86,6 @@ class ReplayedRun:
 
     same_episodes = True
 
-    @uncollected()
     def __init__(
         self,
         folder: Path,

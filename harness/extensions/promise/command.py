@@ -59,6 +59,7 @@ def command(
     """
     from typing import cast, get_args
 
+    from harness.core.memory import uncollected
     from harness.extensions.promise.page import promise_study
     from harness.extensions.promise.promises import Harm
     from harness.extensions.promise.study import promise_of, run_promise
@@ -75,7 +76,7 @@ def command(
         options.check_new_file("--write", write)
         if len(at_most) != 1:
             raise UserError("--write: a file has one promise; give one --at-most")
-    with bar("settings", quiet=as_json or quiet, grows=True) as progress:
+    with uncollected(), bar("settings", quiet=as_json or quiet, grows=True) as progress:
         cards = options.cards(model)
         played = [ReplayedRun(run, latency, progress, not no_model, models=cards) for run in runs]
         tuned = ReplayedRun(tune, latency, progress, not no_model, models=cards)

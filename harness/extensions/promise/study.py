@@ -14,7 +14,6 @@ import numpy as np
 from harness.coordination.operating_point import OperatingPoint
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
-from harness.core.memory import uncollected
 from harness.core.progress import Progress
 from harness.core.seeds import purposes, seeds_text
 from harness.dataset import rebuilt
@@ -44,7 +43,6 @@ DELTA = 0.05
 AT_MOST = (0.01, 0.02, 0.05, 0.1)
 
 
-@uncollected()
 def run_promise(
     runs: Sequence[ReplayedRun],
     tune: ReplayedRun,
