@@ -102,10 +102,10 @@ def sentence(result: Result, level: Level) -> str:
     change = report.success_rule.difference(after.success, before.success)
     requests = after.costs["requests"] - before.costs["requests"]
     late_ms = after.costs["latency_ms"] - before.costs["latency_ms"]
-    careful = " (the ego always takes its first action)" if is_always(point) else ""
+    careful = " (always careful)" if is_always(point) else ""
     return (
         f"{WORDS[result.harm].capitalize()} ≤ {percent(level.at_most)} % costs {requests:+.1f} "
-        f"requests an episode, {late_ms:+.1f} ms a decision and {interval_of(change, sign='+')} "
+        f"requests, {late_ms:+.1f} ms and {interval_of(change, sign='+')} "
         f"points of {report.success_rule.words}{careful}: {interval_of(report.harm(point))} % on "
         f"report layouts, by {typed(point)}; {_beside(result, level)}."
     )
@@ -114,9 +114,9 @@ def sentence(result: Result, level: Level) -> str:
 def _beside(result: Result, level: Level) -> str:
     """Return in words what promises a level without a model, and its success on report layouts."""
     if level.blind is None:
-        return "no ego that looks at nothing can promise it"
-    success = interval_of(result.report.success(level.blind))
-    return f"without a model, {level.blind} promises it, with {success} % success"
+        return "no blind ego can promise it"
+    success = PERCENT.text(result.report.success(level.blind).value)
+    return f"blind, {level.blind} keeps it at {success} success"
 
 
 def is_always(point: OperatingPoint) -> bool:

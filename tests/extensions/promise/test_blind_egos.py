@@ -94,6 +94,5 @@ def test_what_nobody_can_promise_no_blind_ego_may() -> None:
     report = SimpleNamespace(run=SimpleNamespace(name="model"), success=lambda name: None)
     result: Any = SimpleNamespace(harm="unsafe", units=np.zeros((1, 100)), report=report)
     assert sentence(result, Level(0.05, 59, 0, None, None)) == (
-        "No setting of model can promise unsafe episodes ≤ 5 %; no ego that looks at nothing can "
-        "promise it."
+        "No setting of model can promise unsafe episodes ≤ 5 %; no blind ego can promise it."
     )
