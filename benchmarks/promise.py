@@ -61,6 +61,12 @@ class Row(NamedTuple):
     model: str
     condition: str = "6g"
     answer: str = "json"
+    prompt: str | None = None  # the scenario's usual one
+
+    @property
+    def folder(self) -> Path:
+        """Return the folder of its runs."""
+        return Path(f"{self.model}-{self.prompt}" if self.prompt else self.model)
 
 
 ROWS = (
@@ -70,6 +76,7 @@ ROWS = (
     Row("constant", "constant"),
     Row("uniform", "uniform"),
     Row("swarm-tiny-six-v2", "swarm-tiny-six-v2", answer="readout"),
+    Row("swarm-tiny-six-v2, prompt v4", "swarm-tiny-six-v2", answer="readout", prompt="v4"),
 )
 
 
@@ -108,11 +115,12 @@ def main() -> None:
 
 def evaluate(row: Row, dataset: str, limit: int | None) -> Path:
     """Return the folder of a model's run on a dataset, made if it is missing."""
-    out = Path(row.model, dataset)
+    out = row.folder / dataset
     if not (out / "run.json").exists():
         cut = ("--limit", str(limit)) if limit else ()
         how = ("--answer", row.answer, "--condition", "6g", "--seeds", SEEDS, "--ask", "all")
-        words = ("--model", row.model, "--dataset", dataset, *how, *cut)
+        prompt = ("--prompt", row.prompt) if row.prompt else ()
+        words = ("--model", row.model, *prompt, "--dataset", dataset, *how, *cut)
         harness("eval", *words, "--quiet", "--out", str(out))
     return out
 
@@ -210,9 +218,9 @@ def elsewhere_table() -> str:
     """Return the table of the proxy's promises on report layouts, and on other roads."""
     row = ROWS[0]
     others = [str(evaluate(row, dataset, None)) for dataset in ELSEWHERE]
-    runs = [str(Path(row.model, REPORT)), *others]
+    runs = [str(row.folder / REPORT), *others]
     said = harness(
-        "study", "promise", *runs, "--tune", f"{row.model}/tune", "--condition", "6g",
+        "study", "promise", *runs, "--tune", str(row.folder / "tune"), "--condition", "6g",
         "--seeds", "0", "--at-most", "5", "--at-most", "10", "--out", "elsewhere", "--json",
     )  # fmt: skip
     rows = []
