@@ -500,8 +500,22 @@ class _Nearest:
         return self._stored.call_of_agents(scenes, at, intents)
 
 
+def refuse_twice(runs: Sequence[ReplayedRun]) -> None:
+    """Raise UserError if two runs are of one folder, whose episodes would count twice."""
+    folders = set[Path]()
+    for run in runs:
+        folder = run.run.path.resolve()
+        if folder in folders:
+            raise UserError(f"{printable(run.run.path)} is given twice; give each run once")
+        folders.add(folder)
+
+
 def name_apart(runs: Sequence[ReplayedRun]) -> None:
-    """Give runs of one name, which is that of their model, the names of their folders as well."""
+    """Give runs of one name, which is that of their model, the names of their folders as well.
+
+    Raises UserError if two are of one folder.
+    """
+    refuse_twice(runs)
     total = Counter(run.name for run in runs)
     of_folders = Counter((run.name, run.run.path.name) for run in runs)
     for number, run in enumerate(runs, 1):

@@ -53,8 +53,9 @@ def value(summary: pd.DataFrame, at: Any, metric: str) -> float:
 def test_runs_of_one_name_are_named_by_their_folders_as_well(
     done: Evaluated, tmp_path: Path
 ) -> None:
-    """What is of one name is one source in a study's tables."""
-    runs = [ReplayedRun(done.out) for _ in range(3)]
+    """What is of one name is one source in a study's tables, and a folder is given once."""
+    copies = [shutil.copytree(done.out, tmp_path / name / "run") for name in "abc"]
+    runs = [ReplayedRun(folder) for folder in copies]
     runs[2].run.manifest.model["name"] = "another"
     runs[2].name = str(runs[2].run.manifest.variant)
     name_apart(runs)
@@ -64,6 +65,8 @@ def test_runs_of_one_name_are_named_by_their_folders_as_well(
         f"{plain} · run (2)",
         plain.replace("proxy", "another"),
     ]
+    with pytest.raises(UserError, match=r"c/run is given twice; give each run once"):
+        name_apart([*runs, ReplayedRun(tmp_path / "a/../c/run")])
 
 
 @pytest.mark.slow

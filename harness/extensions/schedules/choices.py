@@ -187,6 +187,12 @@ def _values_of(values: Floats, k: Ints) -> Floats:
     return np.asarray(np.take_along_axis(values, index, 2)[:, :, 0])
 
 
+def refuse_idle(point: OperatingPoint) -> None:
+    """Raise UserError if at an operating point no rule for whom to ask changes anything."""
+    if why := point.idle("schedule"):
+        raise UserError(f"--condition {printable(point.name)}: no schedule changes anything: {why}")
+
+
 def refuse(point: OperatingPoint, helpers: int, actions: int) -> None:
     """Raise UserError if decisions depend on more than whom the ego hears now.
 

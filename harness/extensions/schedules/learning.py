@@ -23,9 +23,9 @@ from harness.core.figures import amount
 from harness.core.files import write_whole
 from harness.core.seeds import Purpose, purposes, seeds_text
 from harness.dataset import rebuilt
-from harness.extensions.schedules.choices import Choices, Choose, choices
+from harness.extensions.schedules.choices import Choices, Choose, choices, refuse_idle
 from harness.extensions.schedules.learnt import INPUTS, Learnt, Network, Stated, Weights, inputs
-from harness.studies.replayed_run import ReplayedRun, counted
+from harness.studies.replayed_run import ReplayedRun, counted, refuse_twice
 
 UNITS = 12
 ROUNDS = 6
@@ -130,7 +130,8 @@ def learn(
     `train` are runs on layouts (start situations) that are for learning. `point` is the operating
     point (settings of radio, asking and fusion): its limit of helpers holds, and its schedule (its
     rule for whom to ask) decides in the rest of an episode in the first round, the network in later
-    ones. `progress` is called with 1 for each step and round.
+    ones. `progress` is called with 1 for each step and round. Raises UserError if no helper can be
+    asked anywhere.
     """
     trees = [choices(stored, point, stored.seeds, progress) for stored in train]
     network, rules = None, [tree.scheduled(point) for tree in trees]
@@ -142,7 +143,13 @@ def learn(
             of_tree, gains_of_tree = gains(tree, with_outlook, rule)
             rows.append(of_tree)
             targets.append(gains_of_tree)
-        network = fit(np.concatenate(rows), np.concatenate(targets))
+        every_row = np.concatenate(rows)
+        if not len(every_row):
+            raise UserError(
+                f"--condition {printable(point.name)}: at no decision point of the train runs is a "
+                "helper in reach, so nothing is learnt; give another condition or other runs"
+            )
+        network = fit(every_row, np.concatenate(targets))
         rules = [by_network(tree, with_outlook, network, WHILE_LEARNING) for tree in trees]
         progress(1)
     assert network is not None
@@ -222,10 +229,14 @@ def run_learn(
         progress: called with 1 for each step and round.
 
     Raises:
-        UserError: a run is on layouts for another purpose, or its decisions depend on more than who
-            is heard: the model is asked again with messages, or fusion has a memory.
+        UserError: nobody can be asked; or a run is given twice, is on layouts for another purpose,
+            or its decisions depend on more than who is heard: the model is asked again with
+            messages, or fusion has a memory.
         Unanswered: too many questions got no answer.
     """
+    refuse_idle(point)
+    for runs in (train, tune):
+        refuse_twice(runs)
     learnt_from = tuple(layouts(stored, "train") for stored in train)
     tuned_on = tuple(layouts(stored, "tune") for stored in tune)
     network = learn(train, point, progress)

@@ -25,7 +25,7 @@ from harness.core.figures import DASH, interval_of, some_of
 from harness.core.progress import Progress
 from harness.core.statistics import Estimate, resampled_estimate
 from harness.core.versions import versions
-from harness.extensions.schedules.choices import COSTS, Choices, choices
+from harness.extensions.schedules.choices import COSTS, Choices, choices, refuse_idle
 from harness.extensions.schedules.learning import layouts
 from harness.report.document import Table
 from harness.report.drawing.colours import COLOURS, INK, MARKERS
@@ -417,8 +417,7 @@ def compare(
     Raises:
         UserError: no schedule can change anything at the operating point.
     """
-    if why := point.idle("schedule"):
-        raise UserError(f"--condition {printable(point.name)}: no schedule changes anything: {why}")
+    refuse_idle(point)
     run = choices(stored, point, seeds, progress)
     tune_run = choices(tune, point, seeds, progress) if tune else None
     run_plays: dict[str, list[Play]] = {}
@@ -539,7 +538,7 @@ def _area(success: Floats, messages: Floats, ranks: Floats, most: Floats) -> Flo
         better = ranks[at] > best
         best, taken = np.where(better, ranks[at], best), np.where(better, success[rows, at], taken)
         area += taken * (until[:, place] - costs[:, place])
-    return area / most
+    return _ratio(area, most)
 
 
 def _ratio(part: Floats, whole: Floats) -> Floats:

@@ -338,6 +338,8 @@ def test_an_area_has_the_best_rank_and_not_the_best_luck():
     assert _area(success, messages, np.array([1.0, 0.5, 3.0]), np.array([4.0])) == pytest.approx(
         (2 * 0.2 + 2 * 0.5) / 4
     )
+    nobody_in_reach = np.zeros(1)
+    assert np.isnan(_area(success, 0 * messages, np.ones(3), nobody_in_reach)).all()
 
 
 # -- the commands ----------------------------------------------------------------------------------
@@ -438,6 +440,33 @@ def test_a_schedule_is_learnt_and_then_one_of_its_name(
     assert code == 2
     assert "(tune), 4 layouts" not in err
     assert "give a run on train layouts" in err
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        (["--condition", "single-local"], "no schedule changes anything: it has no channel"),
+        (["--condition", "6g:max_helpers=0"], "no schedule changes anything: max_helpers is 0"),
+        (["--condition", "6g:radius_m=0.1"], "at no decision point of the train runs is a helper"),
+        (["--tune", "TUNE/../run"], "TUNE/../run is given twice; give each run once"),
+        (["TRAIN"], "TRAIN is given twice; give each run once"),
+    ],
+)
+def test_where_nothing_can_be_learnt_it_is_one_line(
+    stored: ReplayedRun,
+    train: ReplayedRun,
+    harness: Callable[..., Any],
+    more: list[str],
+    says: str,
+):
+    def placed(text: str) -> str:
+        return text.replace("TRAIN", str(train.run.path)).replace("TUNE", str(stored.run.path))
+
+    typed = ("study", "schedule", "learn", train.run.path, "--tune", stored.run.path)
+    code, _, said = harness(*typed, "--out", "none.toml", "--quiet", *map(placed, more))
+    assert (code, said.count("\n")) == (2, 1)
+    assert placed(says) in said
+    assert not Path("none.toml").exists()
 
 
 def test_a_network_learns_what_there_is_to_learn():
