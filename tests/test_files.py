@@ -5,6 +5,7 @@ and files that are read once.
 import math
 import os
 import random
+import socket
 import subprocess
 import sys
 from contextlib import nullcontext
@@ -20,10 +21,13 @@ import pytest
 
 from harness.core.errors import UserError, printable
 from harness.core.files import (
+    Refused,
+    alone,
     appending,
     canonical_json,
     digest,
     folder_in,
+    is_there,
     read_once,
     refuse_bomb,
     replacing,
@@ -183,25 +187,44 @@ def test_every_text_of_junit_is_xml(text: str) -> None:
 
 def test_a_device_or_a_pipe_is_not_replaced_by_a_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    refused = pytest.raises(FileExistsError, match="is no file that can be replaced")
+    refused = pytest.raises(Refused, match="a pipe or a device, and is not replaced")
     with refused, replacing(tmp_path / "pipe"):
         pass
     assert (tmp_path / "pipe").is_fifo()
 
 
-@pytest.mark.parametrize("kind", ["link to a file", "link to nothing", "pipe"])
-def test_nothing_is_appended_to_what_is_no_file(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["link to a file", "link to nothing", "pipe", "socket"])
+def test_nothing_is_appended_to_what_is_no_file(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     theirs, file = tmp_path / "theirs", tmp_path / "answers.jsonl"
     if kind == "pipe":
         os.mkfifo(file)
+    elif kind == "socket":
+        monkeypatch.chdir(tmp_path)  # a socket's path is a short one
+        with socket.socket(socket.AF_UNIX) as listening:
+            listening.bind(file.name)
     else:
         file.symlink_to(theirs)
     if kind == "link to a file":
         theirs.write_text("theirs")
-    with pytest.raises(OSError), appending(file):  # noqa: PT011
+    else:
+        with pytest.raises(Refused, match=r"it is no file, so nothing is appended to it"):
+            is_there(file)
+    with pytest.raises(Refused), appending(file):
+        pass
+    with pytest.raises(OSError), alone(file):  # noqa: PT011
         pass
     assert kind == "link to a file" or not theirs.exists()
     assert not theirs.exists() or theirs.read_text() == "theirs"
+
+
+def test_a_file_that_is_appended_to_is_read_and_no_program(tmp_path: Path) -> None:
+    assert not is_there(tmp_path / "answers.jsonl")
+    with appending(tmp_path / "answers.jsonl") as file:
+        file.write(b"1")
+    assert is_there(tmp_path / "answers.jsonl")
+    assert not os.access(tmp_path / "answers.jsonl", os.X_OK)
 
 
 def test_a_folder_in_a_run_is_no_link(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _EXACT = json.JSONEncoder(
     sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=False, check_circular=False
 )
+NO_FILE = "it is no file, but a pipe or a device"
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 # what a formula begins with, and what spreadsheets skip before it
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
@@ -85,10 +86,7 @@ def opened(path: str | Path, kind: Kind) -> BufferedReader:
     """
     file = open(path, "rb", opener=_at_once)  # noqa: SIM115
     try:
-        state = os.fstat(file.fileno())
-        if not stat.S_ISREG(state.st_mode):
-            raise Refused(errno.EINVAL, "it is no file, but a pipe or a device", str(path))
-        if state.st_size > LARGEST[kind]:
+        if os.fstat(file.fileno()).st_size > LARGEST[kind]:
             raise Refused(
                 errno.EFBIG, f"it is larger than {_size(LARGEST[kind])}, the limit", str(path)
             )
@@ -99,8 +97,19 @@ def opened(path: str | Path, kind: Kind) -> BufferedReader:
 
 
 def _at_once(path: str, flags: int) -> int:
-    # Without the flag, opening a pipe waits for somebody who writes to it.
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0))
+    # Without the first flag, opening a pipe waits for somebody at its other end.
+    flags |= getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+    try:
+        file = os.open(path, flags, 0o666)
+    except OSError as error:
+        if error.errno != errno.ENXIO:  # of a pipe that nobody reads, and of a socket
+            raise
+        raise Refused(errno.EINVAL, NO_FILE, path) from None
+    mode = os.fstat(file).st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        os.close(file)
+        raise Refused(errno.EINVAL, NO_FILE, path)
+    return file
 
 
 def _size(size: int) -> str:
@@ -239,8 +248,6 @@ def appending(path: Path) -> Iterator[BinaryIO]:
     else's folder may have in its place.
     """
     with naming(path), open(path, "ab", opener=_in_place) as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise Refused(errno.EINVAL, "it is no file, but a pipe or a device", str(path))
         yield file
 
 
@@ -248,6 +255,16 @@ def _in_place(path: str, flags: int) -> int:
     if os.path.islink(path):
         raise Refused(errno.ELOOP, "it is a link, and nothing is written through it", path)
     return _at_once(path, flags | getattr(os, "O_NOFOLLOW", 0))
+
+
+def is_there(path: Path) -> bool:
+    """Return whether a file is at `path`, which is read now, and to which is appended later.
+
+    Raises Refused for anything else, to which nothing is appended, before work for it is in vain.
+    """
+    if not path.is_file() and os.path.lexists(path):
+        raise Refused(errno.EINVAL, "it is no file, so nothing is appended to it", str(path))
+    return path.is_file()
 
 
 def folder_in(run: Path, name: str) -> Path:
@@ -272,7 +289,7 @@ def replacing(path: Path) -> Iterator[Path]:
     if path.is_dir():  # fail now, and not only after all is written
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if path.exists() and not path.is_file():  # a device or a pipe, whose place the file would take
-        raise FileExistsError(errno.EEXIST, "is no file that can be replaced", str(path))
+        raise Refused(errno.EEXIST, f"{NO_FILE}, and is not replaced", str(path))
     # Arrow takes a relative path with a colon, such as `6g:loss=0/x`, for an address.
     part = path.absolute().with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -344,8 +361,8 @@ def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
 
     It holds an exclusive lock; a missing file is created. The lock of a killed process is released.
     On systems without such locks (Windows) nothing is locked. Raises BlockingIOError if another
-    process still holds it after `patience_s` seconds, and OSError if the file is a link or cannot
-    be opened.
+    process still holds it after `patience_s` seconds, and OSError if the file is a link, a pipe or
+    a device, or cannot be opened.
     """
     try:
         import fcntl
@@ -353,7 +370,7 @@ def alone(path: Path, patience_s: float = 0.0) -> Iterator[None]:
         yield
         return
     how = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT
-    file = os.open(path, how | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    file = _at_once(str(path), how | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         deadline_s = time.monotonic() + patience_s
         while True:

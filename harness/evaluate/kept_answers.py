@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from harness.core.errors import UserError, printable
-from harness.core.files import appending, bytes_of
+from harness.core.files import appending, bytes_of, is_there
 from harness.runs.records import Answer
 
 MORE_FOLLOWS = b" \n"  # ends every line but the last of its chunk, so that a torn chunk can be told
@@ -35,9 +35,9 @@ class KeptAnswers:
 
         That is, since the last call. `cut` removes a chunk at the file's end that was written in
         part. Errors of the engine, which runs the model, do not count as answers. Raises UserError
-        if the file is damaged.
+        if the file is damaged, and OSError for a pipe or the like in its place.
         """
-        if not self.file.is_file() or (size_b := self.file.stat().st_size) == self._read_b:
+        if not is_there(self.file) or (size_b := self.file.stat().st_size) == self._read_b:
             return {}
         lines = bytes_of(self.file, "rows").splitlines(keepends=True)
         while lines and (lines[-1].endswith(MORE_FOLLOWS) or not lines[-1].endswith(b"\n")):

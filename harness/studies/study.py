@@ -18,7 +18,15 @@ from harness.core import extras
 from harness.core.errors import UserError, printable, sayable_path
 from harness.core.extensions import studies
 from harness.core.figures import PERCENT
-from harness.core.files import appending, bytes_of, neutral, replacing, text_of, write_whole
+from harness.core.files import (
+    appending,
+    bytes_of,
+    is_there,
+    neutral,
+    replacing,
+    text_of,
+    write_whole,
+)
 from harness.core.multiplicity import LEVEL, holm
 from harness.core.seals import seal
 from harness.core.statistics import Estimate
@@ -271,7 +279,7 @@ class Cells:
         count, and without a seal those that are `computed`, unlike a model's replies.
         """
         self._path, self._of, self._computed = path, depends_on, computed
-        data = bytes_of(path, "rows") if path.is_file() else b""
+        data = bytes_of(path, "rows") if is_there(path) else b""
         self._torn = bool(data) and not data.endswith(b"\n")
         self._cells = dict(self._read(data))
 

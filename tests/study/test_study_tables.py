@@ -1,6 +1,7 @@
 """A study's folder: its tables as pandas writes them without formulas, and its page."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from markupsafe import Markup
 
 from harness.core.errors import UserError
+from harness.core.files import Refused
 from harness.core.seals import seal
 from harness.report.document import Table, strong
 from harness.studies.study import Cells, Study, p_cell, refuse_other, write_study, write_table
@@ -116,6 +118,12 @@ def test_parts_are_kept_to_the_last_bit_but_those_of_something_else_and_torn_one
     path.write_bytes(path.read_bytes()[:-5])
     assert [part("that", 2), part("this", 1), part("this", 2), part("that", 2)] == [2, 1, 2, 2]
     assert computed == ["this1", "this2", "that2", "this2"]
+
+
+def test_no_part_is_computed_where_a_pipe_would_keep_it(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "cells.jsonl")
+    with pytest.raises(Refused, match="it is no file, so nothing is appended to it"):
+        Cells(tmp_path / "cells.jsonl", "this")
 
 
 @pytest.mark.parametrize("forged", ["its value", "another's key", "no seal"])

@@ -1,7 +1,9 @@
 """A run's stored answers at other operating points."""
 
 import json
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +69,27 @@ def test_runs_of_one_name_are_named_by_their_folders_as_well(
     ]
     with pytest.raises(UserError, match=r"c/run is given twice; give each run once"):
         name_apart([*runs, ReplayedRun(tmp_path / "a/../c/run")])
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("more-answers.jsonl", "it is no file, so nothing is appended to it; fix that"),
+        (".more-answers.jsonl.lock", "it is no file, but a pipe or a device; fix that"),
+        ("sweep-tau/index.html", "it is no file, but a pipe or a device, and is not replaced"),
+    ],
+)
+def test_a_pipe_where_a_study_writes_in_a_run_is_one_line(
+    name: str, says: str, done: Evaluated, harness: Callable[..., Any], tmp_path: Path
+) -> None:
+    pipe = shutil.copytree(done.out, tmp_path / "run") / name
+    pipe.parent.mkdir(exist_ok=True)
+    os.mkfifo(pipe)
+    typed = ("study", "sweep", "run", "--over", "tau", "--grid", "0.1", "--condition", "6g")
+    code, _, said = harness(*typed, "--quiet")
+    assert (code, said.count("\n")) == (2, 1)
+    assert f"run/{name}: {says}" in said
+    assert pipe.is_fifo()
 
 
 @pytest.mark.slow
