@@ -179,9 +179,33 @@ def test_gaps_are_refused(split: Path, harness: Typed, tmp_path: Path) -> None:
     )
     shutil.rmtree(next((shards[1] / ".work").glob("episodes-*")))
     said = refused(harness, shards)
-    assert re.search(
-        r"/2, shard 2/3, lacks episodes 2 to 3 and 0 parts more; type its command again", said
+    assert re.search(r"/2, shard 2/3, lacks episodes 2 to 3; type its command again", said)
+    config = shards[1] / ".work/config.json"  # as if it were to be all of the run
+    config.write_text(json.dumps({**json.loads(config.read_text()), "shard": "1/1"}))
+    assert "/2, shard 1/1, lacks episodes 0 to 1 and 2 parts more; type" in refused(
+        harness, shards[1:2]
     )
+
+
+@pytest.mark.slow
+def test_a_broken_shard_is_named_by_its_own_folder_and_mended(
+    split: Path, harness: Typed, tmp_path: Path
+) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    file = next((shards[1] / ".work").glob("episodes-*")) / "episodes.csv"
+    text = file.read_text()
+    file.write_text("x\0y")
+    typed = ("run", "merge", *shards, "--out", "merged", "--quiet")
+    code, _, said = harness(*typed)
+    assert (code, said.count("\n")) == (2, 1)
+    assert said.startswith(
+        f"harness: {shards[1]}/.work/episodes-000002-000003 is broken (CSV parse"
+    )
+    file.write_text(text)
+    assert harness(*typed) == (0, "", "")
+    assert (tmp_path / "merged/episodes.csv").read_bytes() == (
+        split / "whole/episodes.csv"
+    ).read_bytes()
 
 
 @pytest.mark.slow

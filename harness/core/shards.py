@@ -184,9 +184,11 @@ def owners(
     for folder, config in zip(folders, configs, strict=True):
         shard_parts = {name: folder / WORK / name for name in shard_of(config.shard).part(parts)}
         if missing := [name for name, part in shard_parts.items() if not part.exists()]:
+            first, *others = missing
+            more = f" and {amount(len(others), 'part')} more" if others else ""
             raise UserError(
-                f"{printable(folder)}, shard {config.shard}, lacks {printable(label(missing[0]))} "
-                f"and {len(missing) - 1} parts more; type its command again, and then merge"
+                f"{printable(folder)}, shard {config.shard}, lacks {printable(label(first))}{more};"
+                " type its command again, and then merge"
             )
         for name, part in shard_parts.items():
             if name in paths and _content(part) != _content(paths[name]):

@@ -240,6 +240,12 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
             raise UserError(
                 f"{error}; type the commands of the shards again, and merge then"
             ) from None
+        except UserError:
+            actions = whole.settings["actions"]
+            for name, part in parts.items():  # so that a shard's own part is named, and no copy
+                for _ in run_parts.read_part(part, chunk_by_folder[name], actions):
+                    pass
+            raise
 
 
 def _walk_whole(
