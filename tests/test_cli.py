@@ -17,6 +17,7 @@ from harness import __version__, cli
 from harness.cli.run import default_out
 from harness.core import work
 from harness.core.errors import UserError
+from harness.core.resources import DATASET
 from harness.dataset.load import Dataset, load
 from harness.evaluate.run import evaluate
 from harness.prompts import versions
@@ -151,6 +152,17 @@ def test_bad_input_is_one_line_that_says_what_is_allowed(
 def broken(small_path: Path, tmp_path: Path) -> Path:
     """A copy of the dataset to break."""
     return Path(shutil.copytree(small_path, tmp_path / "broken"))
+
+
+@pytest.mark.parametrize("command", ["eval", "drive"])
+@pytest.mark.parametrize("name", ["FOLDER", DATASET, "suite:v2v-safety-2"])
+def test_a_dataset_in_place_of_settings_is_told_where_it_goes(
+    command: str, name: str, small_path: Path, harness: Harness
+) -> None:
+    name = name.replace("FOLDER", str(small_path))
+    assert one_line(harness(command, name)) == (
+        f"harness: {name} is a dataset, and no settings; type `harness eval --dataset {name}`"
+    )
 
 
 def test_a_dataset_that_is_none_is_one_line(harness: Harness, tmp_path: Path) -> None:

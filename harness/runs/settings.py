@@ -595,9 +595,12 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
     command, or names what only a user may.
     """
     sayable("settings", file.name)
-    file = file / FILE if file.is_dir() else file
+    place, file = file, file / FILE if file.is_dir() else file
     where = f"settings {printable(file)}"
     if not file.exists():
+        if _is_dataset(str(place)):
+            words = printable(shlex.join(["harness", "eval", "--dataset", str(place)]), 2000)
+            raise UserError(f"{printable(place)} is a dataset, and no settings; type `{words}`")
         raise UserError(
             f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, "
             "which runs have since 0.3; for another, type the command in its run.json"
@@ -626,6 +629,16 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
             f"{where}: {what} by itself; if you want it, type `{_again(settings, file, beside)}`"
         )
     return settings
+
+
+def _is_dataset(name: str) -> bool:
+    """Return whether `--dataset` would take a text: a folder, a name that ships, or a suite's."""
+    from harness.dataset.load import find
+    from harness.dataset.suites import datasets
+
+    with suppress(UserError):
+        return all((find(each) / "manifest.json").is_file() for each in datasets(name))
+    return False
 
 
 def otherwise(folder: Path, made_with: Settings) -> str | None:
