@@ -354,8 +354,12 @@ class Asker:
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
         """Return what every viewer intends; NaN if it has no request or its answer failed."""
-        self._ask_at(scenes, None if self.spec.asks_all else [EGO] * len(scenes))
+        self.ask_at_first(scenes)
         return self.laid_out(scenes)
+
+    def ask_at_first(self, scenes: Sequence[Scene]) -> None:
+        """Ask whom a run asks before it knows more: the egos of scenes, or every vehicle."""
+        self._ask_at(scenes, None if self.spec.asks_all else [EGO] * len(scenes))
 
     def whole(self, scenes: Sequence[Scene]) -> Intents:
         """Return the intents of n scenes, `(n, ...)`, after asking every vehicle in them.

@@ -146,6 +146,9 @@ class ReplayedRun:
             self._set_left,
         )
         refuse_others(self.run)
+        # what vehicles intend in the scenes so far, a row each, and the row of each scene's id
+        self._intents: Intents | None = None
+        self._rows: dict[str, int] = {}
 
     @property
     def asks(self) -> bool:
@@ -290,6 +293,7 @@ class ReplayedRun:
 
         New answers are stored in the run's folder.
         """
+        self._rows.clear()
         with self._writing():
             self._asker.answer(requests)
         return self.answers
@@ -315,6 +319,7 @@ class ReplayedRun:
         """Return what every vehicle intends.
         Where the run has no answer of an ego its model is asked.
         """
+        self._rows.clear()
         with self._writing():
             return self._asker(scenes)
 
@@ -323,6 +328,7 @@ class ReplayedRun:
 
         The model is asked for what is not stored, and its answers are stored in the run's folder.
         """
+        self._rows.clear()
         with self._writing():
             return self._asker.whole(scenes)
 
@@ -344,6 +350,8 @@ class ReplayedRun:
                 f"--no-model: {printable(self.run.path)} lacks answers of helpers {lacks}; "
                 f"leave it out{remedy}"
             )
+        for scene in asked_scenes:
+            self._rows.pop(scene.id, None)
         with self._writing():
             return self._asker.helpers(scenes, wanted, question)
 
@@ -355,13 +363,27 @@ class ReplayedRun:
         episodes are left out.
         """
         lacks = self._asker.lacks(scenes, places=[EGO] * len(scenes))
-        if any(lacks):
-            if self._asks:
-                return self(scenes)
+        if any(lacks) and self._asks:
+            with self._writing():
+                self._asker.ask_at_first(scenes)
+        elif any(lacks):
             pairs = zip(scenes, lacks, strict=True)
             self.left_out |= {scene.id for scene, lacking in pairs if lacking}
             leave_out(np.array(lacks))
-        return self._asker.laid_out(scenes)
+        return self._laid_out(scenes)
+
+    def _laid_out(self, scenes: Sequence[Scene]) -> Intents:
+        """Return the intents in n scenes, (n, ...), laid out once until a vehicle is asked."""
+        new = [scene for scene in scenes if scene.id not in self._rows]
+        if new or self._intents is None:
+            parts = [] if self._intents is None else [self._intents]
+            begin = sum(len(part.own) for part in parts)
+            laid_out = self._asker.laid_out(new, width=self.vehicles)
+            self._intents = Intents.joined([*parts, laid_out])
+            self._rows |= {scene.id: begin + n for n, scene in enumerate(new)}
+        rows = np.array([self._rows[scene.id] for scene in scenes], dtype=int)
+        helpers = max(len(scene.viewers) for scene in scenes) - 1
+        return self._intents.take(rows).of_first(helpers)
 
     def others(self, scenes: Sequence[Scene], question: Question, at: Ints) -> Intents:
         """Return the intents of all vehicles in n scenes if helpers are asked `question`, (n, ...).

@@ -93,6 +93,26 @@ def test_a_pipe_where_a_study_writes_in_a_run_is_one_line(
 
 
 @pytest.mark.slow
+def test_intents_are_laid_out_again_once_a_helper_was_asked(
+    done: Evaluated, tmp_path: Path
+) -> None:
+    """What is kept of scenes is what is laid out of all answers anew, in any order."""
+    shutil.copytree(done.out, tmp_path / "run")
+    source = ReplayedRun(tmp_path / "run")
+    scenes = source.dataset.scenes(source.dataset.forest.ids[:9])
+    before = source.intents(scenes, lambda at: None)
+    assert before.unasked is not None
+    wanted = before.unasked & (np.arange(len(scenes)) % 2 > 0)[:, None]
+    source.helpers(scenes, wanted)
+    kept = source.intents(scenes[::-1], lambda at: None)
+    anew = source(scenes[::-1])
+    assert not np.array_equal(kept.helpers[::-1], before.helpers, equal_nan=True)
+    assert kept.arrays().keys() == anew.arrays().keys()
+    for name, values in anew.arrays().items():
+        np.testing.assert_array_equal(kept.arrays()[name], values, err_msg=name)
+
+
+@pytest.mark.slow
 def test_at_the_runs_own_point_a_sweep_says_what_the_run_said(
     done: Evaluated, source: ReplayedRun, tmp_path: Path
 ) -> None:
