@@ -94,11 +94,8 @@ def _map(scenario: Scenario) -> Callable[[Floats], Floats]:
 
     def from_road_m(xy_m: Floats) -> Floats:
         metres, there = np.full(xy_m.shape[:-1], np.inf), ~np.isnan(xy_m).any(axis=-1)
-        # a scene is in many decisions
-        different, place = np.unique(xy_m[there], axis=0, return_inverse=True)
-        points = shapely.points(different)
-        _, nearest_m = tree.query_nearest(points, return_distance=True, all_matches=False)
-        metres[there] = nearest_m[place.reshape(-1)]
+        places = shapely.points(xy_m[there])
+        _, metres[there] = tree.query_nearest(places, return_distance=True, all_matches=False)
         return metres
 
     return from_road_m
