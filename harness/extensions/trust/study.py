@@ -56,7 +56,8 @@ Key = tuple[str, str, float]  # rule, attack, share
 TRUSTED = 0.5  # of trust; below it a helper is taken for an attacker
 PEACE, EXCLUDED = "", "absent"
 BASE = "linear"
-CAPPED = "linear:weight_cap=0.3"
+# what loses least to the strongest lies, chosen on tune layouts (benchmarks/strongest_lies.py)
+CAPPED = "trimmed-mean:weight_cap=0.25"
 LOSES, COSTS = 2.0, 1.0  # points: what a robust rule may lose under an attack, and cost in peace
 
 

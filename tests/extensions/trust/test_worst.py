@@ -19,12 +19,12 @@ from harness.evaluate.draws import channel_draws, tie_draws
 from harness.extensions.trust import lies
 from harness.extensions.trust.attackers import attackers_among
 from harness.extensions.trust.strongest_lies import space_of, strongest_lies
-from harness.extensions.trust.study import PEACE, Bench, run_bench, trust_study, under
+from harness.extensions.trust.study import CAPPED, PEACE, Bench, run_bench, trust_study, under
 from harness.extensions.trust.worst_page import left
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.sweep import point_of
 
-EXACT = (*sorted(lies.ONE_HOT_SUFFICES), "linear:weight_cap=0.3")
+EXACT = (*sorted(lies.ONE_HOT_SUFFICES), "linear:weight_cap=0.3", CAPPED)
 IN_STEPS = ("geometric-median", "centred-clipping")
 ATTACKS = (
     "liar", "brake", "random", "stuck", "stale", "replay", "silent", "overconfident",
@@ -71,7 +71,7 @@ def test_whatever_a_liar_says_certainty_of_that_action_does_as_well(
         assert np.argmax(policy(np.eye(3)[[action]])) == action
 
 
-@pytest.mark.parametrize("name", [*sorted(lies.ONE_HOT_SUFFICES), *IN_STEPS])
+@pytest.mark.parametrize("name", [*EXACT, *IN_STEPS])
 def test_brute_force_over_all_messages_of_a_lattice_finds_no_more_and_no_less(
     stored: ReplayedRun, bench: Bench, name: str
 ) -> None:
