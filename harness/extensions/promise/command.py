@@ -62,7 +62,7 @@ def command(
     from harness.core.memory import uncollected
     from harness.extensions.promise.page import promise_study
     from harness.extensions.promise.promises import Harm
-    from harness.extensions.promise.study import promise_of, run_promise
+    from harness.extensions.promise.study import check_all, promise_of, run_promise
     from harness.runs.fit import write as write_fit
     from harness.studies.replayed_run import ReplayedRun, name_apart
 
@@ -81,6 +81,8 @@ def command(
         played = [ReplayedRun(run, latency, progress, not no_model, models=cards) for run in runs]
         tuned = ReplayedRun(tune, latency, progress, not no_model, models=cards)
         name_apart(played)
+        if write is not None:
+            check_all(tuned)
         draws = parse_seeds(seeds) if seeds else tuned.seeds
         where = out or folder_in(runs[0], "promise")
         levels = [value / 100 for value in dict.fromkeys(at_most)]

@@ -103,11 +103,12 @@ def sentence(result: Result, level: Level) -> str:
     requests = after.costs["requests"] - before.costs["requests"]
     late_ms = after.costs["latency_ms"] - before.costs["latency_ms"]
     careful = " (always careful)" if is_always(point) else ""
+    kept = "" if report.harm(point).low <= level.at_most else ", where it is not kept"
     return (
         f"{WORDS[result.harm].capitalize()} ≤ {percent(level.at_most)} % costs {requests:+.1f} "
         f"requests, {late_ms:+.1f} ms and {interval_of(change, sign='+')} "
         f"points of {report.success_rule.words}{careful}: {interval_of(report.harm(point))} % on "
-        f"report layouts, by {typed(point)}; {_beside(result, level)}."
+        f"report layouts{kept}, by {typed(point)}; {_beside(result, level)}."
     )
 
 

@@ -4,7 +4,7 @@ They are chosen on tune layouts, from a grid that is fixed before, by tests that
 (`risk`), and verified on report layouts. Other runs show what happens where nothing is promised.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ from harness.studies.sweep import point_of
 
 DELTA = 0.05
 AT_MOST = (0.01, 0.02, 0.05, 0.1)
+BY_CHANCE = ("sample", "sample_seed")  # of what selects layouts; all else looks at them
 
 
 def run_promise(
@@ -161,6 +162,7 @@ def check(runs: Sequence[ReplayedRun], tune: ReplayedRun) -> None:
     report, *elsewhere = runs
     name = printable(tune.run.path)
     check_answerers(tune.run)
+    check_choice(report, tune)
     check_seeds(f"--tune {name}", WHAT, *seed_range(tune))
     low, high = seed_range(report)
     if purposes(low, high - low + 1) != ["report"]:
@@ -180,6 +182,36 @@ def check(runs: Sequence[ReplayedRun], tune: ReplayedRun) -> None:
             )
     rebuilt.refuse(tune.dataset, [run.dataset for run in (report, *elsewhere)])
     check_scenes(tune.run, tune.dataset)
+
+
+def check_choice(report: ReplayedRun, tune: ReplayedRun) -> None:
+    """Raise UserError unless the layouts of both runs are chosen by chance, or by the same danger.
+
+    Layouts that are chosen by their outcome promise nothing of others.
+    """
+    of_tune, of_report = choice_of(tune), choice_of(report)
+    if of_tune != of_report or "--only" in of_tune:
+        raise UserError(
+            f"--tune {printable(tune.run.path)}: its layouts are chosen by "
+            f"{of_tune or 'nothing'}, those of {printable(report.run.path)} by "
+            f"{of_report or 'nothing'}; give runs on all, samples, or layouts of the same --danger"
+        )
+
+
+def check_all(tune: ReplayedRun) -> None:
+    """Raise UserError if a file cannot have the promise of a run, since it is of some layouts."""
+    if choice := choice_of(tune):
+        raise UserError(
+            f"--write: a file promises of all layouts, and those of {printable(tune.run.path)} are "
+            f"chosen by {choice}; leave it out, or give runs on all"
+        )
+
+
+def choice_of(run: ReplayedRun) -> str:
+    """Return the options that choose the layouts of a run by anything but chance, as one text."""
+    selection: Mapping[str, Any] = run.run.manifest.world.selection
+    chosen = {name: value for name, value in selection.items() if name not in BY_CHANCE}
+    return " ".join(f"--{name} {printable(value, 40)}" for name, value in chosen.items())
 
 
 def seed_range(run: ReplayedRun) -> tuple[int, int]:

@@ -4,12 +4,13 @@ from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from harness.coordination.named_points import named_point
 from harness.core.statistics import Estimate
-from harness.extensions.promise.outcomes import Level, unable
-from harness.extensions.promise.page import needs, outside, typed
+from harness.extensions.promise.outcomes import Level, Outcome, unable
+from harness.extensions.promise.page import needs, outside, sentence, typed
 
 POINT = named_point("6g")
 
@@ -67,3 +68,12 @@ def test_a_setting_is_written_as_it_is_typed() -> None:
         point = named_point(text).changed(tau_nats=0.35, careful_nats=0.5)
         assert named_point(typed(point)).changed(name=text) == point
     assert typed(POINT) == "6g:tau=0.7"
+
+
+@pytest.mark.parametrize(("harm", "kept"), [(FEW, True), (SOME, True), (MANY, False)])
+def test_a_promise_that_report_layouts_contradict_is_said(harm: Estimate, kept: bool) -> None:
+    outcome = Outcome(np.zeros((1, 4)), np.ones((1, 4)), {"requests": 0.0, "latency_ms": 0.0})
+    rule = SimpleNamespace(difference=lambda after, before: FEW, words="success")
+    report = SimpleNamespace(outcomes={POINT: outcome}, harm=lambda point: harm, success_rule=rule)
+    said = sentence(result_of({}, report=report, conditions=[POINT]), LEVEL)
+    assert ("% on report layouts, where it is not kept, by 6g" in said) == (not kept)

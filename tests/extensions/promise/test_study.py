@@ -196,3 +196,26 @@ def test_runs_of_two_models_are_refused(runs: Path, harness: Typed) -> None:
     code, _, error = harness("study", "promise", "uniform", "--tune", "tune", "--at-most", "60")
     assert code == 2
     assert "--tune tune differs from uniform in model, latency" in error
+
+
+@pytest.mark.parametrize(
+    ("choice", "says"),
+    [
+        ("--only 0,2", "--tune chosen: its layouts are chosen by --only 0,2, those of report/run"),
+        ("--danger none", "by --danger none, those of report/run by nothing; give runs on all"),
+        ("--sample 3", "3 independent layouts"),
+    ],
+)
+def test_layouts_that_are_not_chosen_by_chance_promise_nothing(
+    runs: Path, harness: Typed, choice: str, says: str
+) -> None:
+    words = ("eval", "--dataset", "small", "--condition", "6g", "--seeds", "0,1", "--no-cache")
+    code, _, error = harness(*words, *choice.split(), "--quiet", "--out", "chosen")
+    assert (code, error) == (0, "")
+    code, _, error = harness("study", "promise", "report/run", "--tune", "chosen", "--at-most", "5")
+    assert (code, error.count("\n")) == (2, 1)
+    assert says in error
+    more = ("--at-most", "5", "--write", "promises/p.toml")
+    code, _, error = harness("study", "promise", "report/run", "--tune", "chosen", *more)
+    assert code == 2
+    assert ("--write: a file promises of all layouts" in error) == ("sample" not in choice)
