@@ -176,6 +176,14 @@ class RunFacts(Protocol):
     def frozen(self) -> bool:
         """Return whether the run's scenes are recorded (`harness eval`), not simulated."""
 
+    @property
+    def ties(self) -> str | None:
+        """Return which of equally likely actions is taken; None where no run says so."""
+
+    @property
+    def temperature(self) -> float | None:
+        """Return the temperature at which answers are sampled; None where no run says so."""
+
 
 @cache
 def _hints(kind: type["Part"]) -> dict[str, Any]:
@@ -275,7 +283,8 @@ class Part(Struct, frozen=True, kw_only=True):
         """Return why a run cannot use these settings with its opened models; None if it can.
 
         `identities` are theirs, the ego's first: what tells models apart (`Backend.identity`), such
-        as digests of weights. The text also says what to do instead.
+        as digests of weights. A run adds to the ego's its `latency`, as `run.json` states it. The
+        text also says what to do instead.
         """
 
     def kept(self) -> Mapping[str, Mapping[str, Kept]]:

@@ -98,7 +98,7 @@ def begin(
     Raises UserError if the run was begun with a model of another identity, or a condition cannot be
     used with this one.
     """
-    spec.check_models(identity)
+    spec.check_models(identity, latency)
     if run_start is None:
         return RunStart(
             settings=spec.record(),

@@ -33,7 +33,7 @@ from harness.runs import formats, role_agents
 from harness.runs.answerers import answerers_of
 from harness.runs.folder import read
 from harness.runs.metric import World
-from harness.runs.records import MEASURED, ClosedLoop, FrozenScenes, Manifest
+from harness.runs.records import MEASURED, ClosedLoop, FrozenScenes, Latency, Manifest
 from harness.runs.settings import (
     DriveSettings,
     FrozenSettings,
@@ -338,14 +338,16 @@ class Spec:
                 return obstacle
         return None
 
-    def check_models(self, identity: Mapping[str, Any]) -> None:
+    def check_models(self, identity: Mapping[str, Any], latency: Latency) -> None:
         """Raise UserError if a condition cannot be used with the models that were opened.
 
         `identity` tells them apart, as a run's manifest states it: the ego's, and those of helpers.
-        Of answers that are replayed it is that of the models that gave them.
+        Of answers that are replayed it is that of the models that gave them. `latency` has the
+        seconds of answers.
         """
         ego = answerers_of(identity, identity, (), 0.0).identity
-        identities = [ego, *(ego.get("helpers") or ())]
+        timed = {**ego, "latency": msgspec.to_builtins(latency)}
+        identities = [timed, *(ego.get("helpers") or ())]
         for point in self.points:
             for part in point.more:
                 if obstacle := parts_of_packages.obstacle_of_models(part, identities):
@@ -577,6 +579,11 @@ class Spec:
             return self.settings.ties
         manifest = replayed(self.ego)
         return manifest.settings.ties or TIES[0] if manifest else TIES[0]
+
+    @property
+    def temperature(self) -> float:
+        """Return the temperature at which answers are sampled; 0 takes the likeliest token."""
+        return self.settings.temperature
 
     def _check_batch_size(self) -> None:
         at_once = self.settings.batch_size

@@ -44,11 +44,9 @@ class Fit:
         of_scenario = {"scenario": scenario.name, "actions": " ".join(scenario.actions)}
         now = {**question_of(agent), **of_scenario}
         then = {**self.question, "scenario": self.scenario, "actions": " ".join(self.actions)}
-        # the model may have an adapter, or a pinned file, that it had not then
-        for name in then | now:
-            value, other = then.get(name), now.get(name)
-            if value != other:
-                return f"was fitted with {name} {printable(value, 40)}, not {printable(other, 40)}"
+        if unlike := first_unlike(then, now):
+            name, value, other = unlike
+            return f"was fitted with {name} {printable(value, 40)}, not {printable(other, 40)}"
         return None
 
     def obstacle_of_models(self, identities: Iterable[Mapping[str, Any]]) -> str | None:
@@ -57,13 +55,24 @@ class Fit:
         `identities` tell models apart, by what `Backend.identity` states of each.
         """
         for identity in identities if self.weights else ():
-            now = weights_of(identity)
-            for name in {**self.weights, **now}:
-                value, other = self.weights.get(name), now.get(name)
-                if value != other:
-                    value, other = printable(value, 12), printable(other, 12)
-                    return f"was fitted on other weights ({name} {value}, not {other})"
+            if unlike := first_unlike(self.weights, weights_of(identity)):
+                name, value, other = unlike
+                value, other = printable(value, 12), printable(other, 12)
+                return f"was fitted on other weights ({name} {value}, not {other})"
         return None
+
+
+def first_unlike(
+    then: Mapping[str, Any], now: Mapping[str, Any]
+) -> tuple[str, object, object] | None:
+    """Return the first name whose value is another now, with both values; None if all are alike.
+
+    What a mapping lacks, such as an adapter that the model had not then, is None.
+    """
+    for name in {**then, **now}:
+        if then.get(name) != now.get(name):
+            return name, then.get(name), now.get(name)
+    return None
 
 
 def question_of(agent: Mapping[str, Any]) -> dict[str, str]:

@@ -232,8 +232,10 @@ class ReplayedRun:
 
     def check(self, points: Sequence[OperatingPoint]) -> None:
         """Raise UserError if the run's model cannot make what conditions need, a fusion call."""
-        spec = replace(self._asker.spec, points=tuple(dict.fromkeys(points)))
-        spec.check_models(self.run.manifest.identity)
+        manifest, asks = self.run.manifest, self._asker.spec
+        ego = replace(asks.ego, flip=manifest.flip)  # what is asked now is not asked twice
+        spec = replace(asks, ego=ego, points=tuple(dict.fromkeys(points)))
+        spec.check_models(manifest.identity, self._asker.latency)
 
     def _walked(
         self, points: Sequence[OperatingPoint], vehicles: int, seeds: Sequence[int], read: Read

@@ -27,6 +27,8 @@ class _Facts:
     ego_alone: bool = False
     several_decide: bool = False
     frozen: bool = False
+    ties: str | None = None
+    temperature: float | None = None
 
 
 class Acts:

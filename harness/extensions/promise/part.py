@@ -52,21 +52,25 @@ class Careful(Part, frozen=True, kw_only=True):
         where = f"where promise is {printable(self.promise)}"
         for key, value in self.implies().items():
             if point.setting(key) != value:
-                raise wrong(key, point.setting(key), f"left out, or {value}, {where}")
+                allowed = "left out" if value is None else f"left out, or {value},"
+                raise wrong(key, point.setting(key), f"{allowed} {where}")
         if other := promise(self.promise).other_setting(point):
             key, now, then = other
-            raise wrong(key, now, f"{printable(then)} {where}, which was made so")
+            allowed = "left out" if then is None else printable(then)
+            raise wrong(key, now, f"{allowed} {where}, which was made so")
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
         if not self.promise:
             return None
-        what = f"promise {printable(self.promise)}"
+        what, file = f"promise {printable(self.promise)}", promise(self.promise)
         if run.several_decide:
             return f"{what} is of one ego; leave out --agents"
         for agent in run.agents:
-            if reason := promise(self.promise).obstacle(agent.settings(), run.scenario):
+            if reason := file.obstacle(agent.settings(), run.scenario):
                 return f"{what} {reason}; {_AGAIN}"
-        return None
+        setup = {"ties": run.ties, "temperature": run.temperature, "flip": run.agents[0].flip}
+        reason = file.obstacle_of_setup(point, **setup)
+        return reason and f"{what} {reason}; {_AGAIN}"
 
     def obstacle_of_models(self, identities: Sequence[Mapping[str, Any]]) -> str | None:
         if not self.promise:

@@ -3,8 +3,8 @@
 `harness study promise` writes one. It holds for one model, prompt, scenario and condition.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
@@ -13,9 +13,11 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.core import resources
 from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
-from harness.core.files import read_once
+from harness.core.files import canonical_json, digest, read_once
 from harness.extensions.promise.risk import units_needed
-from harness.runs.fit import Fit, check_seeds
+from harness.runs.fit import Fit, check_seeds, first_unlike
+from harness.runs.records import MEASURED
+from harness.world.scenario import Scenario
 
 FOLDER = "promises"
 WHAT = "a promise"  # in messages
@@ -39,6 +41,11 @@ class Promise(Fit):
     at_most: Share  # of harm, mean over layouts and the channel's draws
     delta: Share  # probability, over draws of tune layouts, that the promise is wrong, at most
     settings: dict[str, bool | int | float | str]  # the condition's others, by flat name
+    parameters: dict[str, str]  # the scenario's, by name (`parameters_of`)
+    # of the run what else decides, by name: `ties`, `temperature`, `flip` and `latency`
+    setup: dict[str, str]
+    # digests of what the condition opens (`opened_of`)
+    opened: dict[str, str] = field(default_factory=dict)
     tau_nats: Nats  # entropy of the ego's answer above which it asks
     careful_nats: Nats | None = None  # entropy from which the ego is careful; None for never
     units: Count  # number of tune layouts, or of scenes that these are cut from
@@ -57,11 +64,73 @@ class Promise(Fit):
         Returned are its flat name, its value in the condition, and that of the promise.
         """
         plain = settings_of(OperatingPoint(point.name))
-        now, then = settings_of(point), {**plain, **self.settings}
-        for key in {**then, **now}:
-            if now.get(key) != then.get(key):
-                return key, now.get(key), then.get(key)
+        return first_unlike(settings_of(point), {**plain, **self.settings})
+
+    def obstacle(self, agent: Mapping[str, Any], scenario: Scenario) -> str | None:
+        reason = super().obstacle(agent, scenario)
+        return reason or _reason(self.parameters, parameters_of(scenario))
+
+    def obstacle_of_setup(self, point: OperatingPoint, **setup: object) -> str | None:
+        """Return in words what a condition opens, or a run decides by, otherwise than it was made.
+
+        `setup` has values of the run by their names in `Promise.setup`; those that are None, since
+        nothing states them, do not count. Returned is None if all are alike.
+        """
+        now = {name: str(value) for name, value in setup.items() if value is not None}
+        then = {name: self.setup.get(name) for name in now}
+        return _reason(then, now) or _reason(self.opened, opened_of(point))
+
+    def obstacle_of_models(self, identities: Iterable[Mapping[str, Any]]) -> str | None:
+        ego, *others = identities
+        reason = super().obstacle_of_models([ego, *others])
+        if reason or "latency" not in ego:
+            return reason
+        return _reason({"latency": self.setup.get("latency")}, {"latency": times_of(ego)})
+
+
+def _reason(then: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
+    unlike = first_unlike(then, now)
+    if unlike is None:
         return None
+    name, value, other = (printable(each, 80) for each in unlike)
+    return f"was made with {name} {value}, not {other}"
+
+
+def parameters_of(scenario: Scenario) -> dict[str, str]:
+    """Return a scenario's parameters as texts by name, as those of its datasets are stated."""
+    return {name: str(value) for name, value in scenario.parameters.stated().items()}
+
+
+def times_of(facts: Mapping[str, Any]) -> str:
+    """Return the seconds of answers as one text, of the `latency` that `facts` has.
+
+    Times that were measured are each run's own, and count as alike.
+    """
+    latency = facts["latency"]
+    if latency["source"] == MEASURED:
+        return MEASURED
+    words = ("source", "basis", "sample")
+    return canonical_json({name: each for name, each in latency.items() if name not in words})
+
+
+def opened_of(point: OperatingPoint) -> dict[str, str]:
+    """Return digests of what a condition opens, by kind and name, such as `channels 6g`.
+
+    They are of files, and of what a radio does; the promise itself is none of them.
+    """
+    from harness.evaluate.spec import files_of
+
+    files = files_of([point])
+    by_kind = {**files, **files["kept"]}
+    del by_kind["kept"]
+    by_kind.pop(FOLDER, None)
+    digests = {}
+    for kind, by_name in by_kind.items():
+        for name, record in by_name.items():
+            if kind == "channels":
+                record = [record["model"], record["parameters"]]
+            digests[f"{kind} {name}"] = digest(record)
+    return digests
 
 
 def settings_of(point: OperatingPoint) -> dict[str, Any]:

@@ -28,7 +28,15 @@ from harness.extensions.promise.outcomes import (
     play,
     unable,
 )
-from harness.extensions.promise.promises import WHAT, Harm, Promise, settings_of
+from harness.extensions.promise.promises import (
+    WHAT,
+    Harm,
+    Promise,
+    opened_of,
+    parameters_of,
+    settings_of,
+    times_of,
+)
 from harness.extensions.promise.risk import Order, best, p_values, units_needed
 from harness.runs.alike import different, setup
 from harness.runs.fit import check_answerers, check_seeds, question_of, weights_of
@@ -279,6 +287,14 @@ def promise_of(result: Result, level: Level, command: str) -> Promise:
         at_most=level.at_most,
         delta=result.delta,
         settings=settings_of(point),
+        parameters=parameters_of(scenario),
+        setup={
+            "ties": str(run.spec.ties),
+            "temperature": str(manifest.answerers.temperature),
+            "flip": str(manifest.flip),
+            "latency": times_of(run.manifest()),
+        },
+        opened=opened_of(point),
         **{key: point.setting(key) for key in ("tau_nats", "careful_nats")},
         units=result.units.shape[1],
         mean_harm=float(result.units[at].mean()),

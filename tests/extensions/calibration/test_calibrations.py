@@ -20,6 +20,7 @@ from harness.core.errors import UserError
 from harness.core.resources import MARKER
 from harness.dataset.build import build
 from harness.dataset.load import Dataset, load
+from harness.evaluate.latency import PAPER
 from harness.extensions.calibration.calibrations import Calibration, Correction, calibration
 from harness.extensions.calibration.fitting import TEMPERATURES, calibrate, fit
 from harness.runs.fit import OF_QUESTION, question_of, weights_of
@@ -220,10 +221,10 @@ def test_a_calibration_is_of_the_weights_that_it_was_fitted_on(
         twice["of"]["identity"] = replayed
         for of_models in (asked, replayed, twice):
             if asked is identity:
-                spec.check_models(of_models)
+                spec.check_models(of_models, PAPER)
             else:
                 with pytest.raises(UserError, match="mine was fitted on other weights"):
-                    spec.check_models(of_models)
+                    spec.check_models(of_models, PAPER)
     said = str(fitted.obstacle_of_models([identity, other]))
     assert said.startswith("was fitted on other weights (file_sha256 aaaaaaaa")
     code, _, error = evaluated(

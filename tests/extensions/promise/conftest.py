@@ -4,11 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import to_builtins
 
 from harness.coordination.named_points import named_point
 from harness.core.resources import MARKER
 from harness.dataset.load import Dataset
-from harness.extensions.promise.promises import Promise, settings_of
+from harness.extensions.promise.promises import (
+    Promise,
+    opened_of,
+    parameters_of,
+    settings_of,
+    times_of,
+)
 from harness.runs import folder
 from harness.runs.fit import question_of, write
 
@@ -28,6 +35,14 @@ def promise_of(run: Path, dataset: Dataset, **changes: Any) -> Promise:
         "at_most": 0.05,
         "delta": 0.05,
         "settings": settings_of(named_point("6g")),
+        "parameters": parameters_of(dataset.scenario),
+        "setup": {
+            "ties": "drawn",
+            "temperature": "0.0",
+            "flip": "False",
+            "latency": times_of({"latency": to_builtins(manifest.latency)}),
+        },
+        "opened": opened_of(named_point("6g")),
         "tau_nats": 0.3,
         "careful_nats": 0.9,
         "units": 100,

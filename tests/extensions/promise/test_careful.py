@@ -16,10 +16,13 @@ from harness.coordination.named_points import misnamed, named_point
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.trigger import entropy_nats
 from harness.core.errors import UserError
+from harness.core.resources import find
 from harness.dataset.load import Dataset, load
 from harness.extensions.promise.part import Careful
+from harness.extensions.promise.promises import opened_of, promise, settings_of
 from harness.extensions.promise.study import usual
 from harness.runs.decisions import Decisions
+from harness.runs.fit import write
 from harness.runs.folder import Run, read
 
 pytestmark = pytest.mark.usefixtures("svg_alone")
@@ -95,10 +98,13 @@ def test_a_promise_is_its_thresholds(project: Path) -> None:
             "tau_nats is 0.7; it must be left out, or 0.3, where promise is p",
         ),
         ("6g:promise=p,careful_nats=1", "careful_nats is 1.0; it must be left out, or 0.9, where"),
-        ("6g:promise=never,careful_nats=1", "careful_nats is 1.0; it must be left out, or None, w"),
+        (
+            "6g:promise=never,careful_nats=1",
+            "careful_nats is 1.0; it must be left out where promise is n",
+        ),
         ("v2x:promise=p", "profile is 'v2x'; it must be 6g where promise is p, which was made so"),
         ("6g:promise=p,max_helpers=1", "max_helpers is 1; it must be 3 where promise is p"),
-        ("6g:promise=p,loss=0.5", "loss is 0.5; it must be None where promise is p"),
+        ("6g:promise=p,loss=0.5", "loss is 0.5; it must be left out where promise is p"),
         ("single-local:promise=p", "profile is None; it must be 6g where promise is p"),
         ("6g:promise=q", "unknown promise 'q'; known: never, p; `harness study promise"),
         ("6g:careful_nats=-1", "careful_nats is -1.0; it must be nats, 0 or more"),
@@ -133,6 +139,58 @@ def test_a_file_that_promises_nothing_is_refused(
     with pytest.raises(UserError) as error:
         named_point("6g:promise=p")
     assert says in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ("--ties first", "was made with ties drawn, not first; make one with `harness study"),
+        ("--latency ego=0.3", 'was made with latency {"ego_s":0.145,'),
+    ],
+)
+def test_a_run_that_decides_otherwise_is_refused(
+    project: Path, small_path: Path, harness: Typed, more: str, says: str
+) -> None:
+    words = ("eval", "--dataset", small_path, "--seeds", "0", "--quiet", "--no-cache")
+    code, _, error = harness(*words, "--condition", "6g:promise=p", *more.split(), "--out", "r")
+    assert (code, error.count("\n")) == (2, 1)
+    assert f"condition 6g:promise=p: promise p {says}" in error
+    assert not (project / "r/run.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"flip" = "False"', '"flip" = "True"', "was made with flip True, not False"),
+        ('"temperature" = "0.0"', '"temperature" = "0.5"', "with temperature 0.5, not 0.0"),
+        ('"decision_lag_s" = "0.145"', '"decision_lag_s" = "0.6"', "decision_lag_s 0.6, not 0.145"),
+    ],
+)
+def test_a_promise_of_another_setup_is_refused(
+    project: Path, small: Dataset, old: str, new: str, says: str
+) -> None:
+    file = project / "promises/p.toml"
+    text = file.read_text()
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new))
+    with pytest.raises(UserError) as error:
+        spec_of(small, points=(named_point("6g:promise=p"),))
+    assert says in str(error.value)
+
+
+def test_a_radio_that_has_changed_has_no_promise(project: Path, small: Dataset) -> None:
+    text = find("channels", "6g.toml").read_text()
+    (project / "channels").mkdir()
+    radio = project / "channels/mine.toml"
+    radio.write_text(text)
+    point = named_point("mine")
+    made: dict[str, Any] = {"settings": settings_of(point), "opened": opened_of(point)}
+    write(replace(promise("p"), **made), project / "promises/mine.toml")
+    kept = named_point("mine:promise=mine")
+    assert spec_of(small, points=(kept,)).points == (kept,)
+    radio.write_text(text.replace("loss = 0.012", "loss = 0.5"))
+    with pytest.raises(UserError, match="was made with channels mine "):
+        spec_of(small, points=(kept,))
 
 
 @pytest.mark.slow
