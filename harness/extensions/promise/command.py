@@ -62,6 +62,7 @@ def command(
     from harness.core.memory import uncollected
     from harness.extensions.promise.page import promise_study
     from harness.extensions.promise.promises import Harm
+    from harness.extensions.promise.risk import LEAST
     from harness.extensions.promise.study import check_all, promise_of, run_promise
     from harness.runs.fit import write as write_fit
     from harness.studies.replayed_run import ReplayedRun, name_apart
@@ -70,8 +71,8 @@ def command(
         raise unknown("--harm", harm, get_args(Harm))
     for name, values in (("--at-most", at_most), ("--delta", [delta])):
         for value in values:
-            if not 0 < value < 100:
-                raise UserError(f"{name} {value:g}: give percent, between 0 and 100")
+            if not 100 * LEAST <= value < 100:
+                raise UserError(f"{name} {value:g}: give percent, between {100 * LEAST:g} and 100")
     if write is not None:
         options.check_new_file("--write", write)
         if len(at_most) != 1:

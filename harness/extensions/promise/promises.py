@@ -14,8 +14,8 @@ from harness.core import resources
 from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json, digest, read_once
-from harness.extensions.promise.risk import units_needed
-from harness.runs.fit import Fit, check_seeds, first_unlike
+from harness.extensions.promise.risk import LEAST, least_p, units_needed
+from harness.runs.fit import Fit, check_seeds, first_unlike, weights_of
 from harness.runs.records import MEASURED
 from harness.world.scenario import Scenario
 
@@ -82,6 +82,8 @@ class Promise(Fit):
 
     def obstacle_of_models(self, identities: Iterable[Mapping[str, Any]]) -> str | None:
         ego, *others = identities
+        if not self.weights and weights_of(ego):
+            return "was made of a model without digests of weights, and this one has some"
         reason = super().obstacle_of_models([ego, *others])
         if reason or "latency" not in ego:
             return reason
@@ -164,12 +166,26 @@ def _read(path: Any) -> Promise:
     where = f"promise file {printable(path)}"
     record = convert(toml(path, where), Promise, where)
     check_seeds(where, WHAT, record.first_seed, record.last_seed)
-    if not (0 < record.at_most < 1 and 0 < record.delta < 1):
-        raise UserError(f"{where}: at_most and delta are shares between 0 and 1; make it again")
-    needed = units_needed(record.at_most, record.delta)
-    if record.units < needed or record.mean_harm >= record.at_most:
+    if not all(LEAST <= share < 1 for share in (record.at_most, record.delta)):
+        raise UserError(
+            f"{where}: at_most and delta are shares between {LEAST:g} and 1; make it again"
+        )
+    layouts, seeds = record.last_seed - record.first_seed + 1, record.channel_seeds
+    if record.units > layouts:
+        raise UserError(
+            f"{where}: {record.units} layouts are more than {layouts} layout seeds; make it again"
+        )
+    if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise UserError(
+            f"{where}: channel_seeds are {printable(seeds, 40)}; allowed: different whole numbers, "
+            "0 or more, at least one; make it again"
+        )
+    p = least_p(record.mean_harm, record.units, record.at_most)
+    if p > record.delta:
+        needed = units_needed(record.at_most, record.delta)
         raise UserError(
             f"{where}: a mean harm of {record.mean_harm:g} on {record.units} layouts promises no "
-            f"{record.at_most:g} (needed: less, on {needed} or more); make it again"
+            f"{record.at_most:g} (p = {p:.2g}, above delta = {record.delta:g}; needed: "
+            f"{needed} layouts, all without harm, or more); make it again"
         )
     return record

@@ -14,6 +14,7 @@ import numpy as np
 from harness.core.arrays import Bools, Floats, Ints
 
 ROUNDING = 1e-9  # of a sum of harms
+LEAST = 1e-6  # share of harm that may be promised, and probability that a promise is wrong
 
 
 def units_needed(at_most: float, delta: float) -> int:
@@ -46,6 +47,12 @@ def p_values(means: Floats, n: int, at_most: float, binary: bool) -> Floats:
     divergence = divergence + np.where(shares > 0, shares * np.log(above / at_most), 0.0)
     bound: Floats = np.minimum(np.exp(-n * divergence), math.e * tail)
     return bound
+
+
+def least_p(mean: float, n: int, at_most: float) -> float:
+    """Return the smaller of both p-values that a mean harm of n units may have (`p_values`)."""
+    means = np.array(mean)
+    return min(float(p_values(means, n, at_most, binary)) for binary in (True, False))
 
 
 def _tail(n: int, share: float) -> Floats:

@@ -135,6 +135,9 @@ def test_what_a_promise_was_not_made_of_is_one_line(kept: Scenario) -> None:
             Acts(named_point(f"6g:promise={name}"), kept, TINY, identity)
         assert says in str(error.value)
         assert "\n" not in str(error.value)
+    write(replace(promise("tiny"), weights={}), Path("promises/plain.toml"))
+    with pytest.raises(UserError, match="plain was made of a model without digests of weights"):
+        Acts(named_point("6g:promise=plain"), kept, TINY, {"sha256": "a" * 64})
     other = scenarios.get("blind-merge")
     with pytest.raises(UserError, match="was fitted with scenario"):
         Acts(named_point("6g:promise=tiny"), other, TINY, {"sha256": "a" * 64})

@@ -175,6 +175,7 @@ def test_what_is_chosen_is_the_best_that_is_certified(runs: Path) -> None:
         ("tune --tune tune --at-most 60", "give a run on report layouts, which no threshold is"),
         ("report/run --tune tune --at-most 60 --condition single-local", "has no channel"),
         ("report/run --tune tune --at-most 60 --delta 0", "--delta 0: give percent, between"),
+        ("report/run --tune tune --at-most 1e-321", "--at-most 9.98013e-322: give percent, betw"),
         ("report/run --tune tune --at-most 60 --condition 7g", "unknown operating point '7g'"),
         ("report/run --tune tune --at-most 60 --no-model", "--no-model: tune lacks answers of"),
     ],

@@ -31,7 +31,7 @@ TRIALS = {
         "study promise report/run --tune run", FEW, f"{FEW} --seeds 7:8",
         "out holds another promise, with other seeds; name another folder",
         {
-            "--at-most 100": "--at-most 100: give percent, between 0 and 100",
+            "--at-most 100": "--at-most 100: give percent, between 0.0001 and 100",
             "--harm bad": "unknown --harm 'bad'",
             "--write p.txt --at-most 60": "--write p.txt: end it in .toml",
             "--write p.toml": "--write: a file has one promise; give one --at-most",
