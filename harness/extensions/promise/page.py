@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 BLIND = "blind"  # in place of a run, of egos that look at nothing
+THRESHOLDS = ("", "tau", "tau_nats", "careful_nats")  # as typed, or nothing
 HEADS = (
     "setting",
     "tau",
@@ -144,10 +145,12 @@ def outside(result: Result, level: Level) -> str:
 
 def typed(point: OperatingPoint) -> str:
     """Return the text of a condition with its thresholds, as it is typed."""
-    careful_nats = point.setting("careful_nats")
-    careful = "" if careful_nats is None else f",careful_nats={careful_nats:g}"
-    separator = "," if ":" in point.name else ":"
-    return f"{point.name}{separator}tau={point.setting('tau_nats'):g}{careful}"
+    name, _, rest = point.name.partition(":")
+    settings = [text for text in rest.split(",") if text.partition("=")[0] not in THRESHOLDS]
+    settings.append(f"tau={point.setting('tau_nats'):g}")
+    if (careful_nats := point.setting("careful_nats")) is not None:
+        settings.append(f"careful_nats={careful_nats:g}")
+    return f"{name}:{','.join(settings)}"
 
 
 def _table(result: Result, played: Played) -> Table:

@@ -68,6 +68,9 @@ def test_a_setting_is_written_as_it_is_typed() -> None:
         point = named_point(text).changed(tau_nats=0.35, careful_nats=0.5)
         assert named_point(typed(point)).changed(name=text) == point
     assert typed(POINT) == "6g:tau=0.7"
+    for text in ("6g:tau=0.3", "6g:careful_nats=0.2,tau_nats=0.1"):
+        assert typed(named_point(text).changed(tau_nats=0.35)).startswith("6g:tau=0.35")
+    assert typed(named_point("6g:loss=0.1,tau=0.3")) == "6g:loss=0.1,tau=0.3"
 
 
 @pytest.mark.parametrize(("harm", "kept"), [(FEW, True), (SOME, True), (MANY, False)])
