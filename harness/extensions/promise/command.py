@@ -60,8 +60,10 @@ def command(
     from typing import cast, get_args
 
     from harness.core.memory import uncollected
+    from harness.core.resources import MARKER
+    from harness.extensions.promise.outcomes import unable
     from harness.extensions.promise.page import promise_study
-    from harness.extensions.promise.promises import Harm
+    from harness.extensions.promise.promises import FOLDER, Harm
     from harness.extensions.promise.risk import LEAST
     from harness.extensions.promise.study import check_all, promise_of, run_promise
     from harness.runs.fit import write as write_fit
@@ -75,6 +77,12 @@ def command(
                 raise UserError(f"{name} {value:g}: give percent, between {100 * LEAST:g} and 100")
     if write is not None:
         options.check_new_file("--write", write)
+        in_folder = write.absolute().parent == Path(FOLDER).absolute()
+        if in_folder and not Path(MARKER).is_file():
+            raise UserError(
+                f"--write {printable(write)}: no project is here that could use it, `harness init` "
+                "makes one"
+            )
         if len(at_most) != 1:
             raise UserError("--write: a file has one promise; give one --at-most")
     with uncollected(), bar("settings", quiet=as_json or quiet, grows=True) as progress:
@@ -90,9 +98,12 @@ def command(
         of_harm = cast(Harm, harm)
         shares = (levels, delta / 100)
         result = run_promise(played, tuned, condition, of_harm, *shares, draws, where, progress)
-    finish(promise_study(result, [*played, tuned]), where, as_json, quiet, verbose, pictures)
-    if write is not None:
+    level = result.levels[0]
+    if write is not None and level.chosen is not None:  # first, since who reads may stop reading
         line = shlex.join(["harness", *sys.argv[1:]])
-        write_fit(promise_of(result, result.levels[0], line), write)
-        if not (as_json or quiet):
-            typer.echo(f"wrote {printable(write)}")
+        write_fit(promise_of(result, level, level.chosen, line), write)
+    finish(promise_study(result, [*played, tuned]), where, as_json, quiet, verbose, pictures)
+    if write is not None and level.chosen is None:
+        raise UserError(f"{unable(result, level)}; no file is written")
+    if write is not None and not (as_json or quiet):
+        typer.echo(f"wrote {printable(write)}")

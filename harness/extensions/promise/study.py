@@ -26,7 +26,6 @@ from harness.extensions.promise.outcomes import (
     is_binary,
     percent,
     play,
-    unable,
 )
 from harness.extensions.promise.promises import (
     WHAT,
@@ -83,7 +82,8 @@ def run_promise(
         Unanswered: too many questions got no answer; the runs keep all others.
     """
     report, *elsewhere = runs
-    points = [point_of([tune], name) for name in conditions or usual(tune)]
+    names = conditions or usual(tune)
+    points = list(dict.fromkeys(point_of([tune], name) for name in names))
     if not points:
         raise UserError(
             f"{printable(tune.run.path)}: no condition has a channel; give --condition 6g"
@@ -262,14 +262,12 @@ def _best_blind(result: Result, at_most: float) -> str | None:
     return None if place < 0 else names[place]
 
 
-def promise_of(result: Result, level: Level, command: str) -> Promise:
-    """Return the promise of a level, to be written as a file; `command` is the one as typed.
+def promise_of(result: Result, level: Level, point: OperatingPoint, command: str) -> Promise:
+    """Return the promise of a level, to be written as a file.
 
-    Raises UserError if no setting can promise it.
+    `point` is the setting that is chosen, and `command` the one as typed.
     """
-    run, point = result.tune.run, level.chosen
-    if point is None:
-        raise UserError(f"{unable(result, level)}; no file is written")
+    run = result.tune.run
     first, last = seed_range(run)
     manifest, scenario = run.run.manifest, run.dataset.scenario
     at = result.grid.points.index(point)

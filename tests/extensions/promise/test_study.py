@@ -90,7 +90,8 @@ def runs(
 @pytest.mark.slow
 def test_a_promise_is_chosen_written_and_kept(runs: Path, harness: Typed) -> None:
     """Of four layouts without a failure 60 % may be promised; a run by the file does as it says."""
-    words = ("study", "promise", "report/run", "--tune", "tune", "--condition", "6g")
+    twice = ("--condition", "6g", "--condition", "6g")
+    words = ("study", "promise", "report/run", "--tune", "tune", *twice)
     more = ("--harm", "failed", "--at-most", "60", "--seeds", "0,1")
     code, out, error = harness(*words, *more, "--json", "--write", "promises/p.toml", "--quiet")
     assert (code, error) == (0, "")
@@ -117,9 +118,30 @@ def test_a_promise_is_chosen_written_and_kept(runs: Path, harness: Typed) -> Non
     assert failed == pytest.approx(chosen["harm_value"])
     latency_ms = played.score("6g:promise=p", "latency_proxy_ms").value
     assert latency_ms == pytest.approx(chosen["latency_ms"], abs=0.01)
+    tried = (runs / "report/run/promise/settings.csv").read_text().splitlines()[1:]
+    assert len(tried) == len(grid_of([SIX_G], 3, "failed").points)
     code, _, error = harness(*words, *more, "--write", "promises/p.toml")
     assert code == 2
     assert "--write promises/p.toml is there already" in error
+    (runs / MARKER).unlink()
+    code, _, error = harness(*words, *more, "--write", "promises/q.toml")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "--write promises/q.toml: no project is here that could use it" in error
+
+
+def test_a_promise_is_written_before_anything_is_printed(
+    runs: Path, harness: Typed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who reads the first lines alone, as `head` does, ends the command there."""
+
+    def stop(*args: object) -> None:
+        raise BrokenPipeError
+
+    monkeypatch.setattr("harness.cli.show.show", stop)
+    words = ("study", "promise", "report/run", "--tune", "tune", "--condition", "6g")
+    more = ("--harm", "failed", "--at-most", "60", "--write", "promises/p.toml")
+    harness(*words, *more)
+    assert promise("p").at_most == 0.6
 
 
 @pytest.mark.slow
