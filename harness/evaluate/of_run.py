@@ -26,7 +26,7 @@ from harness.radio.profiles import CHANNELS
 from harness.runs.contradictions import current
 from harness.runs.folder import Run
 from harness.runs.settings import deciding
-from harness.runs.sources import PROMPTS, prompt_of
+from harness.runs.sources import PROMPTS, prompt_of, refuse_other_files
 
 DRIVER = "driver"  # the engine of what has no model and no prompt
 
@@ -72,6 +72,7 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
     channel, network, schedule or other file that they name has changed since.
     """
     manifest = run.manifest
+    refuse_other_files(run)
     points = {}
     for condition in manifest.conditions:
         try:

@@ -24,6 +24,7 @@ from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.metrics import METRICS
 from harness.runs.records import Episode, FrozenScenes, Score
 from harness.runs.reliability import SAME
+from harness.runs.sources import other_files
 from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
 
@@ -287,9 +288,15 @@ def _figure(score: Score, what: str = "value") -> str:
 
 
 def _of_conditions(run: Run) -> Iterator[str]:
-    """Yield which settings of conditions are others than the conditions' names say."""
+    """Yield which settings of conditions are others than the conditions' names say.
+
+    What a name says by a file follows from the run's own, so one that is another here says nothing.
+    """
+    others = other_files(run)
     for condition in run.manifest.conditions:
         name = printable(str(condition["name"]))
+        if any(condition.get(folder.removesuffix("s")) == file for folder, file in others):
+            continue
         for key in misnamed(condition):
             value = printable(str(condition.get(key)), 60)
             yield f"run.json has {key} {value} in {name}, whose name says otherwise"

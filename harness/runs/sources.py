@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from harness.core.errors import printable
-from harness.core.files import bytes_of
+from harness.core import resources
+from harness.core.errors import UserError, printable
+from harness.core.files import bytes_of, sha256_bytes, sha256_file
 from harness.core.formats import SOURCES
 from harness.prompts import versions
 from harness.prompts.versions import Prompt
@@ -64,6 +65,36 @@ def prompt_of(run: Run, prompt_record: Mapping[str, Any]) -> Prompt | None:
     if any(os.path.realpath(path) != os.path.join(here, path.relative_to(kept)) for path in files):
         return None  # a link, which no command makes
     return versions.as_it_was(version, sha256, kept)
+
+
+def other_files(run: Run) -> dict[tuple[str, str], Path]:
+    """Return the files that a run keeps of what its conditions name, and that are others here.
+
+    They are paths in the run's folder, by the folder of a project, such as `promises`, and the name
+    in it. A file is another here if the project has none, or one of another digest than `run.json`
+    states.
+    """
+    files, others = read(run.path), dict[tuple[str, str], Path]()
+    for folder, by_name in run.manifest.kept.items():
+        for name, recorded in by_name.items():
+            file = f"{folder}/{name}.toml"
+            if file not in files or sha256_bytes(files[file]) != recorded:
+                continue
+            here = resources.find(folder, f"{name}.toml")
+            if not here.is_file() or sha256_file(here) != recorded:
+                others[folder, name] = run.path / SOURCES / file
+    return others
+
+
+def refuse_other_files(run: Run) -> None:
+    """Raise UserError if what a run's conditions name is another file here, or none."""
+    for (folder, name), file in other_files(run).items():
+        is_here = resources.find(folder, f"{name}.toml").is_file()
+        state = "has changed since" if is_here else "is not here"
+        raise UserError(
+            f"{printable(run.path)}: {printable(folder.removesuffix('s'))} {printable(name)} "
+            f"{state}; copy {printable(file)} to {printable(folder)}/, or run again"
+        )
 
 
 def lacking(run: Run) -> str | None:

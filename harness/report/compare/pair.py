@@ -27,6 +27,7 @@ from harness.runs.percentiles import Decided
 from harness.runs.records import Episode, FrozenScenes
 from harness.runs.reliability import Judged
 from harness.runs.settings import COMPARED
+from harness.runs.sources import refuse_other_files
 from harness.runs.success import Success
 from harness.world.parameters import DIALS
 
@@ -251,7 +252,12 @@ def _side(run: Run) -> Side:
     record |= zip(OPENED, (radios, opened.networks, opened.schedules, opened.kept), strict=True)
     record = {**opened.beside, **record}
     # Through the class, which gives a setting that the run does not know the value it had then.
-    points = [OperatingPoint.from_dict(condition).record() for condition in manifest["conditions"]]
+    conditions = manifest["conditions"]
+    try:
+        points = [OperatingPoint.from_dict(condition).record() for condition in conditions]
+    except UserError as error:
+        refuse_other_files(run)
+        raise UserError(f"{printable(run.path)}: {error}") from None
     record["condition"] = {point["name"]: point for point in points}
     settings = {name: str(value) for name, value in facts(nameless(record)) if value is not None}
     metrics = by_episode(metrics_of(run.world), run.grid, run.decisions, run.episodes)

@@ -225,22 +225,33 @@ def test_a_run_is_played_by_a_promise_and_keeps_it(
     project: Path, small_path: Path, harness: Typed
 ) -> None:
     """As by its thresholds typed; another model, prompt or number of egos has no such promise."""
-    words = ("eval", "--dataset", small_path, "--seeds", "0", "--quiet", "--no-cache")
+    evaluated = ("eval", "--dataset", small_path, "--seeds", "0", "--quiet", "--no-cache")
     typed = "6g:tau=0.3,careful_nats=0.9"
     code, _, error = harness(
-        *words, "--condition", "6g:promise=p", "--condition", typed, "--out", "run"
+        *evaluated, "--condition", "6g:promise=p", "--condition", typed, "--out", "run"
     )
     assert (code, error) == (0, "")
     played = read(project / "run")
     assert ends_of(played, "6g:promise=p") == ends_of(played, typed)
     assert list(played.manifest.kept["promises"]) == ["p"]
     assert (project / "run/sources/promises/p.toml").exists()
+    file = project / "promises/p.toml"
+    text = file.read_text()
+    file.write_text(text.replace("careful_nats = 0.9", "careful_nats = 0.8"))
+    assert harness("report", "run", "--out", "run.html")[0] == 0
+    swept = ("study", "sweep", "run", "--over", "tau", "--grid", "0", "--quiet")
+    remedy = "copy run/sources/promises/p.toml to promises/, or run again\n"
+    assert harness(*swept)[2] == f"harness: run: promise p has changed since; {remedy}"
+    file.unlink()
+    for words in (swept, ("compare", "run", "run")):
+        assert harness(*words)[2] == f"harness: run: promise p is not here; {remedy}"
+    file.write_text(text)
     condition = ("--condition", "6g:promise=p")
     for more, says in (
         (("--model", "uniform"), "promise p was fitted with model.name proxy, not uniform"),
         (("--prompt", "v4"), "promise p was fitted with prompt.version v2, not v4"),
     ):
-        code, _, error = harness(*words, *condition, *more, "--out", "other")
+        code, _, error = harness(*evaluated, *condition, *more, "--out", "other")
         assert code == 2
         assert says in error
         assert error.count("\n") == 1
