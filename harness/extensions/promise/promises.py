@@ -164,7 +164,14 @@ def promise(name: str) -> Promise:
 @read_once
 def _read(path: Any) -> Promise:
     where = f"promise file {printable(path)}"
-    record = convert(toml(path, where), Promise, where)
+    table = toml(path, where)
+    for name in ("parameters", "setup"):
+        if name not in table:
+            raise UserError(
+                f"{where}: it has no [{name}], without which a promise says not of what it is; "
+                "make it again"
+            )
+    record = convert(table, Promise, where)
     check_seeds(where, WHAT, record.first_seed, record.last_seed)
     if not all(LEAST <= share < 1 for share in (record.at_most, record.delta)):
         raise UserError(

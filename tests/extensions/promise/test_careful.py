@@ -133,6 +133,7 @@ def test_what_a_promise_does_not_hold_for_is_refused(project: Path, text: str, s
         ("delta = 0.05", "delta = 1.0", "at_most and delta are shares between 1e-06 and 1"),
         ("tau_nats = 0.3", "tau_nats = -0.3", "tau_nats"),
         ('harm = "unsafe"', 'harm = "none"', "harm"),
+        ("[parameters]", "[parameter]", "it has no [parameters], without which a promise says not"),
         ('"profile" = "6g"', '"profile" = ["6g"]', "settings"),
     ],
 )
