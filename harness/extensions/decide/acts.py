@@ -1,7 +1,7 @@
 """Say how to act on a decision under a condition: alone, after helpers are asked, or carefully."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,22 +13,10 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.parts_of_packages import obstacle, obstacle_of_models
 from harness.core.errors import UserError, printable
 from harness.evaluate.agent import Agent
+from harness.evaluate.facts import Facts
 from harness.extensions.decide.asked import Act, Answered
 from harness.radio.channel import Draws
 from harness.world.scenario import Scenario
-
-
-@dataclass(frozen=True)
-class _Facts:
-    """What settings may ask of where they are used: one ego, which asks whom it likes."""
-
-    agents: tuple[Agent, ...]
-    scenario: Scenario
-    ego_alone: bool = False
-    several_decide: bool = False
-    frozen: bool = False
-    ties: str | None = None
-    temperature: float | None = None
 
 
 class Acts:
@@ -46,7 +34,7 @@ class Acts:
         `identity` tells the model apart (`Backend.identity`). Raises UserError if the condition is
         not for this model, prompt or scenario, such as a promise that was made of another.
         """
-        facts = _Facts((agent,), scenario)
+        facts = Facts((agent,), scenario)
         for part in point.more:
             reason = obstacle(part, point, facts) or obstacle_of_models(part, [identity])
             if reason:

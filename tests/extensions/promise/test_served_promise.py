@@ -145,6 +145,26 @@ def test_what_a_promise_was_not_made_of_is_one_line(kept: Scenario) -> None:
         Acts(named_point("6g:schedule=always"), kept, TINY, {})
 
 
+def test_a_wording_that_is_searched_has_no_promise(
+    kept: Scenario, project: Path, harness: Typed
+) -> None:
+    words = ("prompt", "optimize", "--model", "swarm-tiny", "--prompt", TINY.prompt.version)
+    more = (
+        "--answer",
+        TINY.answer,
+        "--condition",
+        "6g:promise=tiny",
+        "--budget",
+        "9",
+        "--out",
+        "mine",
+    )
+    code, _, error = harness(*words, *more)
+    assert (code, error.count("\n")) == (2, 1)
+    assert f"prompt.version {TINY.prompt.version}, not mine; make one with" in error
+    assert not (project / "reports").exists()
+
+
 def test_a_condition_is_served_of_a_scenario(harness: Typed) -> None:
     for words in (("--condition", "6g"), ("--scenario", "blind-merge")):
         code, out, error = harness("serve", "--model", "swarm-tiny", *words)

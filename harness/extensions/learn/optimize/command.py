@@ -6,7 +6,9 @@ import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -100,7 +102,7 @@ def command(
     scenarios = [scenario_of(manifest) for manifest, _ in manifests]
     for name, (manifest, _) in zip(names, manifests, strict=True):
         only_for("report", "--dataset", name, manifest.seed, manifest.episodes)
-    base = _base(settings, scenarios, budget)
+    base = _base(settings, scenarios, budget, out)
     settings = structs.replace(settings, prompt=base.version)
     # What may stop a run is for those that certify: the search says how many tune layouts it asks.
     others = STOPPING_RULES.without(settings.extensions)
@@ -193,11 +195,15 @@ def _report(
     return [resolve.spec(settings, source) for source in sources]
 
 
-def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "Prompt":
+def _base(
+    settings: Settings, scenarios: "Sequence[Scenario]", budget: int, version: str
+) -> "Prompt":
     """Return the version to start from.
     Raises UserError for what can be told to be wrong before any work.
     """
+    from harness.coordination.parts_of_packages import obstacle
     from harness.evaluate import resolve
+    from harness.evaluate.facts import Facts
     from harness.prompts.versions import unfit
     from harness.runs.records import MEASURED
 
@@ -219,6 +225,11 @@ def _base(settings: Settings, scenarios: "Sequence[Scenario]", budget: int) -> "
     for scenario in scenarios:
         if reason := unfit(ego.prompt, scenario):
             raise UserError(f"--prompt {ego.prompt.version} {reason}; give one for every scenario")
+    [point] = points
+    winner = replace(ego, prompt=replace(ego.prompt, version=version))
+    for part, scenario in product(point.more, scenarios):
+        if reason := obstacle(part, point, Facts((winner,), scenario, frozen=True)):
+            raise UserError(f"--condition {printable(point.name)}: {reason}")
     return ego.prompt
 
 
