@@ -482,7 +482,8 @@ def run_bench(
         cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)
     lies = dict[str, StrongestLies]()
-    if run.asks:
+    # what is sent unasked, or comes from other scenes, is no lie that is looked for
+    if run.asks and point.stream is None and point.elsewhere is None:
         progress.more(len(every_rule) + len(of_model))
         for rule in (*every_rule, *of_model):
             honest = under(point, rule, PEACE, 0.0)

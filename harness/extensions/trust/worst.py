@@ -203,14 +203,15 @@ def _plays(
     if search.bounds:
         yield from _bounds(decide, heard, silent, intents)
         return
-    yield decide(heard, intents)
+    honest = decide(heard, intents)
+    yield honest
     yield decide(silent, intents)
     actions = truth.own.shape[-1]
     for message in lies.certain(actions):
         yield decide(heard, lies.with_message(intents, liars, message))
     if name in lies.ONE_HOT_SUFFICES:
         return
-    if RULES[name].start((1,), 1, actions).shape[-1]:
+    if honest.state.shape[-1]:  # a rule with memory
         voices = np.concatenate([heard.own[:, None], truth.helpers], axis=1)
         for message in lies.near_others(voices):
             yield decide(heard, lies.with_message(intents, liars, message))

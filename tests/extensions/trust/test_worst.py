@@ -171,3 +171,11 @@ def test_a_worst_case_is_kept_as_it_was_found(stored: ReplayedRun) -> None:
     case = strongest_lies(stored, point, THIRD, (0,))
     again = type(case).of(case.values())
     assert all(np.array_equal(value, again.values()[k]) for k, value in case.values().items())
+
+
+def test_of_messages_from_other_scenes_no_strongest_lie_is_said(
+    stored: ReplayedRun, tmp_path: Path
+) -> None:
+    pytest.importorskip("harness.extensions.controls")
+    options = ("6g:messages=shuffled", ("linear",), ("silent",), (THIRD,), (0,), tmp_path)
+    assert not run_bench(stored, *options, Watched()).strongest_lies
