@@ -94,7 +94,8 @@ def _reason(then: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
     unlike = first_unlike(then, now)
     if unlike is None:
         return None
-    name, value, other = (printable(each, 80) for each in unlike)
+    words = ("nothing" if value is None else value for value in unlike)
+    name, value, other = (printable(word, 80) for word in words)
     return f"was made with {name} {value}, not {other}"
 
 

@@ -170,6 +170,7 @@ def test_a_run_that_decides_otherwise_is_refused(
     ("old", "new", "says"),
     [
         ('"flip" = "False"', '"flip" = "True"', "was made with flip True, not False"),
+        ('"ties" = "drawn"', '"tie" = "drawn"', "was made with ties nothing, not drawn"),
         ('"temperature" = "0.0"', '"temperature" = "0.5"', "with temperature 0.5, not 0.0"),
         ('"decision_lag_s" = "0.145"', '"decision_lag_s" = "0.6"', "decision_lag_s 0.6, not 0.145"),
     ],
