@@ -138,7 +138,7 @@ def _estimates(bench: "Bench", rule: str) -> dict[str, Estimate]:
 
 def _withstands(bench: "Bench", rule: str) -> list[Estimate]:
     """Return how much success there is with 0, 1, … liars, whoever they are, under a rule."""
-    most = max(int(np.max(case.liars)) for case in bench.strongest_lies.values())
+    most = max(1, *(int(np.max(case.liars)) for case in bench.strongest_lies.values()))
     estimates = []
     for count in range(most):
         withstands = (bench.strongest_lies[rule].liars > count).astype(float)
