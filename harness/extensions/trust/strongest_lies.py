@@ -13,7 +13,7 @@ from harness.core.arrays import Bools, Floats
 from harness.evaluate.walk import walk
 from harness.extensions.trust.attackers import attackers_among
 from harness.extensions.trust.attacks import Jump, Spoof, attacks_of
-from harness.extensions.trust.lies import CLAIMS, PLACES, VOICES, WORDS
+from harness.extensions.trust.lies import CLAIMS, ONE_HOT_SUFFICES, PLACES, VOICES, WORDS
 from harness.extensions.trust.worst import Courses, Search
 from harness.radio.channel import Draws
 from harness.studies.replayed_run import ReplayedRun
@@ -40,7 +40,7 @@ class StrongestLies:
     # lost without; one more than are tried if these do not suffice
     liars: Floats
     # which episodes succeed whatever liars say; less than what lies leave for the rule `trust`
-    # alone, with which not every lie is tried. None where a model reads messages
+    # alone, with which not every lie is tried. None where that is not known
     at_least: Floats | None
 
     def values(self) -> dict[str, Floats]:
@@ -58,7 +58,7 @@ class StrongestLies:
 def space_of(attack: str) -> str:
     """Return which space of lies an attack such as `liar+spoof` is in, a key of `lies.CLAIMS`."""
     attacks = attacks_of(attack)
-    if any(each.adds for each in attacks):
+    if any(each.adds and not each.in_objects for each in attacks):
         return VOICES
     return PLACES if any(isinstance(each, (Spoof, Jump)) for each in attacks) else WORDS
 
@@ -85,7 +85,8 @@ def strongest_lies(
         for each in CLAIMS[space]:
             any_lie = any_lie | lost[_name(each)]
         success[space] = 1.0 - any_lie
-    at_least = None if point.has_fusion_call else success[WORDS]
+    is_exact = point.fusion.consensus in ONE_HOT_SUFFICES and not point.has_fusion_call
+    at_least = success[WORDS] if is_exact else None
     if BOUND in lost:
         at_least = 1.0 - lost[BOUND]
     choices = _choices(run.vehicles - 1)

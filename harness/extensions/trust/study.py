@@ -463,6 +463,7 @@ def run_bench(
         sha256_file(run.run.path / "answers.jsonl", "rows"),
         point.record(),
         list(seeds),
+        run.asks,  # without the model, episodes may be left out
         files_of([*points.values()]),
         versions(),
     ]

@@ -82,10 +82,10 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
         "ego's way, 0 m before the zone; or to be three. All say the same. For linear, log-pool, "
         "median, trimmed-mean, trimmed-heads and bayes no other message does more; for other rules "
         "without memory messages go in steps of a tenth (a fifth with five actions); for trust "
-        "those near others' messages, and 'at least' is what it keeps whatever is said from true "
-        "places. Where the ego's model reads messages, it is asked about those of the attacks that "
-        "ship. Over never asks: words, less the success of an ego that never asks, paired. Unsafe: "
-        "episodes that end so by words that aim at this.",
+        "those near others' messages. 'At least' is what is kept whatever is said from true "
+        "places, where that is known. Where the ego's model reads messages, it is asked about "
+        "those of the attacks that ship. Over never asks: words, less the success of an ego that "
+        "never asks, paired. Unsafe: episodes that end so by words that aim at this.",
         terminal=range(4),
     )
     rows = []
@@ -97,7 +97,8 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
         f"Certificates: {words} whatever liars say from true places, whoever they are, %",
         ("rule", *counts),
         rows,
-        "Every helper, and every pair, is tried as the liars, who say what harms most.",
+        "Every helper, and every pair, is tried as the liars, who say what harms most. Under rules "
+        "with which not every message is tried, as said above, it may be less.",
         terminal=range(len(counts) + 1),
     )
 

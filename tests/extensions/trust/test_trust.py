@@ -304,3 +304,18 @@ def test_of_objects_a_model_is_asked_about_lists_of_liars(done: Evaluated, tmp_p
         assert np.all(case.success["worst"] <= bench.at("linear", attack, 1.0).success)
     assert "harms most" in headline(bench)[0]
     assert write_study(trust_study(bench), tmp_path).is_file()
+
+
+def test_cells_without_the_model_are_not_taken_for_cells_with_it(
+    small: Dataset, tmp_path: Path
+) -> None:
+    whole = run(spec_of(small, ask="all", seeds=(0,)), tmp_path / "run")
+    options = ("6g", ("linear",), ("liar",), (THIRD,), (0,))
+    without = ReplayedRun(whole.out, asks=False)
+    first = run_bench(without, *options, tmp_path / "bench", Watched())
+    asking = ReplayedRun(whole.out)
+    second = run_bench(asking, *options, tmp_path / "bench", Watched())
+    fresh = run_bench(ReplayedRun(whole.out), *options, tmp_path / "fresh", Watched())
+    assert np.isnan(first.at("linear", "liar", THIRD).success).any()
+    for key, cell in fresh.cells.items():
+        assert np.array_equal(second.cells[key].success, cell.success)
