@@ -11,6 +11,7 @@ import numpy as np
 
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.parts import Part
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError
 from harness.extensions.trust.attacks import ATTACKS, INSTRUCTIONS
@@ -37,6 +38,19 @@ MORE = {
     "shift": ("shift:offset_m=-6",),
 }
 TOWARDS = (0.2, 0.4, 0.6, 0.8)
+
+
+def is_likeliest_taken(point: OperatingPoint) -> bool:
+    """Return whether the ego takes what is likeliest after fusion, so that no part acts then."""
+    return all(type(part).after_fusion is Part.after_fusion for part in point.more)
+
+
+def is_certainty_enough(point: OperatingPoint) -> bool:
+    """Return whether certainty of an action brings it about, if any message does.
+
+    `point` is the condition.
+    """
+    return point.fusion.consensus in ONE_HOT_SUFFICES and is_likeliest_taken(point)
 
 
 def certain(actions: int) -> list[Floats]:

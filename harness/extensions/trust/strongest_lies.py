@@ -13,7 +13,14 @@ from harness.core.arrays import Bools, Floats
 from harness.evaluate.walk import walk
 from harness.extensions.trust.attackers import attackers_among
 from harness.extensions.trust.attacks import Jump, Spoof, attacks_of
-from harness.extensions.trust.lies import CLAIMS, ONE_HOT_SUFFICES, PLACES, VOICES, WORDS
+from harness.extensions.trust.lies import (
+    CLAIMS,
+    PLACES,
+    VOICES,
+    WORDS,
+    is_certainty_enough,
+    is_likeliest_taken,
+)
 from harness.extensions.trust.worst import Courses, Search
 from harness.radio.channel import Draws
 from harness.studies.replayed_run import ReplayedRun
@@ -85,7 +92,7 @@ def strongest_lies(
         for each in CLAIMS[space]:
             any_lie = any_lie | lost[_name(each)]
         success[space] = 1.0 - any_lie
-    is_exact = point.fusion.consensus in ONE_HOT_SUFFICES and not point.has_fusion_call
+    is_exact = is_certainty_enough(point) and not point.has_fusion_call
     at_least = success[WORDS] if is_exact else None
     if BOUND in lost:
         at_least = 1.0 - lost[BOUND]
@@ -107,7 +114,8 @@ def _searches(
         for claims in CLAIMS[space]:
             yield _name(claims), Search(point, liars, succeeds, claims)
     yield UNHARMED, Search(point, liars, unharmed)
-    if point.fusion.consensus == TRUST and not point.has_fusion_call:
+    is_arithmetic = not point.has_fusion_call and is_likeliest_taken(point)
+    if point.fusion.consensus == TRUST and is_arithmetic:
         yield BOUND, Search(point, liars, succeeds, bounds=True)
     for chosen in _choices(run.vehicles - 1):
         yield _name(chosen), Search(point, partial(_named, chosen), succeeds)

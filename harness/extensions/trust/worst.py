@@ -209,7 +209,7 @@ def _plays(
     actions = truth.own.shape[-1]
     for message in lies.certain(actions):
         yield decide(heard, lies.with_message(intents, liars, message))
-    if name in lies.ONE_HOT_SUFFICES:
+    if lies.is_certainty_enough(part.point):
         return
     if honest.state.shape[-1]:  # a rule with memory
         voices = np.concatenate([heard.own[:, None], truth.helpers], axis=1)
@@ -217,7 +217,7 @@ def _plays(
             yield decide(heard, lies.with_message(intents, liars, message))
         return
     lies_heard = (heard.on_time & liars).any(axis=1)
-    if isinstance(RULES[name], Heads):
+    if isinstance(RULES[name], Heads) and lies.is_likeliest_taken(part.point):
         lies_heard &= ~_agreed(heard, intents, liars)
     for message in lies.lattice(actions):
         # further actions matter only in episodes that are not lost yet

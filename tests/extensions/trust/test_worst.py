@@ -76,11 +76,25 @@ def test_brute_force_over_all_messages_of_a_lattice_finds_no_more_and_no_less(
     stored: ReplayedRun, bench: Bench, name: str
 ) -> None:
     point = under(point_of([stored], "6g"), name, PEACE, 0.0)
+    finds_as_brute_force(stored, point, bench.strongest_lies[name].success[lies.WORDS][0])
+
+
+@pytest.mark.parametrize("name", ["linear", "geometric-median"])
+def test_an_ego_that_is_careful_where_it_is_unsure_is_made_unsure(
+    stored: ReplayedRun, name: str
+) -> None:
+    pytest.importorskip("harness.extensions.promise")
+    point = under(point_of([stored], "6g:careful_nats=0.6"), name, PEACE, 0.0)
+    case = strongest_lies(stored, point, THIRD, stored.seeds)
+    finds_as_brute_force(stored, point, case.success[lies.WORDS][0])
+    assert case.at_least is None
+
+
+def finds_as_brute_force(stored: ReplayedRun, point: OperatingPoint, success: np.ndarray) -> None:
     forest = stored.dataset.forest
     for tree, root in enumerate(forest.root.tolist()):
         lost = loses(stored, point, root)
-        found = bench.strongest_lies[name].success[lies.WORDS][0, tree]
-        assert lost == (found == 0), forest.ids[root]
+        assert lost == (success[tree] == 0), forest.ids[root]
 
 
 def loses(stored: ReplayedRun, point: OperatingPoint, node: int) -> bool:
