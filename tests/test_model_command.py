@@ -17,6 +17,7 @@ from harness.backends import cards
 from harness.backends.registry import open_backend
 from harness.core.errors import UserError
 from harness.core.files import sha256_file
+from harness.core.plugins import say_once
 
 CITED = """\
 engine = "systemone"
@@ -382,6 +383,7 @@ def test_a_checkpoint_that_sees_is_shown_a_picture_and_a_blank_one(
 
     folder = tiny_vl.build(tmp_path / "vl")
     capsys.readouterr()
+    say_once.cache_clear()  # a test before it may have opened one of that name
     code, out, err = harness(
         monkeypatch, capsys, "model", "check", str(folder), "--device", "cpu", "--json"
     )

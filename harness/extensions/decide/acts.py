@@ -43,10 +43,21 @@ class Acts:
             raise UserError(
                 f"condition {printable(point.name)}: {why}; give one that asks by entropy"
             )
+        if point.stream is not None:
+            raise UserError(
+                f"condition {printable(point.name)}: it has a stream, and what is served has heard "
+                "nothing; leave it out"
+            )
         self._actions = scenario.actions
         self._asks_above = point.ask.tau_nats if point.asks else None
         # who decides without messages; what a promise implies stays
-        self._alone = point.changed(promise="", profile=None)
+        try:
+            self._alone = point.changed(promise="", profile=None)
+        except UserError:
+            raise UserError(
+                f"condition {printable(point.name)}: it has what acts on messages alone, and what "
+                "is served hears none; give one of whom the ego asks, and when"
+            ) from None
 
     def of(self, answer: Answered) -> Answered:
         """Return an answer with how to act on it; as it is if its options are no actions here."""

@@ -170,3 +170,17 @@ def test_a_condition_is_served_of_a_scenario(harness: Typed) -> None:
         code, out, error = harness("serve", "--model", "swarm-tiny", *words)
         assert (code, out) == (2, "")
         assert error == "harness: --condition and --scenario: give both, or neither\n"
+
+
+@pytest.mark.parametrize(
+    ("condition", "says"),
+    [
+        ("6g:attack=liar", "it has what acts on messages alone"),
+        ("6g:stream=cpm", "it has a stream"),
+    ],
+)
+def test_a_condition_that_acts_on_messages_is_not_served(condition: str, says: str) -> None:
+    pytest.importorskip("harness.extensions.trust")
+    pytest.importorskip("harness.extensions.streams")
+    with pytest.raises(UserError, match=f"{condition}: {says}"):
+        Acts(named_point(condition), scenarios.get("occluded-intersection"), TINY, {})
