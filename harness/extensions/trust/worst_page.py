@@ -80,12 +80,12 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
         "Liars know all: each answer, the rule, its memory, and where each action leads. They say "
         "what loses most episodes: words alone, from their true places; or claim to be on the "
         "ego's way, 0 m before the zone; or to be three. All say the same. For linear, log-pool, "
-        "median, trimmed-mean, trimmed-heads and bayes no other message does more; for other rules "
-        "without memory messages go in steps of a tenth (a fifth with five actions); for trust "
-        "those near others' messages. 'At least' is what is kept whatever is said from true "
-        "places, where that is known. Where the ego's model reads messages, it is asked about "
-        "those of the attacks that ship. Over never asks: words, less the success of an ego that "
-        "never asks, paired. Unsafe: episodes that end so by words that aim at this.",
+        "median, trimmed-mean, trimmed-heads and bayes no other message does more. For trust these "
+        "are messages near others'; for other rules, and where the ego is careful, all in steps of "
+        "a tenth (a fifth with five actions). Where the ego's model reads messages, it is asked "
+        "about those of the attacks that ship. 'At least' is what is kept whatever is said from "
+        "true places, where that is known. Over never asks: words, less the success of an ego "
+        "that never asks, paired. Unsafe: episodes that end so by words that aim at this.",
         terminal=range(4),
     )
     rows = []
