@@ -21,13 +21,12 @@ from harness.extensions.trust.lies import (
     is_certainty_enough,
     is_likeliest_taken,
 )
-from harness.extensions.trust.worst import Courses, Search
+from harness.extensions.trust.worst import TRUST, Courses, Search
 from harness.radio.channel import Draws
 from harness.studies.replayed_run import ReplayedRun
 
 MOST = 2  # liars of whom every choice is tried, if there are few
 MOST_CHOICES = 20  # sets of liars that are tried
-TRUST = "trust"  # the rule with a bound of its own
 UNHARMED, BOUND = "unharmed", "bound"  # names of searches
 
 
@@ -72,8 +71,10 @@ def space_of(attack: str) -> str:
 
 def strongest_lies(
     run: ReplayedRun, point: OperatingPoint, share: float, seeds: Sequence[int]
-) -> StrongestLies:
+) -> StrongestLies | None:
     """Find the lies that do most harm under a condition, on a run's episodes.
+
+    None for a rule of a package that has memory, of which not all can be followed.
 
     The condition, `point`, has no attack; `share` is that of the helpers that lie, and `seeds` are
     those of the channel. The run's model is asked in all scenes that lies lead to.
@@ -86,6 +87,8 @@ def strongest_lies(
     courses = Courses(run.dataset, list(searches.values()), seeds, run.spec.ties, run)
     for _ in walk(courses, conditions, run, run.spec.ties):
         pass
+    if courses.unsearchable:
+        return None
     lost, success = courses.lost, {}
     any_lie = np.zeros_like(lost[UNHARMED])
     for space in _spaces(point):

@@ -420,6 +420,8 @@ def run_bench(
         raise UserError(
             f"--condition {printable(condition)}: it allows none of the usual attacks; give another"
         )
+    if set(attacks) == {EXCLUDED}:
+        raise UserError(f"--attacks {EXCLUDED}: it is played beside any attack; name one that lies")
     unfused = point.idle("consensus")
     if unfused and set(rules) - {BASE}:
         raise UserError(
@@ -485,11 +487,14 @@ def run_bench(
     lies = dict[str, StrongestLies]()
     # what is sent unasked, or comes from other scenes, is no lie that is looked for
     if run.asks and point.stream is None and point.elsewhere is None:
+        typed_share = float(f"{shares[0]:.10g}")  # as conditions name it
         progress.more(len(every_rule) + len(of_model))
         for rule in (*every_rule, *of_model):
             honest = under(point, rule, PEACE, 0.0)
-            find = partial(_found_lies, run, honest, shares[0], seeds)
-            lies[rule] = StrongestLies.of(kept.part((rule, "worst", shares[0]), find))
+            find = partial(_found_lies, run, honest, typed_share, seeds)
+            values = kept.part((rule, "worst", shares[0]), find)
+            if values:
+                lies[rule] = StrongestLies.of(values)
             run.settle()
             progress(1)
     [[alone]] = run.walked(
@@ -511,7 +516,8 @@ def run_bench(
 
 
 def _found_lies(*options: Any) -> dict[str, Floats]:
-    return strongest_lies(*options).values()
+    lies = strongest_lies(*options)
+    return lies.values() if lies else {}
 
 
 def trust_study(bench: Bench) -> Study:

@@ -30,6 +30,7 @@ from harness.extensions.trust import lies
 from harness.extensions.trust.attacks import Turn, attacks_of
 from harness.radio.channel import Draws
 
+TRUST = "trust"  # the rule with memory whose lies are looked for
 STATES = 3  # most memories of a rule that are followed at one decision point
 # From what vehicles intend and the draws, of n decisions, to which of H helpers lie, `(n, H)`.
 Liars = Callable[[Intents, Draws], Bools]
@@ -80,6 +81,8 @@ class Courses(SceneWorld):
     Attributes:
         lost: which episodes some lie ends badly, by the name of a search's condition, a mask of
             seeds and layouts, `(S, T)`.
+        unsearchable: names of searches whose rule remembers what only its package knows, of which
+            nothing is said.
     """
 
     def __init__(
@@ -108,6 +111,7 @@ class Courses(SceneWorld):
         start = Front(seed, tree, self._forest.root[tree], None)
         self._fronts = dict.fromkeys(self._searches, start)
         self.lost = {point.name: np.zeros(shape, dtype=bool) for point in self._searches}
+        self.unsearchable: set[str] = set()
 
     def _decides(self, keeps: Bools) -> Bools:
         """Return where some later action gives away what `keeps` is about, `(N,)`."""
@@ -156,6 +160,9 @@ class Courses(SceneWorld):
         ended = (reached & gives_away).any(axis=1)
         lost[front.seed[ended], front.tree[ended]] = True
         rows, action, state, trust = map(np.concatenate, zip(*plays, strict=True))
+        if state.shape[1] and part.point.fusion.consensus != TRUST:
+            self.unsearchable.add(part.point.name)
+            return _NOTHING
         at = forest.child[front.at[rows], action]
         after = Front(front.seed[rows], front.tree[rows], at, state)
         is_open = (at >= 0) & self._at_stake[part.point][at] & ~lost[after.seed, after.tree]

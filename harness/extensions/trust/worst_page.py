@@ -10,6 +10,7 @@ from harness.core.figures import as_mapping, interval_of, some_of
 from harness.core.statistics import Estimate
 from harness.extensions.trust.lies import CLAIMS, PLACES, VOICES, WORDS
 from harness.extensions.trust.strongest_lies import space_of
+from harness.extensions.trust.worst import TRUST
 from harness.report.document import Table
 from harness.runs.estimates import over_episodes
 from harness.studies.study import ends
@@ -90,15 +91,16 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
     )
     rows = []
     for rule in bench.strongest_lies:
-        withstands = [interval_of(estimate) for estimate in _withstands(bench, rule)]
-        rows.append((rule, *withstands))
+        nobody, *liars = [interval_of(estimate) for estimate in _withstands(bench, rule)]
+        at_most = "" if _is_exact(bench, rule) else "≤ "
+        rows.append((rule, nobody, *[at_most + share for share in liars]))
     counts = ("no liar", "any one liar", "any two liars")[: len(rows[0]) - 1]
     yield Table(
         f"Certificates: {words} whatever liars say from true places, whoever they are, %",
         ("rule", *counts),
         rows,
-        "Every helper, and every pair, is tried as the liars, who say what harms most. Under rules "
-        "with which not every message is tried, as said above, it may be less.",
+        "Every helper, and every pair, is tried as the liars, who say what harms most. ≤: not "
+        "every message is tried, as said above, so that it may be less.",
         terminal=range(len(counts) + 1),
     )
 
@@ -135,6 +137,12 @@ def _estimates(bench: "Bench", rule: str) -> dict[str, Estimate]:
         estimates["at_least"] = success_rule.estimate(at_least)
     unsafe = over_episodes("unsafe_rate", case.unsafe, success_rule.clusters)
     return {**estimates, "worst_unsafe": unsafe}
+
+
+def _is_exact(bench: "Bench", rule: str) -> bool:
+    """Return whether no other message could do more to a rule."""
+    is_known = bench.strongest_lies[rule].at_least is not None
+    return is_known and rule.partition(":")[0] != TRUST
 
 
 def _withstands(bench: "Bench", rule: str) -> list[Estimate]:

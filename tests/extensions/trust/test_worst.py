@@ -9,11 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from harness.coordination.consensus import Messages, inverse_distance_weights
+from harness.coordination.consensus import Fused, Messages, inverse_distance_weights
 from harness.coordination.coordinate import FusionInputs, fuse
 from harness.coordination.exchange import exchange
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.rules import RULES
+from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.extensions.trust import lies
@@ -86,6 +87,7 @@ def test_an_ego_that_is_careful_where_it_is_unsure_is_made_unsure(
     pytest.importorskip("harness.extensions.promise")
     point = under(point_of([stored], "6g:careful_nats=0.6"), name, PEACE, 0.0)
     case = strongest_lies(stored, point, THIRD, stored.seeds)
+    assert case is not None
     finds_as_brute_force(stored, point, case.success[lies.WORDS][0])
     assert case.at_least is None
 
@@ -183,6 +185,7 @@ def test_without_a_model_nothing_is_looked_for(small: Dataset, tmp_path: Path) -
 def test_a_worst_case_is_kept_as_it_was_found(stored: ReplayedRun) -> None:
     point = point_of([stored], "6g")
     case = strongest_lies(stored, point, THIRD, (0,))
+    assert case is not None
     again = type(case).of(case.values())
     assert all(np.array_equal(value, again.values()[k]) for k, value in case.values().items())
 
@@ -193,3 +196,44 @@ def test_of_messages_from_other_scenes_no_strongest_lie_is_said(
     pytest.importorskip("harness.extensions.controls")
     options = ("6g:messages=shuffled", ("linear",), ("silent",), (THIRD,), (0,), tmp_path)
     assert not run_bench(stored, *options, Watched()).strongest_lies
+
+
+class Grudge:
+    """A package's rule: it goes for the last action for ever once somebody was sure of the first."""
+
+    def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> np.ndarray:
+        return np.zeros((*batch, 1))
+
+    def fuse(self, messages: Messages, state: np.ndarray) -> Fused:
+        own, sure = messages.intents[..., 0, :], messages.intents[..., 1:, 0] > 0.99
+        last = np.eye(own.shape[-1])[-1]
+        seen = (sure & messages.heard).any(axis=-1, keepdims=True)
+        policy = np.where(state > 0, last, own)
+        return Fused(policy, messages.weights, np.maximum(state, seen))
+
+
+def test_of_a_packages_rule_with_memory_nothing_is_said(
+    stored: ReplayedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RULES._loaded, "grudge", Grudge())
+    monkeypatch.setattr(RULES, "built_in", {**RULES.built_in, "grudge": Grudge()})
+    options = ("6g", ("linear", "grudge"), ("brake",), (THIRD,), (0,), tmp_path)
+    bench = run_bench(stored, *options, Watched())
+    assert bench.rules == ("linear", "grudge")
+    assert set(bench.strongest_lies) == {"linear"}
+    assert trust_study(bench).tables[0].title.startswith("33 %")
+
+
+def test_a_share_that_rounds_has_as_many_liars_as_the_attacks(
+    stored: ReplayedRun, tmp_path: Path
+) -> None:
+    options = ("6g", ("linear",), ("brake", "liar"), (5 / 6,), (0,), tmp_path)
+    bench = run_bench(stored, *options, Watched())
+    case = bench.strongest_lies["linear"]
+    for attack in bench.attacks:
+        assert np.all(case.success[lies.WORDS] <= bench.at("linear", attack, 5 / 6).success)
+
+
+def test_what_only_bounds_attacks_is_no_attack(stored: ReplayedRun, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="--attacks absent: it is played beside any attack"):
+        run_bench(stored, "6g", ("linear",), ("absent",), (THIRD,), (0,), tmp_path, Watched())
