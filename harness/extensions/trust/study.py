@@ -420,6 +420,13 @@ def run_bench(
         raise UserError(
             f"--condition {printable(condition)}: it allows none of the usual attacks; give another"
         )
+    helpers = run.vehicles - 1
+    for share in shares:
+        if helpers and np.floor(share * helpers + 0.5) < 1:
+            raise UserError(
+                f"--share {share:g}: this is nobody of {helpers} helpers, the most there are; give "
+                f"1/{2 * helpers} or more"
+            )
     if set(attacks) == {EXCLUDED}:
         raise UserError(f"--attacks {EXCLUDED}: it is played beside any attack; name one that lies")
     unfused = point.idle("consensus")

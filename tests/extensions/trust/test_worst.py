@@ -234,6 +234,11 @@ def test_a_share_that_rounds_has_as_many_liars_as_the_attacks(
         assert np.all(case.success[lies.WORDS] <= bench.at("linear", attack, 5 / 6).success)
 
 
+def test_a_share_of_nobody_is_one_line(stored: ReplayedRun, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="this is nobody of 3 helpers"):
+        run_bench(stored, "6g", ("linear",), ("brake",), (0.1,), (0,), tmp_path, Watched())
+
+
 def test_what_only_bounds_attacks_is_no_attack(stored: ReplayedRun, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--attacks absent: it is played beside any attack"):
         run_bench(stored, "6g", ("linear",), ("absent",), (THIRD,), (0,), tmp_path, Watched())
