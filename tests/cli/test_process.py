@@ -21,12 +21,14 @@ from harness.core.process import LEAST_MB
 HARNESS = (sys.executable, "-m", "harness")
 pytestmark = pytest.mark.slow
 NO_UTF8 = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-# Says when it has come to an import, and waits there.
+# Says when it has come to an import, and waits there, in short steps: a signal may come just before
+# one.
 WAITS = """
 import sys, time
 print("here", flush=True)
 try:
-    time.sleep(30)
+    for _ in range(600):
+        time.sleep(0.05)
 except {caught}:
     raise ImportError("a library makes another error of it")
 """
