@@ -171,7 +171,7 @@ class Forest:
         it cannot be reached.
         """
         earliest_s = self.cleared_s[self.edge]
-        for rows in self._levels_backwards():
+        for rows in self.levels_backwards():
             has_child = self.child[rows] >= 0
             after = earliest_s[self.child[rows]].min(axis=-1)
             earliest_s[rows] = np.where(has_child, after, earliest_s[rows])
@@ -184,7 +184,7 @@ class Forest:
         There are N decision points and A actions. Harm is a collision, or leaving the road.
         """
         avoids = ~self.harms[self.edge]
-        for rows in self._levels_backwards():
+        for rows in self.levels_backwards():
             child = self.child[rows]
             avoids[rows] = np.where(child >= 0, avoids[child].any(axis=-1), avoids[rows])
         return np.asarray(avoids)
@@ -214,12 +214,12 @@ class Forest:
         the last decision to the end. That driver is the reference rule that sees everything.
         """
         last, chosen = self.edge.copy(), self.drivers[PRIVILEGED]
-        for rows in self._levels_backwards():
+        for rows in self.levels_backwards():
             child = self.child[rows]
             last[rows] = np.where(child >= 0, last[child, chosen[child]], last[rows])
         return last
 
-    def _levels_backwards(self) -> list[Ints]:
+    def levels_backwards(self) -> list[Ints]:
         """Return the decision points of each step, the last step first."""
         last = int(self.step.max())
         return [np.flatnonzero(self.step == step) for step in range(last, -1, -1)]
@@ -385,7 +385,7 @@ class Forest:
         if ends is None:
             ends = self.succeeds(self.edge, self.tree[:, None])
         chance = ends.astype(float)
-        for rows in self._levels_backwards():
+        for rows in self.levels_backwards():
             child = self.child[rows]
             after = np.average(chance[child], axis=-1, weights=policy[child])
             chance[rows] = np.where(child >= 0, after, chance[rows])

@@ -61,7 +61,7 @@ class Attackers:
         sent = truth
         attacking = np.zeros(truth.valid.shape, dtype=bool)
         for attack in self._attacks:
-            drawn = attackers_among(attack.share, truth, draws)
+            drawn = _drawn(attack.share, truth, draws.trips, uniforms)
             turn = Turn(truth, drawn, first, past, of_step)
             sent = _acted(attack, sent, turn)
             attacking |= drawn
@@ -116,9 +116,12 @@ def attackers_among(share: float, truth: Intents, draws: Draws) -> Bools:
     same helpers attack in all decisions of an episode, as long as the same are present.
     """
     assert draws.trips is not None
-    uniforms = _uniforms(draws.trips, truth.valid.shape[1])
+    return _drawn(share, truth, draws.trips, _uniforms(draws.trips, truth.valid.shape[1]))
+
+
+def _drawn(share: float, truth: Intents, trips: Trips, uniforms: Floats) -> Bools:
     drawn = attackers(share, np.isfinite(truth.range_m), uniforms[..., 0])
-    return np.asarray(_of_helpers(drawn, draws.trips))
+    return np.asarray(_of_helpers(drawn, trips))
 
 
 def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:

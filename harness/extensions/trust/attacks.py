@@ -572,8 +572,13 @@ def attackers(share: float, present: Bools, draws: Floats) -> Bools:
         draws: draws in [0, 1), `(n, H)`.
     """
     rank = np.argsort(np.argsort(np.where(present, draws, np.inf), axis=-1, kind="stable"), axis=-1)
-    count = np.floor(share * np.sum(present, axis=-1, keepdims=True) + 0.5)
+    count = count_of_attackers(share, np.sum(present, axis=-1, keepdims=True))
     return np.asarray(present & (rank < count))
+
+
+def count_of_attackers(share: float, helpers: Ints | int) -> Any:
+    """Return how many a share, 0 to 1, of some helpers is: the nearest whole number, halves up."""
+    return np.floor(share * helpers + 0.5)
 
 
 def with_voices(sent: Intents, talkers: Bools, voices: int) -> Intents:

@@ -14,7 +14,7 @@ from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.parts import Part
 from harness.core.arrays import Bools, Floats
 from harness.core.errors import UserError
-from harness.extensions.trust.attacks import ATTACKS, INSTRUCTIONS
+from harness.extensions.trust.attacks import ATTACKS, INSTRUCTIONS, Attack, attacks_of
 
 # What liars may claim of who and where they are, the same in a whole episode: attacks, by the name
 # of the space, which has the spaces before it, too. At the false place Eq. 2 gives the most weight.
@@ -81,14 +81,14 @@ def messages_to_ask(point: OperatingPoint) -> list[str]:
     for name, attack in ATTACKS.items():
         if attack.by_scene and (attack.in_text or attack.in_objects):
             texts += [name, *MORE.get(name, ())]
-    allowed = []
+    allowed = dict[tuple[Attack, ...], str]()  # one that is spelt twice is asked about once
     for text in texts:
         try:
             point.changed(attack=text)
         except UserError:
             continue
-        allowed.append(text)
-    return allowed
+        allowed.setdefault(attacks_of(text), text)
+    return [*allowed.values()]
 
 
 def near_others(voices: Floats) -> list[Floats]:
@@ -107,12 +107,11 @@ def near_others(voices: Floats) -> list[Floats]:
 
 
 def with_message(truth: Intents, liars: Bools, message: Floats) -> Intents:
-    """Return what helpers send if liars, `(n, H)`, all say a message, `(A,)` or `(n, A)`,
-    or each its own, `(n, H, A)`.
+    """Return what helpers send if liars, `(n, H)`, all say a message, `(A,)` or `(n, A)`.
 
     `truth` has what they would send, in n decisions. A message with a NaN changes nothing.
     """
-    every = message if message.ndim == 3 else np.expand_dims(message, -2)
+    every = np.expand_dims(message, -2)
     lies = liars[..., None] & ~np.isnan(every).any(axis=-1, keepdims=True)
     helpers = np.where(lies, every, truth.helpers)
     return replace(truth, helpers=helpers)

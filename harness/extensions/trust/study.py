@@ -31,6 +31,7 @@ from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.spec import files_of
 from harness.evaluate.walk import Decided
+from harness.extensions.trust.attacks import count_of_attackers
 from harness.extensions.trust.strongest_lies import StrongestLies, strongest_lies
 from harness.extensions.trust.worst_page import (
     worst_headline,
@@ -422,7 +423,7 @@ def run_bench(
         )
     helpers = run.vehicles - 1
     for share in shares:
-        if helpers and np.floor(share * helpers + 0.5) < 1:
+        if helpers and count_of_attackers(share, helpers) < 1:
             raise UserError(
                 f"--share {share:g}: this is nobody of {helpers} helpers, the most there are; give "
                 f"1/{2 * helpers} or more"

@@ -116,8 +116,7 @@ class Courses(SceneWorld):
     def _decides(self, keeps: Bools) -> Bools:
         """Return where some later action gives away what `keeps` is about, `(N,)`."""
         forest, ends = self._forest, ~keeps
-        for step in range(int(forest.step.max()), -1, -1):
-            rows = np.flatnonzero(forest.step == step)
+        for rows in forest.levels_backwards():
             child = forest.child[rows]
             ends[rows] |= (child >= 0) & ends[child].any(axis=-1)
         return np.asarray(ends.any(axis=-1))
@@ -240,7 +239,7 @@ def _asked_plays(
     """Yield what the ego's model answers to each of a set of messages of liars, and to none."""
     truth, draws, at = part.said.intents, part.due.draws, part.due.at
     liars, drawn_ties = search.liars(truth, draws), tie_draws(draws, ties)
-    rows, nobody = np.arange(len(at)), np.zeros_like(search.liars(truth, draws))
+    rows, nobody = np.arange(len(at)), np.zeros_like(liars)
     for attack, silent in (
         ("", nobody),
         ("", liars),
@@ -280,11 +279,13 @@ def _bounds(
     """
     alone = decide.fused(silent, intents)
     *n, helpers, actions = intents.helpers.shape
+    every_sent = [intents]
+    for message in lies.certain(actions):
+        every_sent.append(lies.with_message(intents, decide.liars, message))
     for trusts in product((False, True), repeat=helpers):
         trusted = (np.nan_to_num(alone.trust) >= 0.5) | np.array(trusts)
         state = trusting_only(trusted, actions)
-        for message in (intents.helpers, *lies.certain(actions)):
-            sent = lies.with_message(intents, decide.liars, message)
+        for sent in every_sent:
             action = replace(decide, state=state).fused(heard, sent).action
             yield Play(np.arange(*n), action, alone.state, np.zeros(n))
 

@@ -90,6 +90,14 @@ def test_a_promise_is_its_thresholds(project: Path) -> None:
     assert asks_more.setting("careful_nats") == 0.9
 
 
+def rewrite(project: Path, old: str, new: str) -> None:
+    """Have the promise `p` state something else."""
+    file = project / "promises/p.toml"
+    text = file.read_text()
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new))
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -140,10 +148,7 @@ def test_what_a_promise_does_not_hold_for_is_refused(project: Path, text: str, s
 def test_a_file_that_promises_nothing_is_refused(
     project: Path, old: str, new: str, says: str
 ) -> None:
-    file = project / "promises/p.toml"
-    text = file.read_text()
-    assert text.count(old) == 1
-    file.write_text(text.replace(old, new))
+    rewrite(project, old, new)
     with pytest.raises(UserError) as error:
         named_point("6g:promise=p")
     assert says in str(error.value)
@@ -178,10 +183,7 @@ def test_a_run_that_decides_otherwise_is_refused(
 def test_a_promise_of_another_setup_is_refused(
     project: Path, small: Dataset, old: str, new: str, says: str
 ) -> None:
-    file = project / "promises/p.toml"
-    text = file.read_text()
-    assert text.count(old) == 1
-    file.write_text(text.replace(old, new))
+    rewrite(project, old, new)
     with pytest.raises(UserError) as error:
         spec_of(small, points=(named_point("6g:promise=p"),))
     assert says in str(error.value)
