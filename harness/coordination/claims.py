@@ -70,7 +70,7 @@ class Claims:
         `at` is an array of indices or a mask.
         """
         maps = self.from_road_m
-        return Claims(
+        some = Claims(
             self.xy_m[at],
             self.speed_mps[at],
             self.time_s[at],
@@ -78,6 +78,9 @@ class Claims:
             self.sensed_m[at],
             maps.take(at) if isinstance(maps, Maps) else maps,
         )
+        if "off_road_m" in vars(self):  # to measure it again would take longer than all else here
+            vars(some)["off_road_m"] = self.off_road_m[at]
+        return some
 
     def of_helpers(self, places: Ints) -> "Claims":
         """Return the claimed positions and speeds with the helpers reordered, chosen or repeated.

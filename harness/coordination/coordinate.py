@@ -189,7 +189,7 @@ def fuse(
         **{field.name: getattr(heard, field.name) for field in fields(Exchange)},
         weights=weights,
         fused=fused,
-        action=_likeliest(fused, fusion.ties),
+        action=likeliest(fused, fusion.ties),
         fusion_failed=failed,
         latency_s=np.where(unknown, np.nan, latency_s),
         deadline_missed=latency_s > point.fusion.window_s,
@@ -224,8 +224,12 @@ def _by_rule(name: str, messages: Messages, state: Floats | None) -> Fused:
         return Fused(policy, weights, numbers("memory", fused.state, memory.shape), trust)
 
 
-def _likeliest(policy: Floats, ties: TieDraws | None) -> Ints:
-    """Return the index of each policy's most probable action, `(...)`."""
+def likeliest(policy: Floats, ties: TieDraws | None) -> Ints:
+    """Return the index of each policy's most probable action, `(...)`.
+
+    `policy` has the probabilities of A actions, `(..., A)`. Of equally likely ones the first is
+    taken, or that which `ties` draws.
+    """
     action: Ints = np.argmax(policy, axis=-1)
     if ties is None:
         return action

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from harness.coordination.consensus import Fused, Messages, Pool, linear_pool, scaled
-from harness.core.arrays import Bools, Floats, Ints, summed
+from harness.core.arrays import Bools, Floats, Ints, length_of, summed
 
 CLIP = 0.3  # radius of centred clipping, as a distance between distributions (at most sqrt 2)
 CLIP_ROUNDS = 5
@@ -129,9 +129,9 @@ def centred_clipping(p: Floats, weights: Floats) -> Floats:
     centre = p[..., 0, :]
     for _ in range(CLIP_ROUNDS):
         step = np.where((weights > 0)[..., None], p - centre[..., None, :], 0.0)
-        length = np.linalg.norm(step, axis=-1, keepdims=True)
+        length = length_of(step)[..., None]
         step *= np.minimum(1.0, CLIP / np.maximum(length, 1e-12))
-        centre = centre + np.sum(weights[..., None] * step, axis=-2)
+        centre = centre + summed(weights[..., None] * step, axis=-2)
     return np.asarray(centre / np.sum(centre, axis=-1, keepdims=True))
 
 

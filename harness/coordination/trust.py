@@ -25,7 +25,7 @@ import numpy as np
 
 from harness.coordination.consensus import Fused, Messages, linear_pool
 from harness.coordination.trigger import entropy_nats, normalised_entropy
-from harness.core.arrays import Bools, Floats
+from harness.core.arrays import Bools, Floats, any_of, least_of, length_of, summed
 
 CERTAIN = 1e9  # evidence that nothing outweighs
 CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, time
@@ -95,7 +95,7 @@ class Trust:
         reputation = np.where(
             heard[..., None], self.kept * last_reputation + counts, last_reputation
         )
-        trust = reputation[..., 0] / np.sum(reputation, axis=-1)
+        trust = reputation[..., 0] / summed(reputation, axis=-1)
         weights = self._weights(messages, trust)
         intended = np.where(heard[..., None], p[..., 1:, :], last_intents)
         memory = np.concatenate([reputation, intended, present_claims], axis=-1).reshape(
@@ -109,7 +109,7 @@ class Trust:
         voices = np.insert(heard, 0, True, axis=-1)
         divergences = divergence(p[..., 1:, None, :], p[..., None, :, :])
         other_voices = voices[..., None, :] & ~np.eye(p.shape[-2], dtype=bool)[1:]
-        from_nearest = np.min(np.where(other_voices, divergences, 1.0), axis=-1)
+        from_nearest = least_of(np.where(other_voices, divergences, 1.0))
         ego = p[..., :1, :]
         against_ego = (1 - normalised_entropy(ego)) * np.nan_to_num(divergence(intended, ego))
         return np.where(heard, np.maximum(from_nearest, against_ego), 0.0)
@@ -126,12 +126,12 @@ class Trust:
         off_road = claims.off_road_m > self.lane_tolerance_m + error_m
         moved = claimed - last
         elapsed_s, speed_mps = moved[..., 3], np.minimum((claimed + last)[..., 2] / 2, self.top_mps)
-        discrepancy_m = np.abs(np.linalg.norm(moved[..., :2], axis=-1) - speed_mps * elapsed_s)
+        discrepancy_m = np.abs(length_of(moved[..., :2]) - speed_mps * elapsed_s)
         contradicts_last = discrepancy_m > self.speed_tolerance_mps * elapsed_s + 2 * error_m
         places = claims.xy_m[..., 1:, :]
-        between_m = np.linalg.norm(places[..., None, :, :] - places[..., None, :], axis=-1)
+        between_m = length_of(places[..., None, :, :] - places[..., None, :])
         same_place = (between_m < self.apart_m) & ~np.eye(places.shape[-2], dtype=bool)
-        overlaps = np.any(same_place, axis=-1) & ~(is_seen & ~elsewhere)
+        overlaps = any_of(same_place) & ~(is_seen & ~elsewhere)
         return np.asarray(elsewhere | off_road | contradicts_last | overlaps)
 
     def _weights(self, messages: Messages, trust: Floats) -> Floats:

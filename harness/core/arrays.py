@@ -63,6 +63,23 @@ def count_of(flags: Bools) -> Ints:
     return count
 
 
+def least_of(values: Floats) -> Floats:
+    """Return the least value along the last axis, which is dropped; faster than `np.min` if short.
+
+    `values` are (..., n), with a result (...).
+    """
+    least: Floats = reduce(np.minimum, [values[..., k] for k in range(values.shape[-1])])
+    return least
+
+
+def length_of(vectors: Floats) -> Floats:
+    """Return the Euclidean length of vectors of few numbers, (..., n), as an array (...).
+
+    It is `np.linalg.norm` along the last axis, in a fraction of the time.
+    """
+    return np.asarray(np.sqrt(summed(vectors * vectors, axis=-1)))
+
+
 def read_only(value: T) -> T:
     """Return arrays as views that cannot be written to, to give to code of another package.
 

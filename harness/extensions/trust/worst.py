@@ -13,7 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness.coordination.coordinate import Coordination, FusionInputs, TieDraws, fuse
+from harness.coordination.coordinate import (
+    Coordination,
+    FusionInputs,
+    TieDraws,
+    fuse,
+    likeliest,
+)
 from harness.coordination.exchange import Exchange, exchange
 from harness.coordination.intents import Intents
 from harness.coordination.operating_point import OperatingPoint
@@ -21,7 +27,7 @@ from harness.coordination.plans import Plans
 from harness.coordination.robust import Heads
 from harness.coordination.rules import RULES
 from harness.coordination.trust import trusting_only
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import Bools, Floats, Ints, taken
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.evaluate.fusion import codes_of
@@ -31,6 +37,7 @@ from harness.extensions.trust.attacks import Turn, attacks_of
 from harness.radio.channel import Draws
 
 TRUST = "trust"  # the rule with memory whose lies are looked for
+AT_ONCE = 2048  # decisions that are fused at once, few enough for a processor's caches
 STATES = 3  # most memories of a rule that are followed at one decision point
 # From what vehicles intend and the draws, of n decisions, to which of H helpers lie, `(n, H)`.
 Liars = Callable[[Intents, Draws], Bools]
@@ -200,37 +207,45 @@ def _plays(
     gives_away: Bools,
 ) -> Iterator[Play]:
     """Yield what comes of each lie; `reached`, `(n, A)`, is kept up to date by who takes them."""
-    truth, draws, name = part.said.intents, part.due.draws, part.point.fusion.consensus
+    truth, draws, point = part.said.intents, part.due.draws, part.point
     drawn_ties = tie_draws(draws, ties)
     intents, liars, draws = with_claims(search.claims, truth, search.liars(truth, draws), draws)
-    heard = exchange(part.point, intents, draws)
-    decide = _Decide(part.point, front.state, drawn_ties, liars)
-    silent = replace(heard, on_time=heard.on_time & ~liars)
+    heard = exchange(point, intents, draws)
+    every = _Decisions(point, heard, intents, liars, front.state)
+    kinds = every.kinds(front.at, drawn_ties)
+    decisions = every.take(kinds.first)
     if search.bounds:
-        yield from _bounds(decide, heard, silent, intents)
+        yield from map(kinds.spread, _bounds(decisions))
         return
-    honest = decide(heard, intents)
-    yield honest
-    yield decide(silent, intents)
+    honest = decisions.fused()
+    yield kinds.spread(honest)
+    yield kinds.spread(decisions.silent().fused())
     actions = truth.own.shape[-1]
-    for message in lies.certain(actions):
-        yield decide(heard, lies.with_message(intents, liars, message))
-    if lies.is_certainty_enough(part.point):
+    places = np.arange(len(kinds.first))
+    yield from map(kinds.spread, decisions.each(lies.certain(actions), places))
+    if lies.is_certainty_enough(point):
         return
     if honest.state.shape[-1]:  # a rule with memory
-        voices = np.concatenate([heard.own[:, None], truth.helpers], axis=1)
-        for message in lies.near_others(voices):
-            yield decide(heard, lies.with_message(intents, liars, message))
+        others = truth.helpers[kinds.first]
+        voices = np.concatenate([decisions.heard.own[:, None], others], axis=1)
+        yield from map(kinds.spread, decisions.each(lies.near_others(voices), places))
         return
-    lies_heard = (heard.on_time & liars).any(axis=1)
-    if isinstance(RULES[name], Heads) and lies.is_likeliest_taken(part.point):
-        lies_heard &= ~_agreed(heard, intents, liars)
-    for message in lies.lattice(actions):
+    lies_heard = (decisions.heard.on_time & decisions.liars).any(axis=1)
+    is_of_heads = isinstance(RULES[point.fusion.consensus], Heads)
+    if is_of_heads and lies.is_likeliest_taken(point):
+        lies_heard &= ~_agreed(decisions)
+    remaining = lies.lattice(actions)
+    while len(remaining):
         # further actions matter only in episodes that are not lost yet
-        is_open = lies_heard & ~reached.all(axis=1) & ~(reached & gives_away).any(axis=1)
-        rows = np.flatnonzero(is_open)
-        if len(rows):
-            yield decide(heard, lies.with_message(intents, liars, message), rows)
+        reached_here, ends = reached[kinds.first], gives_away[kinds.first]
+        is_lost = (reached_here & ends).any(axis=1)
+        is_open = lies_heard & ~is_lost & ~reached_here.all(axis=1)
+        places = np.flatnonzero(is_open)
+        if not len(places):
+            return
+        count = max(1, AT_ONCE // len(places))
+        yield from map(kinds.spread, decisions.each(remaining[:count], places))
+        remaining = remaining[count:]
 
 
 def _asked_plays(
@@ -257,78 +272,155 @@ def _asked_plays(
         yield Play(rows, result.action, result.state, np.zeros(len(at)))
 
 
-def _agreed(heard: Exchange, intents: Intents, liars: Bools) -> Bools:
+def _agreed(decisions: "_Decisions") -> Bools:
     """Return where a rule that counts heads lets no liar change a decision, `(n,)`.
 
     There is one liar, and all others, the ego among them and at least two, want one action.
     """
+    heard, liars = decisions.heard, decisions.liars
     honest = heard.on_time & ~liars
-    choice = np.argmax(np.nan_to_num(intents.helpers), axis=-1)
+    choice = np.argmax(np.nan_to_num(decisions.intents.helpers), axis=-1)
     differs = (choice != np.argmax(heard.own, axis=-1)[:, None]) & honest
     one_liar = np.sum(heard.on_time & liars, axis=1) == 1
     return np.asarray(one_liar & honest.any(axis=1) & ~differs.any(axis=1))
 
 
-def _bounds(
-    decide: "_Decide", heard: Exchange, silent: Exchange, intents: Intents
-) -> Iterator[Play]:
+def _bounds(decisions: "_Decisions") -> Iterator["_Fused"]:
     """Yield what `trust` does with each set of helpers to trust, and each message of liars.
 
     Another's message can only speak for an honest helper, as long as liars claim nothing false. So
     whom the rule trusts that hears no liar, it trusts. Its memory is that of not hearing them.
     """
-    alone = decide.fused(silent, intents)
-    *n, helpers, actions = intents.helpers.shape
-    every_sent = [intents]
-    for message in lies.certain(actions):
-        every_sent.append(lies.with_message(intents, decide.liars, message))
+    alone = decisions.silent().coordinated()
+    n, helpers, actions = decisions.intents.helpers.shape
+    every_sent = [decisions]
+    every_sent += [decisions.saying(message) for message in lies.certain(actions)]
     for trusts in product((False, True), repeat=helpers):
         trusted = (np.nan_to_num(alone.trust) >= 0.5) | np.array(trusts)
         state = trusting_only(trusted, actions)
         for sent in every_sent:
-            action = replace(decide, state=state).fused(heard, sent).action
-            yield Play(np.arange(*n), action, alone.state, np.zeros(n))
+            policy = replace(sent, state=state).coordinated().fused
+            yield _Fused(np.arange(n), policy, alone.state, np.zeros(n))
+
+
+class _Fused(NamedTuple):
+    """Hold what comes of a lie in some decisions of which none are alike, k of them."""
+
+    rows: Ints  # which of the decisions, `(k,)`; they may be repeated
+    policy: Floats  # the fused probabilities of A actions, `(k, A)`
+    state: Floats  # the rule's memory after it, `(k, K)`
+    trust: Floats  # how far the rule trusts liars after it, summed over them, `(k,)`
+
+
+class _Kinds(NamedTuple):
+    """Say which of n decisions of a front are alike, so that each kind, of k, is fused once."""
+
+    first: Ints  # row of the first decision of each kind, `(k,)`
+    of_row: Ints  # each decision's kind, `(n,)`
+    ties: TieDraws | None  # draws the n decisions' ties
+
+    def spread(self, fused: _Fused) -> Play:
+        """Return what comes of a lie in all decisions, from what comes of it in each kind."""
+        rows = np.argsort(self.of_row, kind="stable")
+        counts = np.bincount(self.of_row, minlength=len(self.first))
+        begins = np.cumsum(counts) - counts
+        repeats = counts[fused.rows]
+        source = np.repeat(np.arange(len(repeats)), repeats)
+        nth = np.arange(len(source)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+        at = rows[begins[fused.rows][source] + nth]
+        ties = self.ties and _TiesOf(self.ties, at, len(rows))
+        action = likeliest(taken(fused.policy, source), ties)
+        return Play(at, action, taken(fused.state, source), fused.trust[source])
 
 
 @dataclass(frozen=True)
-class _Decide:
-    """Fuse what is said in the decisions of a front, from the rule's memory there."""
+class _Decisions:
+    """Hold n decisions of a front and what is heard there, to be fused."""
 
     point: OperatingPoint
-    state: Floats | None
-    ties: TieDraws | None
+    heard: Exchange
+    intents: Intents
     liars: Bools
+    state: Floats | None  # the rule's memory before each
 
-    def __call__(self, heard: Exchange, intents: Intents, rows: Ints | None = None) -> Play:
-        liars, n = self.liars, len(self.liars)
-        if rows is None:
-            rows, result = np.arange(n), self.fused(heard, intents)
-        else:
-            liars = liars[rows]
-            values = {field.name: getattr(heard, field.name)[rows] for field in fields(heard)}
-            state = None if self.state is None else self.state[rows]
-            ties = None if self.ties is None else _TiesOf(self.ties, rows, n)
-            some = replace(self, state=state, ties=ties, liars=liars)
-            result = some.fused(Exchange(**values), intents.take(rows))
-        trust = np.where(liars, np.nan_to_num(result.trust), 0.0).sum(axis=-1)
-        return Play(rows, result.action, result.state, trust)
+    def kinds(self, at: Ints, ties: TieDraws | None) -> _Kinds:
+        """Return which decisions are alike in all that a rule of the harness reads.
 
-    def fused(self, heard: Exchange, intents: Intents) -> Coordination:
-        return fuse(self.point, heard, intents, FusionInputs(None, self.state, self.ties))
+        `at`, `(n,)`, is the decision point of each. No two are alike for another rule, which may
+        read when messages arrive. `ties` draws ties, which are each decision's own.
+        """
+        n = len(self.liars)
+        if self.point.fusion.consensus not in RULES.built_in:
+            return _Kinds(np.arange(n), np.arange(n), ties)
+        intents, claims = self.intents, self.intents.claims
+        inputs = [at, self.liars, self.heard.on_time, self.heard.own]
+        inputs += [intents.helpers, intents.distance_m]
+        if self.state is not None:
+            inputs.append(self.state)
+        if claims is not None:
+            inputs += [claims.xy_m, claims.speed_mps, claims.time_s]
+            inputs += [claims.error_m, claims.sensed_m]
+        numbers = [values.reshape(n, -1).astype(float) for values in inputs]
+        table = np.concatenate(numbers, axis=1)
+        rows = table.view(np.dtype((np.void, table.strides[0]))).ravel()
+        _, first, of_row = np.unique(rows, return_index=True, return_inverse=True)
+        return _Kinds(first, of_row, ties)
+
+    def take(self, at: Ints) -> "_Decisions":
+        """Return the decisions at indices `at`, which may be repeated."""
+        values = {}
+        for field in fields(Exchange):
+            values[field.name] = taken(getattr(self.heard, field.name), at)
+        return _Decisions(
+            self.point,
+            Exchange(**values),
+            self.intents.take(at),
+            self.liars[at],
+            None if self.state is None else taken(self.state, at),
+        )
+
+    def silent(self) -> "_Decisions":
+        on_time = self.heard.on_time & ~self.liars
+        return replace(self, heard=replace(self.heard, on_time=on_time))
+
+    def saying(self, message: Floats) -> "_Decisions":
+        """Return the decisions if all liars say a message, `(A,)`, or one each, `(n, A)`."""
+        return replace(self, intents=lies.with_message(self.intents, self.liars, message))
+
+    def coordinated(self) -> Coordination:
+        return fuse(self.point, self.heard, self.intents, FusionInputs(None, self.state))
+
+    def fused(self) -> _Fused:
+        result = self.coordinated()
+        trust = np.where(self.liars, np.nan_to_num(result.trust), 0.0).sum(axis=-1)
+        return _Fused(np.arange(len(self.liars)), result.fused, result.state, trust)
+
+    def each(self, messages: Sequence[Floats] | Floats, at: Ints) -> Iterator[_Fused]:
+        """Yield what comes of each message, `(A,)` or `(n, A)`, in decisions at `at`, `(k,)`."""
+        count = max(1, AT_ONCE // max(1, len(at)))
+        for start in range(0, len(messages), count):
+            some = messages[start : start + count]
+            rows, lies_at = np.tile(at, len(some)), []
+            for message in some:
+                lies_at.append(np.broadcast_to(message, self.heard.own.shape)[at])
+            fused = self.take(rows).saying(np.concatenate(lies_at)).fused()
+            yield fused._replace(rows=rows)
 
 
 @dataclass(frozen=True)
 class _TiesOf:
-    """Draw ties of some rows of n decisions."""
+    """Draw ties of some rows of n decisions, which may be repeated."""
 
     ties: TieDraws
     rows: Ints
     n: int
 
     def __call__(self, tied: Bools) -> Floats:
-        of_all = np.zeros(self.n, dtype=bool)
-        of_all[self.rows[tied]] = True
-        return self.ties(of_all)
+        is_tied = np.zeros(self.n, dtype=bool)
+        is_tied[self.rows[tied]] = True
+        draws = np.empty(self.n)
+        draws[is_tied] = self.ties(is_tied)
+        return draws[self.rows[tied]]
 
 
 def with_claims(

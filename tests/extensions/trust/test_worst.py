@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from harness.coordination.consensus import Fused, Messages, inverse_distance_weights
-from harness.coordination.coordinate import FusionInputs, fuse
+from harness.coordination.coordinate import FusionInputs, TieDraws, fuse
 from harness.coordination.exchange import exchange
 from harness.coordination.operating_point import OperatingPoint
 from harness.coordination.rules import RULES
 from harness.core.errors import UserError
 from harness.dataset.load import Dataset
 from harness.evaluate.draws import channel_draws, tie_draws
-from harness.extensions.trust import lies
+from harness.extensions.trust import lies, worst
 from harness.extensions.trust.attackers import attackers_among
 from harness.extensions.trust.strongest_lies import space_of, strongest_lies
 from harness.extensions.trust.study import CAPPED, PEACE, Bench, run_bench, trust_study, under
@@ -121,6 +121,28 @@ def loses(stored: ReplayedRun, point: OperatingPoint, node: int) -> bool:
         if not forest.safe[node, action] or (child >= 0 and loses(stored, point, child)):
             return True
     return False
+
+
+@pytest.mark.parametrize("name", ["linear", "geometric-median", "trust"])
+def test_decisions_that_are_alike_end_as_if_each_was_fused(
+    stored: ReplayedRun, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    point = under(point_of([stored], "6g"), name, PEACE, 0.0)
+    at_once = strongest_lies(stored, point, THIRD, range(4))
+    kinds, shares = worst._Decisions.kinds, list[float]()
+
+    def each_its_own(self: worst._Decisions, at: np.ndarray, ties: TieDraws) -> worst._Kinds:
+        every = np.arange(len(at))
+        shares.append(len(kinds(self, at, ties).first) / len(at))
+        return worst._Kinds(every, every, ties)
+
+    monkeypatch.setattr(worst._Decisions, "kinds", each_its_own)
+    one_by_one = strongest_lies(stored, point, THIRD, range(4))
+    assert at_once is not None
+    assert one_by_one is not None
+    assert min(shares) < 0.5
+    for column, values in at_once.values().items():
+        assert np.array_equal(values, one_by_one.values()[column]), column
 
 
 def test_without_a_liar_an_episode_ends_as_it_does_in_peace(bench: Bench) -> None:
