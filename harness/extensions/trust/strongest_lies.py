@@ -54,6 +54,23 @@ class StrongestLies:
         values = {**self.success, "unsafe": self.unsafe, "liars": self.liars}
         return values if self.at_least is None else {**values, "at_least": self.at_least}
 
+    def with_lie(self, space: str, success: Floats, unsafe: Floats, liars: int) -> "StrongestLies":
+        """Return what lies do of which one more, of a space of lies, was played.
+
+        It leaves the episodes in `success`, (S, E), 1 or 0, ends those in `unsafe` unsafely, and
+        is of up to so many `liars`. A lie of a space belongs to wider ones, too.
+        """
+        wider = list(CLAIMS)[list(CLAIMS).index(space) :]
+        left = dict(self.success)
+        for each in wider:
+            if each in left:
+                left[each] = np.fmin(left[each], success)
+        if space != WORDS:
+            return replace(self, success=left)
+        takes = np.where(success == 0, np.minimum(self.liars, liars), self.liars)
+        at_least = None if self.at_least is None else np.fmin(self.at_least, success)
+        return StrongestLies(left, np.fmax(self.unsafe, unsafe), takes, at_least)
+
     @classmethod
     def of(cls, values: Mapping[str, Floats]) -> "StrongestLies":
         """Return the strongest lies whose `values` these are."""

@@ -268,6 +268,7 @@ class Bench:
     # what the strongest lies by the first share of helpers do, by rule; empty where they were not
     # looked for
     strongest_lies: Mapping[str, StrongestLies] = field(default_factory=dict)
+    liars: int = 0  # how many these are at most
 
     @cached_property
     def rules(self) -> tuple[str, ...]:
@@ -493,8 +494,10 @@ def run_bench(
         cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)
     lies = dict[str, StrongestLies]()
-    # what is sent unasked, or comes from other scenes, is no lie that is looked for
-    if run.asks and point.stream is None and point.elsewhere is None:
+    # what is sent unasked, or comes from other scenes, is no lie that is looked for; and where
+    # helpers open rounds, what liars say changes who is heard
+    tells = point.stream is None and point.elsewhere is None and not point.radio.helper_rounds
+    if run.asks and tells:
         typed_share = float(f"{shares[0]:.10g}")  # as conditions name it
         progress.more(len(every_rule) + len(of_model))
         for rule in (*every_rule, *of_model):
@@ -520,6 +523,7 @@ def run_bench(
         run.caveats,
         unfused,
         lies,
+        int(count_of_attackers(shares[0], helpers)),
     )
 
 

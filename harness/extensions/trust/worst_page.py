@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from harness.core.arrays import Floats
 from harness.core.figures import as_mapping, interval_of, some_of
 from harness.core.statistics import Estimate
 from harness.extensions.trust.lies import CLAIMS, PLACES, VOICES, WORDS
-from harness.extensions.trust.strongest_lies import space_of
+from harness.extensions.trust.strongest_lies import StrongestLies, space_of
 from harness.extensions.trust.worst import TRUST
 from harness.report.document import Table
 from harness.runs.estimates import over_episodes
@@ -21,18 +20,13 @@ if TYPE_CHECKING:
 NAMES = {WORDS: "words", PLACES: "and a false place", VOICES: "and three voices"}
 
 
-def left(bench: "Bench", rule: str, space: str) -> Floats:
-    """Return which episodes succeed under the strongest lie of a space, (S, E), by one rule.
-
-    Of attacks that ship, those of the space that were played are among the lies.
-    """
-    success = bench.strongest_lies[rule].success[space]
-    spaces = list(CLAIMS)[: list(CLAIMS).index(space) + 1]
+def strongest(bench: "Bench", rule: str) -> StrongestLies:
+    """Return what the strongest lies do to a rule; attacks that ship and were played are lies."""
+    case = bench.strongest_lies[rule]
     for attack in bench.attacks:
-        key = rule, attack, bench.shares[0]
-        if space_of(attack) in spaces and key in bench.cells:
-            success = np.fmin(success, bench.at(*key).success)
-    return success
+        if cell := bench.cells.get((rule, attack, bench.shares[0])):
+            case = case.with_lie(space_of(attack), cell.success, cell.unsafe, bench.liars)
+    return case
 
 
 def worst_headline(bench: "Bench") -> Iterator[str]:
@@ -40,7 +34,7 @@ def worst_headline(bench: "Bench") -> Iterator[str]:
     if not bench.strongest_lies:
         return
     success_rule, share = bench.success_rule, bench.shares[0]
-    successes = {rule: left(bench, rule, WORDS) for rule in bench.strongest_lies}
+    successes = {rule: strongest(bench, rule).success[WORDS] for rule in bench.strongest_lies}
     first, *others = successes
     best, *close = success_rule.most(successes)
     shares = {rule: interval_of(success_rule.estimate(each)) for rule, each in successes.items()}
@@ -67,7 +61,8 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
         estimates = _estimates(bench, rule)
         names = (*CLAIMS, "at_least", "worst_unsafe")
         values = [interval_of(estimates[name]) if name in estimates else "–" for name in names]
-        more = bench.success_rule.difference(left(bench, rule, WORDS), bench.alone)
+        by_words = strongest(bench, rule).success[WORDS]
+        more = bench.success_rule.difference(by_words, bench.alone)
         values.insert(1, interval_of(more, sign="+"))
         rows.append((rule, interval_of(_withstands(bench, rule)[0]), *values))
     rows.append(("never asks", alone, alone, "", *[alone] * 3, ""))
@@ -130,11 +125,10 @@ def worst_mapping(bench: "Bench") -> dict[str, Any]:
 
 def _estimates(bench: "Bench", rule: str) -> dict[str, Estimate]:
     """Return the means with intervals of a rule's worst case, by name."""
-    case, success_rule = bench.strongest_lies[rule], bench.success_rule
-    estimates = {space: success_rule.estimate(left(bench, rule, space)) for space in case.success}
+    case, success_rule = strongest(bench, rule), bench.success_rule
+    estimates = {space: success_rule.estimate(success) for space, success in case.success.items()}
     if case.at_least is not None:
-        at_least = np.fmin(case.at_least, left(bench, rule, WORDS))
-        estimates["at_least"] = success_rule.estimate(at_least)
+        estimates["at_least"] = success_rule.estimate(case.at_least)
     unsafe = over_episodes("unsafe_rate", case.unsafe, success_rule.clusters)
     return {**estimates, "worst_unsafe": unsafe}
 
@@ -148,8 +142,8 @@ def _is_exact(bench: "Bench", rule: str) -> bool:
 def _withstands(bench: "Bench", rule: str) -> list[Estimate]:
     """Return how much success there is with 0, 1, … liars, whoever they are, under a rule."""
     most = max(1, *(int(np.max(case.liars)) for case in bench.strongest_lies.values()))
-    estimates = []
+    case, estimates = strongest(bench, rule), []
     for count in range(most):
-        withstands = (bench.strongest_lies[rule].liars > count).astype(float)
+        withstands = (case.liars > count).astype(float)
         estimates.append(bench.success_rule.estimate(withstands))
     return estimates

@@ -19,9 +19,9 @@ from harness.dataset.load import Dataset
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.extensions.trust import lies, worst
 from harness.extensions.trust.attackers import attackers_among
-from harness.extensions.trust.strongest_lies import space_of, strongest_lies
+from harness.extensions.trust.strongest_lies import StrongestLies, space_of, strongest_lies
 from harness.extensions.trust.study import CAPPED, PEACE, Bench, run_bench, trust_study, under
-from harness.extensions.trust.worst_page import left
+from harness.extensions.trust.worst_page import strongest
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.sweep import point_of
 
@@ -160,8 +160,11 @@ def test_no_attack_that_ships_does_more(bench: Bench) -> None:
                 assert np.all(case.unsafe >= cell.unsafe), (rule, attack)
     for rule in bench.strongest_lies:
         for attack in ATTACKS:
-            worst = left(bench, rule, space_of(attack))
-            assert np.all(worst <= bench.at(rule, attack, THIRD).success), (rule, attack)
+            case, cell = strongest(bench, rule), bench.at(rule, attack, THIRD)
+            assert np.all(case.success[space_of(attack)] <= cell.success), (rule, attack)
+            if space_of(attack) == lies.WORDS:
+                assert np.all(case.unsafe >= cell.unsafe), (rule, attack)
+                assert not np.any((case.liars > bench.liars) & (cell.success == 0)), (rule, attack)
 
 
 def test_what_trust_keeps_in_any_case_no_lie_and_no_attack_takes(bench: Bench) -> None:
@@ -218,6 +221,29 @@ def test_of_messages_from_other_scenes_no_strongest_lie_is_said(
     pytest.importorskip("harness.extensions.controls")
     options = ("6g:messages=shuffled", ("linear",), ("silent",), (THIRD,), (0,), tmp_path)
     assert not run_bench(stored, *options, Watched()).strongest_lies
+
+
+def test_where_what_liars_say_decides_who_is_heard_no_strongest_lie_is_said(
+    stored: ReplayedRun, tmp_path: Path
+) -> None:
+    options = ("6g:helper_rounds=true", ("linear",), ("brake",), (THIRD,), (0,), tmp_path)
+    assert not run_bench(stored, *options, Watched()).strongest_lies
+
+
+def test_an_attack_that_was_played_is_one_of_the_lies() -> None:
+    every, none = np.ones((1, 4)), np.zeros((1, 4))
+    case = StrongestLies(dict.fromkeys(lies.CLAIMS, every), none, every + 2, every)
+    lost, ended = np.array([[1.0, 0, 1, np.nan]]), np.array([[0.0, 1, 0, np.nan]])
+    of_words = case.with_lie(lies.WORDS, lost, ended, 1)
+    assert of_words.success[lies.VOICES].tolist() == [[1, 0, 1, 1]]
+    assert of_words.unsafe.tolist() == [[0, 1, 0, 0]]
+    assert of_words.liars.tolist() == [[3, 1, 3, 3]]
+    assert of_words.at_least is not None
+    assert of_words.at_least.tolist() == [[1, 0, 1, 1]]
+    of_places = case.with_lie(lies.PLACES, lost, ended, 1)
+    assert of_places.success[lies.WORDS].tolist() == [[1, 1, 1, 1]]
+    assert of_places.success[lies.PLACES].tolist() == [[1, 0, 1, 1]]
+    assert of_places.liars.tolist() == [[3, 3, 3, 3]]
 
 
 class Grudge:
