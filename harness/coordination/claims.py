@@ -78,9 +78,7 @@ class Claims:
             self.sensed_m[at],
             maps.take(at) if isinstance(maps, Maps) else maps,
         )
-        if "off_road_m" in vars(self):  # to measure it again would take longer than all else here
-            vars(some)["off_road_m"] = self.off_road_m[at]
-        return some
+        return some._measured(self.off_road_m[at])
 
     def of_helpers(self, places: Ints) -> "Claims":
         """Return the claimed positions and speeds with the helpers reordered, chosen or repeated.
@@ -89,12 +87,13 @@ class Claims:
         stands at each of H' places.
         """
         with_ego = np.insert(places + 1, 0, 0, axis=-1)
-        return replace(
+        claims = replace(
             self,
             xy_m=np.take_along_axis(self.xy_m, with_ego[..., None], axis=-2),
             speed_mps=np.take_along_axis(self.speed_mps, places, axis=-1),
             sensed_m=np.take_along_axis(self.sensed_m, places, axis=-1),
         )
+        return claims._measured(np.take_along_axis(self.off_road_m, places, axis=-1))
 
     def moved(self, movers: Bools, xy_m: Floats) -> "Claims":
         """Return the claims with other positions for some helpers, as liars among them state.
@@ -106,3 +105,8 @@ class Claims:
         return replace(
             self, xy_m=np.concatenate([ego, np.where(movers[..., None], xy_m, helpers)], axis=-2)
         )
+
+    def _measured(self, off_road_m: Floats) -> "Claims":
+        """Return these claims, which know `off_road_m`: to measure it takes longest of all here."""
+        vars(self)["off_road_m"] = off_road_m
+        return self

@@ -7,7 +7,7 @@ and the ego attacks nobody.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -135,6 +135,9 @@ def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:
         return attack.act(sent, turn)
     with worded(label("attack", attack)):
         after = attack.act(read_only(sent), read_only(turn))
+        if after.claims and sent.claims:  # the map is nobody's claim
+            claims = replace(after.claims, from_road_m=sent.claims.from_road_m)
+            after = replace(after, claims=claims)
         if after.voice_of is None:
             after = replace(after, site=sent.site, outlook=sent.outlook, plans=sent.plans)
             _refuse_of_others(sent, after, turn.attackers)
@@ -199,12 +202,14 @@ def _refuse_of_others(sent: Intents, after: Intents, attackers: Bools) -> None:
 
 def _claimed(intents: Intents) -> dict[str, Any]:
     """Return the arrays of what helpers claim, by name."""
-    claims = intents.claims
-    return (
-        {}
-        if claims is None
-        else {k: v for k, v in vars(claims).items() if isinstance(v, np.ndarray)}
-    )
+    claims, arrays = intents.claims, dict[str, Any]()
+    if claims is None:
+        return arrays
+    for field in fields(claims):
+        value = getattr(claims, field.name)
+        if isinstance(value, np.ndarray):
+            arrays[field.name] = value
+    return arrays
 
 
 def _uniforms(trips: Trips, helpers: int) -> Floats:

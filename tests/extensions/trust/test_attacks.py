@@ -300,9 +300,22 @@ class Bent(Attack):
             sent.helpers[...] = 1 / 3
         if self.way == "own":
             return replace(sent, own=np.array(BOLD))
+        if self.way == "map":
+            claims = replace(sent.claims, from_road_m=lambda xy_m: np.ones(xy_m.shape[:-1]))
+            vars(claims)["off_road_m"] = np.ones(sent.range_m.shape)
+            return replace(sent, claims=claims)
         if self.way == "sums":
             return self.intend(sent, turn, sent.helpers * 2)
         return replace(sent, helpers=np.full_like(sent.helpers, 1 / 3))
+
+
+def test_where_the_road_is_no_attack_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(ATTACKS._loaded, "bent", Bent())
+    monkeypatch.setattr(type(ATTACKS), "__iter__", lambda self: iter(self._loaded))
+    truth, keys = many(TRUTH, 9), [(n, n) for n in range(9)]
+    told = told_by(under("bent:way=map").speaker(), truth, drawn(range(9)), keys)
+    assert told.intents.claims is not None
+    assert not told.intents.claims.off_road_m.any()
 
 
 @pytest.mark.parametrize(
