@@ -36,6 +36,7 @@ def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
         for i in places:
             seen, sectors = _outlook(road, scenes[i]), len(road.sectors)
             unseen[i, :sectors], to_zone_s[i] = seen.unseen, seen.to_zone_s
+            added[i, : len(seen.added)] = 0.0  # nothing, where a road has no such region
             added[i, : len(seen.added), :sectors] = seen.added
     return Outlook(unseen, added, to_zone_s)
 

@@ -135,6 +135,23 @@ def test_the_ego_knows_of_regions_what_its_graph_says(small: Dataset):
     assert np.array_equal(again.added[0], seen.added[3], equal_nan=True)
 
 
+def test_what_helpers_add_does_not_depend_on_the_other_roads():
+    pytest.importorskip("harness.extensions.roads")
+    roads = load(find("datasets", "sumo-merge-v1"), 20)
+    scenes = roads.scenes([roads.forest.ids[root] for root in roads.forest.root.tolist()])
+    together = outlook(roads.scenario, scenes)
+    widths = set()
+    for n, scene in enumerate(scenes):
+        alone = outlook(roads.scenario, [scene])
+        helpers, regions = alone.added.shape[1:]
+        widths.add(regions)
+        assert not np.isnan(together.added[n, :helpers]).any(), scene.id
+        assert np.array_equal(together.added[n, :helpers, :regions], alone.added[0])
+        assert not together.added[n, :helpers, regions:].any()
+        assert np.isnan(together.added[n, helpers:]).all()
+    assert len(widths) > 1
+
+
 @pytest.mark.slow
 def test_frozen_and_driven_ask_alike(small: Dataset, tmp_path: Path):
     texts = ("6g:schedule=coverage,max_helpers=1", "6g:schedule=random", "6g:schedule=learnt")
