@@ -1,20 +1,25 @@
-"""What a number format changes: the same JSON answers in each, on transformers and OpenVINO.
+"""What a number format changes: the same answers in each, on transformers and OpenVINO.
 
-    python benchmarks/number_formats.py [--prompts 500] [--formats openvino:auto ...] [--out FOLDER]
+    python benchmarks/number_formats.py [--answer readout] [--formats openvino:auto ...]
 
 Prompts of v10, spread over the scenes of a dataset, at temperature 0 on a CPU in batches of 8 after
-one that warms up. An answer is compared with that of transformers in float32: its text, and its
-likeliest action. What a format wrote is kept in FOLDER, and is read there and not made again.
+one that warms up. An answer is compared with that of transformers in float32: its text, its
+likeliest action, and the greatest difference of a probability. What a format wrote is kept in the
+folder `--out`, and is read there and not made again.
 """
 
 import argparse
 import json
+import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from harness.backends import cards
 from harness.backends.base import Request
@@ -53,29 +58,33 @@ def main() -> None:
     arguments.add_argument("--model", default="smollm2-135m")
     arguments.add_argument("--dataset", default="occluded-intersection-v3")
     arguments.add_argument("--prompts", type=int, default=500)
+    arguments.add_argument("--answer", choices=("json", "readout"), default="json")
     arguments.add_argument("--batch", type=int, default=8)
     arguments.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS)
     arguments.add_argument("--out", type=Path, default=Path("reports/number-formats"))
     given = arguments.parse_args()
-    asked = questions(given.model, given.dataset, given.prompts)
+    asked = questions(given)
     written = {each: of_format(each, asked, given) for each in given.formats}
     reference = written[REFERENCE]
-    expected = actions(asked, reference.texts)
+    expected = intents(asked, reference.texts)
     print(f"{len(asked)} answers, {len(set(reference.texts))} different ones in {REFERENCE}")
-    print("| format | answers a CPU s | same text | same likeliest action | read |")
+    print(f"likeliest actions there: {Counter(map(likeliest, expected))}")
+    print("| format | answers a CPU s | same text | same likeliest action | mean, greatest diff. |")
     print("|---|--:|--:|--:|--:|")
-    for name, done in written.items():
-        found = actions(asked, done.texts)
-        same = equal(done.texts, reference.texts)
-        alike, read = equal(found, expected), len(found) - found.count(None)
-        pace = len(asked) / done.cpu_s
-        print(f"| {name} | {pace:.2f} | {same} | {alike} | {read} of {len(asked)} |")
+    for name, answers in written.items():
+        here = intents(asked, answers.texts)
+        texts = equal(answers.texts, reference.texts)
+        actions = equal(list(map(likeliest, here)), list(map(likeliest, expected)))
+        apart = np.abs(np.array(here) - np.array(expected)).max(axis=1)
+        pace = len(asked) / answers.cpu_s
+        differences = f"{np.nanmean(apart):.2g}, {np.nanmax(apart):.2g}"
+        print(f"| {name} | {pace:.2f} | {texts} | {actions} | {differences} |")
 
 
-def questions(model: str, dataset: str, count: int) -> list[Request]:
+def questions(given: argparse.Namespace) -> list[Request]:
     """Return as many questions, to all that are asked in scenes spread over a dataset."""
-    data = load(find(dataset))
-    agent = Agent(cards.resolve(model), versions.load("v10"), "json")
+    data, count = load(find(given.dataset)), given.prompts
+    agent = Agent(cards.resolve(given.model), versions.load("v10"), given.answer)
     spec = Spec(agent, FrozenSource(data), (), (0,))
     every = list(requests(spec, data.scenes(data.courses())))
     by_scene = groupby(every, lambda request: request.id.partition("/")[0])
@@ -87,7 +96,7 @@ def questions(model: str, dataset: str, count: int) -> list[Request]:
 
 def of_format(name: str, asked: list[Request], given: argparse.Namespace) -> Written:
     """Return what the model writes in a format: that which is kept, or else asked now."""
-    file = given.out / f"{name.replace(':', '-')}.json"
+    file = given.out / f"{given.answer}-{name.replace(':', '-')}.json"
     key = [given.model, *(request.id for request in asked)]
     if file.exists() and (kept := json.loads(file.read_text()))["key"] == key:
         return Written(kept["texts"], kept["cpu_s"])
@@ -110,13 +119,18 @@ def of_engine(model: str, engine: str) -> Card:
     return replace(cards.resolve(model, "llama-cpp"), engine=engine)
 
 
-def actions(asked: list[Request], texts: list[str]) -> list[int | None]:
-    """Return the place of each answer's likeliest action; None where none is read."""
-    places: list[int | None] = []
+def intents(asked: list[Request], texts: list[str]) -> list[Sequence[float]]:
+    """Return each answer's probabilities of the actions; NaN where none can be read."""
+    intents: list[Sequence[float]] = []
     for request, text in zip(asked, texts, strict=True):
-        intent = parse(text, role=request.role, actions=request.actions).intent
-        places.append(intent.index(max(intent)) if intent else None)
-    return places
+        intent = parse(text, **request.shape._asdict()).intent
+        intents.append(intent or [math.nan] * len(request.actions))
+    return intents
+
+
+def likeliest(intent: Sequence[float]) -> int | None:
+    """Return the place of an answer's likeliest action; None where none is read."""
+    return None if math.isnan(intent[0]) else int(np.argmax(intent))
 
 
 def equal(one: Sequence[object], other: Sequence[object]) -> int:
