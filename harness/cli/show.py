@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill, wrap
 from typing import TYPE_CHECKING, Any
@@ -51,7 +51,10 @@ def finish(
 
 
 def echo_answer(study: "Study") -> None:
-    """Print a study's result, its `answer`, as JSON; a data frame as a list of records."""
+    """Print a study's result, its `answer`, as JSON; a data frame as a list of records.
+
+    What a reader must know first, its `caveats`, is in it, except beside records.
+    """
 
     def records(frame: Any) -> Any:
         return json.loads(frame.to_json(orient="records"))
@@ -59,7 +62,10 @@ def echo_answer(study: "Study") -> None:
     if hasattr(study.answer, "to_json"):
         typer.echo(study.answer.to_json(orient="records"))
     else:
-        typer.echo(json.dumps(study.answer, indent=1, default=records))
+        answer = study.answer
+        if isinstance(answer, Mapping):
+            answer = {**answer, "caveats": list(study.caveats)}
+        typer.echo(json.dumps(answer, indent=1, default=records))
 
 
 def show(study: "Study", verbose: bool) -> None:

@@ -256,6 +256,14 @@ class Asker:
         """
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
+    def new_answers(self) -> dict[str, Answer]:
+        """Return the answers by request id to questions that were asked here and had none given.
+
+        Those that were kept from earlier are among them.
+        """
+        names = self.answers.keys() - self._given - self._unasked
+        return {name: self.answers[name] for name in names}
+
     def settle(self) -> None:
         """Raise Unanswered if too many questions that were asked here got no answer.
 

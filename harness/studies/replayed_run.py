@@ -4,8 +4,8 @@ and no model is asked what the run has.
 
 import gc
 import os
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -48,7 +48,7 @@ from harness.runs.contradictions import sound
 from harness.runs.records import Answer
 from harness.runs.run_dataset import dataset_of
 from harness.runs.success import Success, alike
-from harness.runs.unanswered import tally
+from harness.runs.unanswered import Tally, tally
 from harness.studies.axes import Setting
 from harness.studies.play import Read, WalkResult, metric_columns, walk_through
 
@@ -62,6 +62,7 @@ _GIVE_IT = (
     "models/NAME.toml"
 )
 OWN = ("ego", "helper")  # roles that have one answer a vehicle
+LEFT_OUT, ASKED, LOST = "left-out", "asked", "lost"  # what results lack; a role follows the others
 # answers at decision points that the run did not come to, and its fusion calls
 MORE = "more-answers.jsonl"
 
@@ -130,6 +131,7 @@ class ReplayedRun:
         self._asks, self._models = asks, models
         self._progress = progress
         self.left_out: set[str] = set()
+        self._kept_gaps = defaultdict[str, set[str]](set)
         self._announced, self._left = False, 0  # questions that are asked next
         self._opened: dict[int, Backend] = {}
         # a lost message is a part of the run; what it lacks is asked again
@@ -305,13 +307,43 @@ class ReplayedRun:
         """Return warnings on the results: whose answers they are of, if another program wrote them,
         requests without an answer, and episodes left out.
         """
-        counts, name, n = self._asker.tally.counts(), printable(self.name), len(self.left_out)
+        counts, name, n = self._tally().counts(), printable(self.name), len(self.left_out)
         lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
         left_out = (
             f"{name}: left out episodes that reach one of {n} decision points without a stored "
             "answer; without --no-model the model is asked there"
         )
         return tuple(filter(None, (*stated_elsewhere(self.run), lost, left_out if n else "")))
+
+    def _tally(self) -> Tally:
+        """Count the questions that the run did not ask, and those of them without an answer."""
+        counts = Tally()
+        for kind, ids in self.gaps().items():
+            what, _, role = kind.partition(" ")
+            if role:
+                (counts.asked if what == ASKED else counts.unanswered)[role] = len(ids)
+        return counts
+
+    def gaps(self) -> dict[str, set[str]]:
+        """Return what results lack so far, ids by kind, that of results which were kept included.
+
+        They are decision points without an answer, whose episodes were left out, and by role the
+        questions that the run did not ask, and those of them that got no answer.
+        """
+        gaps = defaultdict[str, set[str]](set, {LEFT_OUT: set(self.left_out)})
+        for kind, ids in self._kept_gaps.items():
+            gaps[kind] |= ids
+        for name, answer in self._asker.new_answers().items():
+            gaps[f"{ASKED} {answer.role}"].add(name)
+            if answer.error is not None:
+                gaps[f"{LOST} {answer.role}"].add(name)
+        return dict(gaps)
+
+    def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
+        """Take over what kept results lack, ids by kind, as `gaps` has them."""
+        self.left_out.update(gaps[LEFT_OUT])
+        for kind, ids in gaps.items():
+            self._kept_gaps[kind] |= set(ids)
 
     def settle(self) -> None:
         """Raise Unanswered if results are invalid, as too many requests made here got no answer."""

@@ -4,11 +4,11 @@ and one writer of its folder and page.
 
 import csv
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 import numpy as np
@@ -129,7 +129,11 @@ def write_study(study: Study, out: Path, draws: bool = True) -> Path:
         more=study.more,
     )
     write_whole(out / "index.html", document([section]))
-    manifest = {"format": f"swarmdrive-{study.kind}/1", **study.manifest}
+    manifest = {
+        "format": f"swarmdrive-{study.kind}/1",
+        **study.manifest,
+        "caveats": list(study.caveats),
+    }
     text = msgspec.json.format(json.dumps(manifest, allow_nan=False), indent=1)
     write_whole(out / f"{study.kind}.json", text + "\n")
     return out / "index.html"
@@ -265,20 +269,37 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
         )
 
 
+class GapRecord(Protocol):
+    """Describe what knows of gaps in results, such as episodes left out, as ids by kind."""
+
+    def gaps(self) -> Mapping[str, Collection[str]]:
+        """Return the ids of what results lack so far, by kind."""
+        ...
+
+    def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
+        """Take over the gaps of results that were kept: ids by kind."""
+        ...
+
+
 class Cells:
     """Keep finished parts of a study in a file, one a line, so that a killed study can continue.
 
-    It is made from the file, the digest of all settings that decide a part, and whether parts are
-    `computed` here, unlike a model's replies. A part that was made of other settings than this
-    study's is not taken, nor is a computed one that was not computed by this user on this machine:
-    anybody may have written the file.
+    It is made from the file, the digest of all settings that decide a part, whether parts are
+    `computed` here, unlike a model's replies, and what they are computed of, if it knows of gaps in
+    results. A part that was made of other settings than this study's is not taken, nor is a
+    computed one that was not computed by this user on this machine: anybody may have written the
+    file. Gaps are kept with the part that came upon them, so that a study says them again.
     """
 
-    def __init__(self, path: Path, depends_on: str, computed: bool = True) -> None:
+    def __init__(
+        self, path: Path, depends_on: str, computed: bool = True, source: GapRecord | None = None
+    ) -> None:
         """Read a file. Torn lines and those of another digest of all that decides a part do not
-        count, and without a seal those that are `computed`, unlike a model's replies.
+        count, and without a seal those that are `computed`, unlike a model's replies. Nor do those
+        without gaps, as older versions wrote them, if the `source` knows of some.
         """
         self._path, self._of, self._computed = path, depends_on, computed
+        self._source, self._gaps = source, set[tuple[str, str]]()
         data = bytes_of(path, "rows") if is_there(path) else b""
         self._torn = bool(data) and not data.endswith(b"\n")
         self._cells = dict(self._read(data))
@@ -288,7 +309,11 @@ class Cells:
             try:
                 kept = json.loads(line)
                 if kept["of"] == self._of and (not self._computed or self._is_sealed(kept)):
-                    yield tuple(kept["key"]), {k: _array(v) for k, v in kept["cell"].items()}
+                    part = {k: _array(v) for k, v in kept["cell"].items()}
+                    if self._source:
+                        self._source.recall_gaps(kept["gaps"])
+                        self._new_gaps(kept["gaps"])
+                    yield tuple(kept["key"]), part
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 continue
 
@@ -298,6 +323,14 @@ class Cells:
 
     def _seal(self, kept: Mapping[str, Any]) -> str | None:
         return seal({"cell": json.dumps(kept, default=np.ndarray.tolist).encode()}, "a study")
+
+    def _new_gaps(self, gaps: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
+        """Return the gaps that no part in the file has, and take them as being there."""
+        new = {}
+        for kind, ids in gaps.items():
+            new[kind] = sorted(name for name in ids if (kind, name) not in self._gaps)
+            self._gaps |= {(kind, name) for name in new[kind]}
+        return new
 
     def __contains__(self, key: Sequence[Any]) -> bool:
         return tuple(key) in self._cells
@@ -316,6 +349,8 @@ class Cells:
             return there
         values = compute()
         kept: dict[str, Any] = {"of": self._of, "key": key, "cell": values}
+        if self._source:
+            kept["gaps"] = self._new_gaps(self._source.gaps())
         if self._computed:
             kept["seal"] = self._seal(kept)
         line = json.dumps(kept, default=np.ndarray.tolist)

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,7 @@ def test_a_page_shows_text_as_text_and_a_terminal_no_markup(tmp_path: Path) -> N
     assert json.loads((tmp_path / "sweep.json").read_text()) == {
         "format": "swarmdrive-sweep/1",
         "a": 1,
+        "caveats": [HOSTILE],
     }
 
 
@@ -118,6 +120,35 @@ def test_parts_are_kept_to_the_last_bit_but_those_of_something_else_and_torn_one
     path.write_bytes(path.read_bytes()[:-5])
     assert [part("that", 2), part("this", 1), part("this", 2), part("that", 2)] == [2, 1, 2, 2]
     assert computed == ["this1", "this2", "that2", "this2"]
+
+
+class Watched:
+    """A source that has come upon some gaps."""
+
+    def __init__(self, *names: str) -> None:
+        self.names = set(names)
+
+    def gaps(self) -> Mapping[str, Collection[str]]:
+        return {"left-out": self.names}
+
+    def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
+        self.names |= set(gaps["left-out"])
+
+
+def test_gaps_are_kept_with_the_part_that_came_upon_them_and_recalled(tmp_path: Path) -> None:
+    path, first = tmp_path / "cells.jsonl", Watched("a")
+    cells = Cells(path, "this", source=first)
+    cells.part(("one",), dict)
+    first.names.add("b")
+    cells.part(("two",), dict)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["gaps"] for line in lines] == [{"left-out": ["a"]}, {"left-out": ["b"]}]
+    again = Watched()
+    Cells(path, "this", source=again)
+    assert again.names == {"a", "b"}
+    Cells(path, "that").part(("one",), dict)  # as older versions kept it
+    assert ("one",) in Cells(path, "that")
+    assert ("one",) not in Cells(path, "that", source=Watched())
 
 
 def test_no_part_is_computed_where_a_pipe_would_keep_it(tmp_path: Path) -> None:

@@ -478,8 +478,8 @@ def run_bench(
         files_of([*points.values()]),
         versions(),
     ]
-    kept, cells = Cells(out / "cells.jsonl", digest(depends_on)), dict[Key, Cell]()
-
+    kept = Cells(out / "cells.jsonl", digest(depends_on), source=run)
+    cells = dict[Key, Cell]()
     missing = [key for key in every if key not in kept]
     settings = [Setting(point.name, points[key], run.vehicles) for key in missing]
     walks = run.walked(settings, seeds, partial(_judged, run))

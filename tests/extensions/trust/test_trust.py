@@ -3,13 +3,16 @@ and it goes on when stopped.
 """
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import served
 from evaluating import Watched, figure, live_spec_of, run, spec_of
+from misbehaving import Asked, serving
 
 from harness.coordination.named_points import named_point
 from harness.core import resources, versions
@@ -319,3 +322,48 @@ def test_cells_without_the_model_are_not_taken_for_cells_with_it(
     assert np.isnan(first.at("linear", "liar", THIRD).success).any()
     for key, cell in fresh.cells.items():
         assert np.array_equal(second.cells[key].success, cell.success)
+
+
+@pytest.mark.slow
+def test_a_study_of_kept_cells_says_again_what_was_left_out(small: Dataset, tmp_path: Path) -> None:
+    whole = run(spec_of(small, ask="all", seeds=(0,)), tmp_path / "run")
+
+    def caveats() -> tuple[str, ...]:
+        without = ReplayedRun(whole.out, asks=False)
+        options = ("6g", ("linear", "trust"), ("liar",), (THIRD,), (0,))
+        return run_bench(without, *options, tmp_path / "bench", Watched()).caveats
+
+    first = caveats()
+    assert any("left out episodes that reach one of" in caveat for caveat in first)
+    assert caveats() == first
+    kept = tmp_path / "bench" / "cells.jsonl"
+    lines = kept.read_bytes().splitlines(keepends=True)
+    kept.write_bytes(b"".join(lines[:2]))  # as of a study that was stopped
+    assert caveats() == first
+
+
+@pytest.mark.slow
+def test_a_study_of_kept_cells_says_again_which_answers_were_lost(
+    harness: Callable[..., tuple[int, str, str]], small_path: Path
+) -> None:
+    run_of_server = "--seeds 0:1 --condition single-local --condition 6g --out run --no-cache"
+    study = "study trust run --rules linear --attacks liar --seeds 0:1 --out bench --json"
+    number = [-1]  # of the next question: the tenth of the study's is refused
+
+    def play(asked: Asked) -> None:
+        number[0] += number[0] >= 0
+        if number[0] == 10:
+            asked.reply({"error": {"message": "content filter"}}, 400)
+        else:
+            served.answer(asked)
+
+    with serving(play) as server:
+        model = ("--model", f"{server.url}#m")
+        made = harness("eval", *run_of_server.split(), *model, "--dataset", small_path)
+        assert made[0] == 0, made
+        number[0] = 0
+        said = [harness(*study.split(), *model) for _ in range(2)]
+    caveats = [json.loads(out)["caveats"] for _, out, _ in said]
+    assert re.search(r"no answer to 1 of \d{2,} questions to helpers", caveats[0][-1])
+    assert caveats[1] == caveats[0]
+    assert json.loads(Path("bench/trust.json").read_text())["caveats"] == caveats[0]
