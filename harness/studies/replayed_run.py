@@ -540,7 +540,9 @@ class _Nearest:
         reach = np.nan_to_num(intents.range_m, nan=np.inf)
         near = chosen(np.zeros_like(reach), -1.0, np.isfinite(reach), reach, self._helpers)
         range_m = np.where(near, intents.range_m, np.nan)
-        return replace(intents, valid=intents.valid & near, range_m=range_m)
+        # what a helper intends that is not there must not be remembered until it comes near
+        helpers = np.where(near[..., None], intents.helpers, np.nan)
+        return replace(intents, helpers=helpers, valid=intents.valid & near, range_m=range_m)
 
     def fusion_call(
         self, scenes: Sequence[Scene], codes: Ints, rewrites: Rewrites = AS_SENT

@@ -90,6 +90,8 @@ def settings(
                 point = axis.at(point, value)
                 if axis.field is None:
                     size = int(value)
+            if point.stream or point.elsewhere:
+                _refuse_fewer(runs, condition, size)
             idle.append({axis.name: point.idle(axis.field) for axis in axes})
             value_or_values = values if len(axes) > 1 else values[0]
             result.append(Setting(condition, point, size, name, value_or_values))
@@ -100,6 +102,17 @@ def settings(
                     f"{idle[0][axis.name]}; vary another setting or another --condition"
                 )
     return tuple(result)
+
+
+def _refuse_fewer(runs: Sequence[ReplayedRun], condition: str, size: int) -> None:
+    """Raise UserError if fewer vehicles are to be played than some run has in its scenes."""
+    most = max(run.vehicles for run in runs)
+    if size < most:
+        raise UserError(
+            f"--condition {printable(condition)}: with {size} of {most} vehicles, those that are "
+            "left out would still be heard, as messages come unasked or from elsewhere; leave it "
+            "out, or vary another setting than the size"
+        )
 
 
 def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:

@@ -234,6 +234,31 @@ def test_points_that_are_walked_together_are_each_as_alone(
         assert np.array_equal(walked.places, expected.places)
 
 
+@pytest.mark.slow
+def test_a_helper_beyond_the_size_intends_nothing_whatever_is_stored(
+    done: Evaluated, tmp_path: Path
+) -> None:
+    """Else an attacker that repeats what it intended remembers it from when it was far."""
+    source = ReplayedRun(Path(shutil.copytree(done.out, tmp_path / "run")))
+    scenes = source.dataset.scenes(source.dataset.forest.ids[:9])
+    source.whole(scenes)
+    intents = replayed_run._Nearest(source, 1, lambda at: None)(scenes)
+    is_near = np.isfinite(intents.range_m)
+    assert (is_near.sum(axis=1) == 1).all()
+    assert np.isnan(intents.helpers[~is_near]).all()
+    assert np.isfinite(intents.helpers[is_near]).all()
+
+
+def test_a_size_below_the_runs_is_refused_where_all_vehicles_would_still_be_heard(
+    source: ReplayedRun,
+) -> None:
+    said = "with 1 of 4 vehicles, those that are left out would still be heard"
+    for condition in ("6g:stream=cpm", "6g:messages=shuffled"):
+        with pytest.raises(UserError, match=f"--condition {condition}: {said}"):
+            settings([source], [AXES["size"]], [None], [condition])
+        assert settings([source], [AXES["tau"]], [(0.5,)], [condition])
+
+
 @pytest.mark.exhaustive
 def test_many_points_are_walked_in_parts(
     source: ReplayedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
