@@ -21,7 +21,6 @@ from harness.core.figures import amount
 from harness.core.seeds import LAST_EPISODE
 from harness.dataset import select
 from harness.dataset.load import Dataset
-from harness.dataset.select import Choice
 from harness.evaluate import latency as latencies
 from harness.evaluate.frozen_world import FrozenSource
 from harness.evaluate.of_run import (
@@ -42,6 +41,7 @@ from harness.prompts import versions
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
+from harness.runs.run_dataset import OTHER_EPISODES, choice_of
 from harness.runs.settings import FrozenSettings
 from harness.runs.stopping import looked_otherwise
 from harness.runs.unanswered import Tally
@@ -122,7 +122,7 @@ def differences(
     """
     source = _source(run, dataset)
     if tuple(source.numbers) != run.grid.episodes:
-        return ["episodes.csv has other episodes than run.json says that were selected"], []
+        return [OTHER_EPISODES], []
     stored_spec, manifest = spec_of(run, source), run.manifest
     check_prompts(run, stored_spec)
     timer = manifest.timer
@@ -155,7 +155,7 @@ def _source(run: Run, dataset: Dataset | None) -> Source:
     world = run.manifest.world
     if isinstance(world, FrozenScenes):
         assert dataset is not None
-        choice = _choice(run, world.selection, dataset.episodes, dataset)
+        choice = choice_of(run, dataset.episodes, dataset)
         numbers = choice.numbers if choice else dataset.episodes
         part = dataset.of_episodes(frozenset(numbers[: world.limit]))
         return FrozenSource(part, world.limit, choice)
@@ -163,24 +163,10 @@ def _source(run: Run, dataset: Dataset | None) -> Source:
 
     most = int(world.selection.get("of", world.episodes))
     in_range(f"{printable(run.path)}: episodes to select of", most, 1, LAST_EPISODE + 1)
-    choice = _choice(run, world.selection, range(most), None)
+    choice = choice_of(run, range(most), None)
     if choice:
         choice = replace(choice, numbers=choice.numbers[: world.episodes])
     return LiveSource(world.first_seed, most, scenarios.argument(run.manifest.scenario), choice)
-
-
-def _choice(
-    run: Run, record: Mapping[str, Any], numbers: Sequence[int], dataset: Dataset | None
-) -> Choice | None:
-    """Return what chose a run's episodes, by what it states, out of all; None for all.
-
-    Where the extension that chooses is gone, the episodes are those that the run has.
-    """
-    if select.lacking(record):
-        pool = tuple(layout.episode for layout in run.layouts) or run.grid.episodes
-        return Choice(run.grid.episodes, pool, record)
-    selection = select.recorded(record)
-    return selection.choice(numbers, dataset) if selection else None
 
 
 def _unchecked_choice(record: Mapping[str, Any]) -> Iterator[str]:

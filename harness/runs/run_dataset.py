@@ -1,17 +1,20 @@
 """Find the dataset of a run, and hold the run's scenes against it."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from harness.core.errors import UserError, printable
+from harness.dataset import select
 from harness.dataset.load import Dataset, find, load
+from harness.dataset.select import Choice
 from harness.dataset.verify import read_manifest
 from harness.runs.folder import Run
 from harness.runs.records import (
     FrozenScenes,
 )
 
+OTHER_EPISODES = "episodes.csv has other episodes than run.json says that were selected"
 DEEPEST = 8  # folders of a dataset's stated path that are looked for above a run
 
 
@@ -43,6 +46,36 @@ def dataset_of(run: Run, given: Path | None = None) -> Dataset:
         f"at {printable(scenes.path)}, seen from here or from a folder above the run, nor known by "
         f"its name; {repair}"
     )
+
+
+def choice_of(run: Run, numbers: Sequence[int], dataset: Dataset | None) -> Choice | None:
+    """Return what chose a run's episodes, by what it states, out of `numbers`; None for all.
+
+    `dataset` is the run's, None if it was driven. Where the extension that chooses is gone, the
+    episodes are those that the run has.
+    """
+    record = run.manifest.world.selection
+    if select.lacking(record):
+        pool = tuple(layout.episode for layout in run.layouts) or run.grid.episodes
+        return Choice(run.grid.episodes, pool, record)
+    selection = select.recorded(record)
+    return selection.choice(numbers, dataset) if selection else None
+
+
+def episodes_of(run: Run, given: Path | None = None) -> Dataset:
+    """Return the episodes of a run on frozen (recorded) scenes, as a part of its dataset.
+
+    `given` is the folder of the dataset; None finds it. Raises UserError as `dataset_of` does, or
+    if the episodes are not those that are selected as the run states: then nobody knows by what
+    they were chosen.
+    """
+    dataset, world = dataset_of(run, given), run.manifest.world
+    assert isinstance(world, FrozenScenes)
+    choice = choice_of(run, dataset.episodes, dataset)
+    numbers = choice.numbers if choice else dataset.episodes
+    if run.grid.episodes != tuple(numbers[: world.limit]):
+        raise UserError(f"{printable(run.path)}: {OTHER_EPISODES}; make the run again")
+    return dataset.of_episodes(run.grid.episodes)
 
 
 def _datasets(run: Run, scenes: FrozenScenes) -> Iterator[Path]:

@@ -9,6 +9,7 @@ from runpy import run_path
 
 import numpy as np
 import pytest
+from run_on_disk import digested, restated
 from studied import Once
 
 from harness.coordination.named_points import named_point
@@ -242,3 +243,9 @@ def test_layouts_that_are_not_chosen_by_chance_promise_nothing(
     code, _, error = harness("study", "promise", "report/run", "--tune", "chosen", *more)
     assert code == 2
     assert ("--write: a file promises of all layouts" in error) == ("sample" not in choice)
+    record = json.loads(Path("chosen/run.json").read_text())
+    world = {**record["world"], "selection": {}}  # though they are chosen
+    Path("chosen/run.json").write_text(json.dumps(restated(record, {"world": world})))
+    digested(Path("chosen"))
+    code, _, error = harness("study", "promise", "report/run", "--tune", "chosen", *more)
+    assert "chosen: episodes.csv has other episodes than run.json says that were selected" in error

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import to_builtins
 from msgspec.structs import replace
+from run_on_disk import digested, restated
 
 from harness.core import resources
 from harness.core.errors import UserError
@@ -175,3 +177,25 @@ def test_a_file_may_select_in_both_worlds(tmp_path: Path) -> None:
         match=r"sample-seed stands in a table; write sample_seed below a line \[world\] instead$",
     ):
         read(file, FrozenSettings, {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "selection", [{"only": "1:3"}, {"sample": 2, "sample_seed": 1}, {"danger": "left"}]
+)
+def test_nothing_is_learnt_from_a_run_whose_episodes_are_others_than_it_states(
+    selection: dict[str, Any], proxy_run: Path, small_path: Path, harness: Typed, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(proxy_run, tmp_path / "run"))
+    record = json.loads((run / "run.json").read_text())
+    world = {**record["world"], "selection": selection}
+    (run / "run.json").write_text(json.dumps(restated(record, {"world": world})))
+    digested(run)
+    said = "run: episodes.csv has other episodes than run.json says that were selected; make"
+    for typed in (
+        "study sweep run --over tau --condition 6g",
+        f"model calibrate run --dataset {small_path} --out c.toml",
+        f"run export run --sft sft.jsonl --dataset {small_path}",
+    ):
+        code, _, error = harness(*typed.split())
+        assert (code, error.count("\n"), said in error) == (2, 1, True), error
