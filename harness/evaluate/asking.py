@@ -145,6 +145,7 @@ class Asker:
         self._progress, self._more = progress, more
         self._of_rules = not any(agent.can.language_model for agent in spec.agents)
         self._given, self.served = frozenset(answers or {}), list[Served]()
+        self._asked = list[str]()  # ids of questions that were asked here and had no answer given
         recalled = {**(sent or {}), **self._recalled()}
         agents, actions = spec.agents, spec.actions
         refuse_other_kept(SENT, (sent or {}).values(), agents, actions)
@@ -170,6 +171,7 @@ class Asker:
         kept = [request for request in requests if request.id in self._unasked]
         for request in kept:
             self._check_kept(request)
+            self._asked.append(request.id)
         self._check_rules(kept)
         missing = [request for request in requests if request.id not in self.answers]
         if len(missing) < len(requests):
@@ -200,8 +202,9 @@ class Asker:
                         self._keep_servers(served(backend))
                         self._take(answers.values(), single=window(backend) > 0)
         finally:
-            there = (request.id for request in missing if request.id in new_answers)
+            there = [request.id for request in missing if request.id in new_answers]
             self.answers |= {name: new_answers[name] for name in there}
+            self._asked += there
         tally = Tally(new_answers.values())
         if not all(map(is_helper, tally.missing)):
             raise Unanswered(str(tally))
@@ -256,13 +259,12 @@ class Asker:
         """
         return {name: answer for name, answer in self.answers.items() if self._has(name)}
 
-    def new_answers(self) -> dict[str, Answer]:
-        """Return the answers by request id to questions that were asked here and had none given.
+    def new_answers(self, after: int = 0) -> list[Answer]:
+        """Return the answers to questions that were asked here and had none given, in that order.
 
-        Those that were kept from earlier are among them.
+        Those that were kept from earlier are among them; the first `after` are left out.
         """
-        names = self.answers.keys() - self._given - self._unasked
-        return {name: self.answers[name] for name in names}
+        return [self.answers[name] for name in self._asked[after:]]
 
     def settle(self) -> None:
         """Raise Unanswered if too many questions that were asked here got no answer.

@@ -131,7 +131,8 @@ class ReplayedRun:
         self._asks, self._models = asks, models
         self._progress = progress
         self.left_out: set[str] = set()
-        self._kept_gaps = defaultdict[str, set[str]](set)
+        # what results lack, ids by kind, and of how many new answers that was found
+        self._gaps, self._answers_before = defaultdict[str, set[str]](set), 0
         self._announced, self._left = False, 0  # questions that are asked next
         self._opened: dict[int, Backend] = {}
         # a lost message is a part of the run; what it lacks is asked again
@@ -330,20 +331,27 @@ class ReplayedRun:
         They are decision points without an answer, whose episodes were left out, and by role the
         questions that the run did not ask, and those of them that got no answer.
         """
-        gaps = defaultdict[str, set[str]](set, {LEFT_OUT: set(self.left_out)})
-        for kind, ids in self._kept_gaps.items():
-            gaps[kind] |= ids
-        for name, answer in self._asker.new_answers().items():
-            gaps[f"{ASKED} {answer.role}"].add(name)
+        self.new_gaps()
+        return dict(self._gaps)
+
+    def new_gaps(self) -> dict[str, list[str]]:
+        """Return what results lack that was not returned yet, ids by kind, as `gaps` has them."""
+        new = defaultdict[str, list[str]](list)
+        new[LEFT_OUT] = sorted(self.left_out - self._gaps[LEFT_OUT])
+        answers = self._asker.new_answers(self._answers_before)
+        self._answers_before += len(answers)
+        for answer in answers:
+            new[f"{ASKED} {answer.role}"].append(answer.id)
             if answer.error is not None:
-                gaps[f"{LOST} {answer.role}"].add(name)
-        return dict(gaps)
+                new[f"{LOST} {answer.role}"].append(answer.id)
+        self.recall_gaps(new)
+        return dict(new)
 
     def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
         """Take over what kept results lack, ids by kind, as `gaps` has them."""
         self.left_out.update(gaps[LEFT_OUT])
         for kind, ids in gaps.items():
-            self._kept_gaps[kind] |= set(ids)
+            self._gaps[kind].update(ids)
 
     def settle(self) -> None:
         """Raise Unanswered if results are invalid, as too many requests made here got no answer."""

@@ -272,8 +272,8 @@ def refuse_other(out: Path, kind: str, manifest: Mapping[str, Any]) -> None:
 class GapRecord(Protocol):
     """Describe what knows of gaps in results, such as episodes left out, as ids by kind."""
 
-    def gaps(self) -> Mapping[str, Collection[str]]:
-        """Return the ids of what results lack so far, by kind."""
+    def new_gaps(self) -> Mapping[str, Collection[str]]:
+        """Return the ids of what results lack, by kind, that were not returned before."""
         ...
 
     def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
@@ -299,7 +299,7 @@ class Cells:
         without gaps, as older versions wrote them, if the `source` knows of some.
         """
         self._path, self._of, self._computed = path, depends_on, computed
-        self._source, self._gaps = source, set[tuple[str, str]]()
+        self._source = source
         data = bytes_of(path, "rows") if is_there(path) else b""
         self._torn = bool(data) and not data.endswith(b"\n")
         self._cells = dict(self._read(data))
@@ -312,7 +312,6 @@ class Cells:
                     part = {k: _array(v) for k, v in kept["cell"].items()}
                     if self._source:
                         self._source.recall_gaps(kept["gaps"])
-                        self._new_gaps(kept["gaps"])
                     yield tuple(kept["key"]), part
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 continue
@@ -323,14 +322,6 @@ class Cells:
 
     def _seal(self, kept: Mapping[str, Any]) -> str | None:
         return seal({"cell": json.dumps(kept, default=np.ndarray.tolist).encode()}, "a study")
-
-    def _new_gaps(self, gaps: Mapping[str, Collection[str]]) -> dict[str, list[str]]:
-        """Return the gaps that no part in the file has, and take them as being there."""
-        new = {}
-        for kind, ids in gaps.items():
-            new[kind] = sorted(name for name in ids if (kind, name) not in self._gaps)
-            self._gaps |= {(kind, name) for name in new[kind]}
-        return new
 
     def __contains__(self, key: Sequence[Any]) -> bool:
         return tuple(key) in self._cells
@@ -350,7 +341,7 @@ class Cells:
         values = compute()
         kept: dict[str, Any] = {"of": self._of, "key": key, "cell": values}
         if self._source:
-            kept["gaps"] = self._new_gaps(self._source.gaps())
+            kept["gaps"] = self._source.new_gaps()
         if self._computed:
             kept["seal"] = self._seal(kept)
         line = json.dumps(kept, default=np.ndarray.tolist)

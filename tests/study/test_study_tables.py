@@ -126,10 +126,11 @@ class Watched:
     """A source that has come upon some gaps."""
 
     def __init__(self, *names: str) -> None:
-        self.names = set(names)
+        self.names, self.new = set(names), set(names)
 
-    def gaps(self) -> Mapping[str, Collection[str]]:
-        return {"left-out": self.names}
+    def new_gaps(self) -> Mapping[str, Collection[str]]:
+        new, self.new = sorted(self.new), set()
+        return {"left-out": new}
 
     def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
         self.names |= set(gaps["left-out"])
@@ -139,7 +140,7 @@ def test_gaps_are_kept_with_the_part_that_came_upon_them_and_recalled(tmp_path: 
     path, first = tmp_path / "cells.jsonl", Watched("a")
     cells = Cells(path, "this", source=first)
     cells.part(("one",), dict)
-    first.names.add("b")
+    first.new.add("b")
     cells.part(("two",), dict)
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [line["gaps"] for line in lines] == [{"left-out": ["a"]}, {"left-out": ["b"]}]
