@@ -148,7 +148,7 @@ def under(point: OperatingPoint, rule: str, attack: str, share: float) -> Operat
     `linear:weight_cap=0.3`. Each attack of `attack`, joined by `+`, gets the share, 0 to 1. Raises
     UserError for another setting of a rule.
     """
-    text = "+".join(f"{part}:share={share:.10g}" for part in attack.split("+") if part)
+    text = "+".join(f"{part}:share={share!r}" for part in attack.split("+") if part)
     consensus, *settings = rule.split(":")
     pairs = dict(setting.partition("=")[::2] for setting in settings)
     if pairs.keys() - {"weight_cap"}:
@@ -498,11 +498,10 @@ def run_bench(
     # helpers open rounds, what liars say changes who is heard
     tells = point.stream is None and point.elsewhere is None and not point.radio.helper_rounds
     if run.asks and tells:
-        typed_share = float(f"{shares[0]:.10g}")  # as conditions name it
         progress.more(len(every_rule) + len(of_model))
         for rule in (*every_rule, *of_model):
             honest = under(point, rule, PEACE, 0.0)
-            find = partial(_found_lies, run, honest, typed_share, seeds)
+            find = partial(_found_lies, run, honest, shares[0], seeds)
             values = kept.part((rule, "worst", shares[0]), find)
             if values:
                 lies[rule] = StrongestLies.of(values)

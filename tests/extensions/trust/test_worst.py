@@ -22,6 +22,8 @@ from harness.extensions.trust.attackers import attackers_among
 from harness.extensions.trust.strongest_lies import StrongestLies, space_of, strongest_lies
 from harness.extensions.trust.study import CAPPED, PEACE, Bench, run_bench, trust_study, under
 from harness.extensions.trust.worst_page import strongest
+from harness.runs.headline import SUCCESS
+from harness.studies.axes import Setting
 from harness.studies.replayed_run import ReplayedRun
 from harness.studies.sweep import point_of
 
@@ -280,6 +282,9 @@ def test_a_share_that_rounds_has_as_many_liars_as_the_attacks(
     case = bench.strongest_lies["linear"]
     for attack in bench.attacks:
         assert np.all(case.success[lies.WORDS] <= bench.at("linear", attack, 5 / 6).success)
+    typed = point_of([stored], "6g:attack=brake:share=5/6")
+    [[walked]] = stored.walked([Setting("typed", typed, stored.vehicles)], (0,))
+    assert np.array_equal(walked.ends[SUCCESS], bench.at("linear", "brake", 5 / 6).success)
 
 
 def test_a_share_of_nobody_is_one_line(stored: ReplayedRun, tmp_path: Path) -> None:
