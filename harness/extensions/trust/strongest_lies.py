@@ -86,6 +86,15 @@ def space_of(attack: str) -> str:
     return PLACES if any(isinstance(each, (Spoof, Jump)) for each in attacks) else WORDS
 
 
+def why_not_searched(point: OperatingPoint) -> str:
+    """Return why no strongest lie is looked for under a condition, in words; empty if it is."""
+    if point.stream is not None:
+        return "messages come unasked"
+    if point.elsewhere is not None:
+        return "messages come from other scenes"
+    return "what helpers say decides who is heard" if point.radio.helper_rounds else ""
+
+
 def strongest_lies(
     run: ReplayedRun, point: OperatingPoint, share: float, seeds: Sequence[int]
 ) -> StrongestLies | None:

@@ -32,7 +32,11 @@ from harness.dataset.load import Scene
 from harness.evaluate.spec import files_of
 from harness.evaluate.walk import Decided
 from harness.extensions.trust.attacks import count_of_attackers
-from harness.extensions.trust.strongest_lies import StrongestLies, strongest_lies
+from harness.extensions.trust.strongest_lies import (
+    StrongestLies,
+    strongest_lies,
+    why_not_searched,
+)
 from harness.extensions.trust.worst_page import (
     worst_headline,
     worst_mapping,
@@ -494,10 +498,8 @@ def run_bench(
         cells[key] = Cell(**kept.part(key, partial(compute, key)))
         progress(1)
     lies = dict[str, StrongestLies]()
-    # what is sent unasked, or comes from other scenes, is no lie that is looked for; and where
-    # helpers open rounds, what liars say changes who is heard
-    tells = point.stream is None and point.elsewhere is None and not point.radio.helper_rounds
-    if run.asks and tells:
+    not_searched = why_not_searched(point) if run.asks else "the model is not asked"
+    if not not_searched:
         progress.more(len(every_rule) + len(of_model))
         for rule in (*every_rule, *of_model):
             honest = under(point, rule, PEACE, 0.0)
@@ -511,6 +513,9 @@ def run_bench(
         [Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds
     )
     run.settle()
+    caveats = [*run.caveats]
+    if not_searched:
+        caveats.append(f"No strongest lie is looked for: {not_searched}.")
     return Bench(
         run.name,
         run.run.source,
@@ -519,7 +524,7 @@ def run_bench(
         cells,
         alone.ends[SUCCESS],
         Success(run.dataset.dangerous, run.dataset.clusters),
-        run.caveats,
+        tuple(caveats),
         unfused,
         lies,
         int(count_of_attackers(shares[0], helpers)),

@@ -222,14 +222,18 @@ def test_of_messages_from_other_scenes_no_strongest_lie_is_said(
 ) -> None:
     pytest.importorskip("harness.extensions.controls")
     options = ("6g:messages=shuffled", ("linear",), ("silent",), (THIRD,), (0,), tmp_path)
-    assert not run_bench(stored, *options, Watched()).strongest_lies
+    played = run_bench(stored, *options, Watched())
+    assert not played.strongest_lies
+    assert "looked for: messages come from other scenes." in played.caveats[-1]
 
 
 def test_where_what_liars_say_decides_who_is_heard_no_strongest_lie_is_said(
     stored: ReplayedRun, tmp_path: Path
 ) -> None:
     options = ("6g:helper_rounds=true", ("linear",), ("brake",), (THIRD,), (0,), tmp_path)
-    assert not run_bench(stored, *options, Watched()).strongest_lies
+    played = run_bench(stored, *options, Watched())
+    assert not played.strongest_lies
+    assert "looked for: what helpers say decides who is heard." in played.caveats[-1]
 
 
 def test_an_attack_that_was_played_is_one_of_the_lies() -> None:
