@@ -285,6 +285,18 @@ def test_shards_that_are_forged_alike_are_refused_in_one_line_and_nothing_is_mad
         (part / file).write_bytes(own)
 
 
+@pytest.mark.parametrize(
+    "place", [".work", ".work/sources", ".work/sources/prompts", ".work/episodes-000002-000003"]
+)
+def test_no_link_in_a_shard_is_followed(
+    place: str, split: Path, harness: Typed, tmp_path: Path
+) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    (shards[1] / place).rename(tmp_path / "secret")
+    (shards[1] / place).symlink_to(tmp_path / "secret")
+    assert f"/2/{place} is a link, which no command makes; delete it" in refused(harness, shards)
+
+
 def test_who_is_still_writing_is_waited_for(split: Path, harness: Typed, tmp_path: Path) -> None:
     shards = copied(split, tmp_path, "1", "2", "3")
     with alone(shards[0] / ".work/lock"):

@@ -182,18 +182,12 @@ def _edit(file: Path) -> None:
     file.write_text(file.read_text() + "more")
 
 
-def _link(file: Path) -> None:
-    shutil.copy(file, "elsewhere.j2")
-    file.unlink()
-    file.symlink_to(Path("elsewhere.j2").resolve())
-
-
 def _pipe(file: Path) -> None:
     file.unlink()
     os.mkfifo(file)
 
 
-@pytest.mark.parametrize("spoil", [_edit, _link, _pipe, Path.unlink])
+@pytest.mark.parametrize("spoil", [_edit, _pipe, Path.unlink])
 def test_a_kept_prompt_that_is_not_what_the_run_states_is_not_used(
     spoil: Callable[[Path], None], project: Path
 ) -> None:
@@ -202,6 +196,23 @@ def test_a_kept_prompt_that_is_not_what_the_run_states_is_not_used(
     assert prompt_of(run, run.manifest.prompt) is not None
     spoil(run.path / "sources/prompts/mine/ego.j2")
     assert prompt_of(run, run.manifest.prompt) is None
+
+
+@pytest.mark.parametrize("place", ["sources", "sources/prompts", "sources/prompts/mine/ego.j2"])
+def test_no_link_among_a_runs_sources_is_followed(
+    place: str, project: Path, harness: Typed
+) -> None:
+    run, secret = read(project / "reports/run"), project / "secret"
+    shutil.rmtree("prompts")
+    link = run.path / place
+    link.rename(secret)
+    link.symlink_to(secret)
+    for typed in (("report", run.path), ("run", "check", run.path)):
+        code, out, err = harness(*typed)
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert f"{place} is a link, which no command makes; delete it" in err
+    with pytest.raises(UserError, match="is a link"):
+        prompt_of(run, run.manifest.prompt)
 
 
 @pytest.mark.parametrize("version", ["../mine", "..", "", "\0", "mine/../mine", "/etc"])

@@ -278,6 +278,17 @@ def folder_in(run: Path, name: str) -> Path:
     return folder
 
 
+def refuse_links(path: Path) -> None:
+    """Raise UserError, which names it, if `path` is a link, or a folder with one in it or below.
+
+    It guards what is read or copied from a folder that somebody else may have made: a link leads
+    anywhere, to any file of whoever reads it.
+    """
+    for place in (path, *path.rglob("*")):
+        if place.is_symlink():
+            raise UserError(f"{printable(place)} is a link, which no command makes; delete it")
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Enter a context that yields a temporary file to write, which then replaces `path`.

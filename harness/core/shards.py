@@ -18,7 +18,7 @@ import msgspec
 from harness.core import work
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
-from harness.core.files import bytes_of, text_of
+from harness.core.files import bytes_of, refuse_links, text_of
 from harness.core.formats import CONFIG, WORK
 from harness.core.seals import write_seal
 from harness.core.zips import BROKEN_ZIP
@@ -146,6 +146,7 @@ def made_whole(folders: Sequence[Path], out: Path) -> Iterator[None]:
 
 def _read(folder: Path, kind: type[Start]) -> Start:
     file = folder / WORK / CONFIG
+    refuse_links(folder / WORK)
     try:
         config = msgspec.json.decode(text_of(file, "record"), type=kind)
     except (OSError, ValueError, RecursionError):

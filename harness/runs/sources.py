@@ -13,7 +13,7 @@ from typing import Any
 
 from harness.core import resources
 from harness.core.errors import UserError, printable
-from harness.core.files import bytes_of, sha256_bytes, sha256_file
+from harness.core.files import bytes_of, refuse_links, sha256_bytes, sha256_file
 from harness.core.formats import SOURCES
 from harness.prompts import versions
 from harness.prompts.versions import Prompt
@@ -44,27 +44,26 @@ def write(out: Path, files: Mapping[str, bytes], work: Path) -> None:
 def read(out: Path) -> dict[str, bytes]:
     """Return the files that a run was made of, as its folder keeps them in `sources`.
 
-    They are prompts, models' descriptions and the like: content by path. Links are left out.
+    They are prompts, models' descriptions and the like: content by path. Raises UserError for a
+    link, which could lead to any file of whoever reads a stranger's run.
     """
     kept = out / SOURCES
-    files = sorted(path for path in kept.rglob("*") if path.is_file() and not path.is_symlink())
+    refuse_links(kept)
+    files = sorted(path for path in kept.rglob("*") if path.is_file())
     return {file.relative_to(kept).as_posix(): bytes_of(file, "text") for file in files}
 
 
 def prompt_of(run: Run, prompt_record: Mapping[str, Any]) -> Prompt | None:
     """Return a prompt version with the digest that a run states: the installed one or its own copy.
 
-    `prompt_record` has the keys `version` and `sha256`. None if neither has this digest.
+    `prompt_record` has the keys `version` and `sha256`. None if neither has this digest. Raises
+    UserError for a link in the folder of its own copies.
     """
     version, sha256 = prompt_record["version"], prompt_record["sha256"]
     if prompt := versions.as_it_was(version, sha256):
         return prompt
-    kept = run.path / SOURCES / PROMPTS
-    here = os.path.join(os.path.realpath(run.path), SOURCES, PROMPTS)
-    files = [path for folder in kept.glob("*") for path in (folder, *folder.glob("*"))]
-    if any(os.path.realpath(path) != os.path.join(here, path.relative_to(kept)) for path in files):
-        return None  # a link, which no command makes
-    return versions.as_it_was(version, sha256, kept)
+    refuse_links(run.path / SOURCES)
+    return versions.as_it_was(version, sha256, run.path / SOURCES / PROMPTS)
 
 
 def other_files(run: Run) -> dict[tuple[str, str], Path]:
