@@ -297,6 +297,16 @@ def test_no_link_in_a_shard_is_followed(
     assert f"/2/{place} is a link, which no command makes; delete it" in refused(harness, shards)
 
 
+def test_a_shard_with_another_text_of_its_prompt_is_named(
+    split: Path, harness: Typed, tmp_path: Path
+) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    [file] = (shards[1] / ".work/sources/prompts").glob("*/ego.j2")
+    file.write_text(file.read_text() + " Always go.")
+    said = f"/2: sources/prompts/{file.parent.name} has another digest than prompt "
+    assert said in refused(harness, shards)
+
+
 def test_who_is_still_writing_is_waited_for(split: Path, harness: Typed, tmp_path: Path) -> None:
     shards = copied(split, tmp_path, "1", "2", "3")
     with alone(shards[0] / ".work/lock"):

@@ -215,6 +215,14 @@ def test_no_link_among_a_runs_sources_is_followed(
         prompt_of(run, run.manifest.prompt)
 
 
+def test_a_kept_prompt_with_another_text_is_named(project: Path, harness: Typed) -> None:
+    _edit(Path("reports/run/sources/prompts/mine/ego.j2"))
+    code, out, _ = harness("run", "check", "reports/run")
+    assert code == 1
+    said = "sources/prompts/mine has another digest than prompt mine in run.json"
+    assert said in " ".join(out.split())
+
+
 @pytest.mark.parametrize("version", ["../mine", "..", "", "\0", "mine/../mine", "/etc"])
 def test_a_run_can_name_no_prompt_outside_its_folder(version: str, project: Path) -> None:
     run = read(project / "reports/run")

@@ -224,6 +224,7 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
     tags = tuple(dict.fromkeys(tag for each in run_starts for tag in each.tags))
     created = min(each.created for each in run_starts)
     whole = msgspec.structs.replace(run_starts[0], shard="", tags=tags, created=created)
+    made_of = _sources_of(folders, whole.settings)
     if (out / "run.json").exists() and (out / WORK).is_dir():
         # Anybody may have written what a stopped merge finished, and the shards are here.
         finished_with(whole.settings, out)
@@ -235,7 +236,7 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
     with work.working(out, stopped or whole, "run.json") as place:
         shards.collect(parts, place)
         try:
-            return _gather(out, whole, chunks, place, kept_sources.read(folders[0] / WORK), folders)
+            return _gather(out, whole, chunks, place, made_of, folders)
         except Unanswered as error:
             raise UserError(
                 f"{error}; type the commands of the shards again, and merge then"
@@ -246,6 +247,16 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
                 for _ in run_parts.read_part(part, chunk_by_folder[name], actions):
                     pass
             raise
+
+
+def _sources_of(folders: Sequence[Path], settings: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the sources of a run that is merged from shards, each held to the run's settings."""
+    prompts = [agent["prompt"] for agent in (settings, *settings["helpers"])]
+    of_shards = [kept_sources.read(shard / WORK) for shard in folders]
+    for shard, files in zip(folders, of_shards, strict=True):
+        if sentence := next(kept_sources.otherwise(files, prompts), None):
+            raise UserError(f"{printable(shard)}: {sentence}; make this shard again")
+    return of_shards[0]
 
 
 def _walk_whole(

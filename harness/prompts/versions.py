@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 _compiled = lru_cache(maxsize=64)(Template)  # a process may load a version many times
 FILES = ("ego.j2", "helper.j2", "prompt.toml")
+OPTIONAL = (EXAMPLES, ANSWER)
 NO_WORDS: Mapping[str, str] = MappingProxyType({})
 # Digest of v1, which asks for reasons first and was released before prompt.toml could say so.
 REASONS_FIRST = {"139fe002c5c6d680d758a35b92e1d6c1a1db69481a4b3a76336829cfceae8df8": ROLES}
@@ -356,7 +357,7 @@ def load(version: str, where: Path | None = None) -> Prompt:
             f"prompt {printable(version)} has a name of more than plain signs; rename its folder"
         )
     base = _base(version, where)
-    optional = [name for name in (EXAMPLES, ANSWER) if os.path.lexists(base / version / name)]
+    optional = [name for name in OPTIONAL if os.path.lexists(base / version / name)]
     texts = {name: _text(base / version / name) for name in (*FILES, *optional)}
     released = _released(base)
     if version in released and released[version] != digest(texts):

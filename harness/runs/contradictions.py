@@ -15,7 +15,7 @@ from harness.core.figures import amount
 from harness.core.formats import SUITE
 from harness.core.versions import FIGURES
 from harness.dataset.suites import PREFIX, named
-from harness.runs import digests, pinned
+from harness.runs import digests, pinned, sources
 from harness.runs.difficulty import adjusted_scores
 from harness.runs.folder import Run, read
 from harness.runs.headline import BALANCED, PAIRED
@@ -24,7 +24,6 @@ from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.metrics import METRICS
 from harness.runs.records import Episode, FrozenScenes, Score
 from harness.runs.reliability import SAME
-from harness.runs.sources import other_files
 from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
 
@@ -104,6 +103,8 @@ def contradictions(run: Run) -> Iterator[str]:
         yield f"answers.jsonl has {delay}"
     yield from _of_scores(run, _scores(run))
     yield from digests.otherwise(run)
+    agents = (run.manifest.agent(0), *run.manifest.helpers)
+    yield from sources.otherwise(sources.read(run.path), [agent["prompt"] for agent in agents])
 
 
 def of_suite(suite: SuiteRun) -> Iterator[str]:
@@ -292,7 +293,7 @@ def _of_conditions(run: Run) -> Iterator[str]:
 
     What a name says by a file follows from the run's own, so one that is another here says nothing.
     """
-    others = other_files(run)
+    others = sources.other_files(run)
     for condition in run.manifest.conditions:
         name = printable(str(condition["name"]))
         if any(condition.get(folder.removesuffix("s")) == file for folder, file in others):

@@ -7,7 +7,7 @@ checked.
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, refuse_links, sha256_bytes, sha256_file
 from harness.core.formats import SOURCES
 from harness.prompts import versions
-from harness.prompts.versions import Prompt
+from harness.prompts.versions import FILES, OPTIONAL, Prompt
 from harness.runs.folder import Run
 
 PROMPTS = "prompts"
@@ -64,6 +64,26 @@ def prompt_of(run: Run, prompt_record: Mapping[str, Any]) -> Prompt | None:
         return prompt
     refuse_links(run.path / SOURCES)
     return versions.as_it_was(version, sha256, run.path / SOURCES / PROMPTS)
+
+
+def otherwise(
+    files: Mapping[str, bytes], prompt_records: Iterable[Mapping[str, Any]]
+) -> Iterator[str]:
+    """Yield a sentence for each prompt that a run keeps with another digest than it states.
+
+    `files` are those of its folder `sources`, by path, and `prompt_records` have the keys `version`
+    and `sha256`. A run may keep none.
+    """
+    pairs = [(each["version"], each["sha256"]) for each in prompt_records]
+    for version, sha256 in dict.fromkeys(pairs):
+        folder = f"{PROMPTS}/{version}"
+        names = [name for name in (*FILES, *OPTIONAL) if f"{folder}/{name}" in files]
+        texts = {name: files[f"{folder}/{name}"].decode(errors="replace") for name in names}
+        if texts and versions.digest(texts) != sha256:
+            yield (
+                f"{SOURCES}/{printable(folder, 60)} has another digest than prompt "
+                f"{printable(version, 40)} in run.json"
+            )
 
 
 def other_files(run: Run) -> dict[tuple[str, str], Path]:
