@@ -402,6 +402,28 @@ def test_what_a_study_asks_of_a_runs_model_is_kept_but_for_errors(
     assert set(play.bodies) == refused(refuses, before)
 
 
+@pytest.mark.slow
+def test_a_study_says_what_its_run_lost_and_can_be_repeated(
+    ask: Typed, harness: Typed, play: Play, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play.again(first_of(of_helper, 40))
+    assert ask("eval", *EVAL, "--out", "run")[0] == 0
+    play.again(one_of(of_helper, 50))
+    study = ("study", "attribute", "run", "--sample", "20", "--verbose")
+    code, out, _ = harness(*study)
+    assert code == 0
+    plain = " ".join(out.split())
+    assert "no answer to 1 of 33 questions to helpers: each counts as a lost message" in plain
+    lost = re.search(r"no answer here either to (\d+) of (\d+) questions to helpers", plain)
+    assert lost
+    # What was lost is all that is left to ask, so that nothing at all is answered.
+    monkeypatch.setattr("harness.evaluate.asking.FIRST", 2)
+    monkeypatch.setattr("harness.evaluate.asking.IN_A_ROW", 3)
+    play.again(play.refuses)
+    assert harness(*study)[:2] == (0, out)
+    assert len(play.bodies) == int(lost[1]) > 3
+
+
 # -- runs of older versions, which hold errors of the ego ------------------------------------------
 
 

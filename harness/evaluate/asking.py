@@ -114,7 +114,8 @@ class Asker:
         spec: the evaluation: models with their prompts, scenes, conditions and settings.
         answers: answers by request id, in the order of the requests.
         latency: how long the models take to answer.
-        tally: how many questions that were asked here got an answer, and how many an error.
+        tally: how many of the questions asked here got an answer, an earlier one that was kept
+            among them, and how many an error.
         served: which server gave each answer that is not kept in a file.
     """
 
@@ -162,7 +163,7 @@ class Asker:
         They are written to a file in chunks, some requests each. Raises Unanswered if a question of
         the ego or a fusion call (the ego asked again, with messages) got no answer, once all others
         of these were asked; or if none of the first questions was answered, or none of the last
-        `IN_A_ROW`.
+        `IN_A_ROW` and too few of all.
         """
         if self._kept:  # another process may have asked, too
             recalled = self._recalled(cut=True)
@@ -173,6 +174,8 @@ class Asker:
             self._check_kept(request)
             self._asked.append(request.id)
         self._check_rules(kept)
+        # Else what was lost before, which is asked again, would be all that counts.
+        self.tally.add(self.answers[request.id] for request in kept)
         missing = [request for request in requests if request.id not in self.answers]
         if len(missing) < len(requests):
             self._progress(len(requests) - len(missing))
@@ -269,7 +272,7 @@ class Asker:
     def settle(self) -> None:
         """Raise Unanswered if too many questions that were asked here got no answer.
 
-        Results would be invalid then.
+        Results would be invalid then. Questions whose answers were kept before count, too.
         """
         if self.tally.missing:
             raise Unanswered(str(self.tally))
@@ -286,7 +289,8 @@ class Asker:
         refused_so_far = self._refused_so_far()
         self.tally.add(answers)
         self._in_a_row = 0 if answered else self._in_a_row + len(answers)
-        if self._in_a_row >= (self._first() if refused_so_far else IN_A_ROW):
+        most = self._first() if refused_so_far else IN_A_ROW
+        if self._in_a_row >= most and self.tally.missing:
             raise Unanswered(str(self.tally))
         self._look_at(answered)
         self._progress(len(answers))

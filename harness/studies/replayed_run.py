@@ -43,7 +43,7 @@ from harness.evaluate.requests import EGO, wanted_in
 from harness.evaluate.spec import Spec
 from harness.evaluate.texts import refuse_others
 from harness.evaluate.walk import Fuses
-from harness.report.caveats import stated_elsewhere
+from harness.report.caveats import lost_messages, stated_elsewhere
 from harness.runs.contradictions import sound
 from harness.runs.records import Answer
 from harness.runs.run_dataset import episodes_of
@@ -306,15 +306,18 @@ class ReplayedRun:
     @property
     def caveats(self) -> tuple[str, ...]:
         """Return warnings on the results: whose answers they are of, if another program wrote them,
-        requests without an answer, and episodes left out.
+        requests of the run and of the study without an answer, and episodes left out.
         """
         counts, name, n = self._tally().counts(), printable(self.name), len(self.left_out)
-        lost = f"{name}: no answer to {counts}; left out, as lost messages are" if counts else ""
+        of_run = [f"{name}: {sentence}" for sentence in lost_messages(self.run)]
+        here = "no answer here either" if of_run else "no answer"
+        lost = f"{name}: {here} to {counts}; left out, as lost messages are" if counts else ""
         left_out = (
             f"{name}: left out episodes that reach one of {n} decision points without a stored "
             "answer; without --no-model the model is asked there"
         )
-        return tuple(filter(None, (*stated_elsewhere(self.run), lost, left_out if n else "")))
+        caveats = (*stated_elsewhere(self.run), *of_run, lost, left_out if n else "")
+        return tuple(filter(None, caveats))
 
     def _tally(self) -> Tally:
         """Count the questions that the run did not ask, and those of them without an answer."""
@@ -331,21 +334,27 @@ class ReplayedRun:
         They are decision points without an answer, whose episodes were left out, and by role the
         questions that the run did not ask, and those of them that got no answer.
         """
-        self.new_gaps()
-        return dict(self._gaps)
+        gaps = {kind: set(ids) for kind, ids in self._gaps.items()}
+        for kind, ids in self._others().items():
+            gaps.setdefault(kind, set()).update(ids)
+        return gaps
 
     def new_gaps(self) -> dict[str, list[str]]:
-        """Return what results lack that was not returned yet, ids by kind, as `gaps` has them."""
-        new = defaultdict[str, list[str]](list)
-        new[LEFT_OUT] = sorted(self.left_out - self._gaps[LEFT_OUT])
-        answers = self._asker.new_answers(self._answers_before)
-        self._answers_before += len(answers)
-        for answer in answers:
-            new[f"{ASKED} {answer.role}"].append(answer.id)
-            if answer.error is not None:
-                new[f"{LOST} {answer.role}"].append(answer.id)
+        """Return what results lack that was not returned here yet, ids by kind, as `gaps` does."""
+        new = self._others()
+        self._answers_before += len(self._asker.new_answers(self._answers_before))
         self.recall_gaps(new)
-        return dict(new)
+        return new
+
+    def _others(self) -> dict[str, list[str]]:
+        """Return what results lack that is not among the gaps noted yet, ids by kind."""
+        others = defaultdict[str, list[str]](list)
+        others[LEFT_OUT] = sorted(self.left_out - self._gaps[LEFT_OUT])
+        for answer in self._asker.new_answers(self._answers_before):
+            others[f"{ASKED} {answer.role}"].append(answer.id)
+            if answer.error is not None:
+                others[f"{LOST} {answer.role}"].append(answer.id)
+        return dict(others)
 
     def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
         """Take over what kept results lack, ids by kind, as `gaps` has them."""
@@ -354,7 +363,7 @@ class ReplayedRun:
             self._gaps[kind].update(ids)
 
     def settle(self) -> None:
-        """Raise Unanswered if results are invalid, as too many requests made here got no answer."""
+        """Raise Unanswered if results are invalid: too many requests of the study got no answer."""
         self._asker.settle()
 
     def __call__(self, scenes: Sequence[Scene]) -> Intents:
