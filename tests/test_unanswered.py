@@ -424,6 +424,20 @@ def test_a_study_says_what_its_run_lost_and_can_be_repeated(
     assert len(play.bodies) == int(lost[1]) > 3
 
 
+@pytest.mark.slow
+def test_helpers_that_no_condition_asks_make_no_share_of_lost_messages_smaller(
+    ask: Typed, play: Play, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost = "no answer to 2 of 33 questions to helpers"
+    play.again(one_of(of_helper, 30))
+    for who in ("used", "all"):
+        code, _, err = ask("eval", *EVAL, "--ask", who, "--out", who)
+        assert (code, lost in err) == (3, True), "2 of the 48 that all are asked would be too few"
+    monkeypatch.setattr("harness.runs.unanswered.MOST_LOST", 0.1)
+    code, out, _ = ask("eval", *EVAL, "--ask", "all", "--out", "all")
+    assert (code, lost in " ".join(out.split())) == (0, True)
+
+
 # -- runs of older versions, which hold errors of the ego ------------------------------------------
 
 

@@ -76,7 +76,7 @@ from harness.runs.records import (
 from harness.runs.settings import FILE, of_words, text_of
 from harness.runs.stopping import InterimLooks
 from harness.runs.summary import Figures, counted
-from harness.runs.unanswered import Tally
+from harness.runs.unanswered import Tally, of_use
 from harness.world import scenarios
 
 if TYPE_CHECKING:  # only driving loads the simulator
@@ -195,7 +195,8 @@ def evaluate_shard(
         _drive(spec, run_start, own_chunks, place, progress, None, workers)
         kept_sources.write(place, made_of, place)
         parts = [place / _folder_name(chunk) for chunk in own_chunks]
-        _settle(parts, chain.from_iterable(map(run_parts.facts_of, parts)))
+        facts = chain.from_iterable(map(run_parts.facts_of, parts))
+        _settle(parts, facts, run_start.settings)
     return sum(map(len, own_chunks))
 
 
@@ -489,9 +490,15 @@ def _answered_file(place: Path, chunk: Sequence[int]) -> Path:
     return place / f"{_folder_name(chunk)}.jsonl"
 
 
-def _settle(parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts]) -> None:
+def _settle(
+    parts: Sequence[Path], answers: Iterable[Answer | AnswerFacts], settings: Mapping[str, Any]
+) -> None:
     """Raise Unanswered if a run needs answers that it lacks; its parts lose what lacks them."""
-    tally = Tally(answers)
+    facts = list(answers)
+    if settings["ask"] == "all" and any(fact.error is not None for fact in facts):
+        decisions = (run_parts.decided_in(part, settings["actions"]) for part in parts)
+        facts = list(of_use(facts, decisions))
+    tally = Tally(facts)
     if not tally.missing:
         return
     for part in parts:
@@ -533,7 +540,7 @@ def _walked(
         new = _split(numbers[at[-1] if at else 0 : layouts], most)
         walk_all(new)
         parts = [place / _folder_name(chunk) for chunk in new]
-        _settle(parts, chain.from_iterable(map(run_parts.facts_of, parts)))
+        _settle(parts, chain.from_iterable(map(run_parts.facts_of, parts)), spec.record())
         done, at = [*done, *new], [*at, layouts]
         ended += chain.from_iterable(map(run_parts.ends_of, parts))
         grid = Grid(names, spec.seeds, tuple(numbers[:layouts]))
@@ -674,7 +681,7 @@ def _gather(
     with uncollected():
         whole = Figures.joined(Grid(names, seeds, tuple(chain.from_iterable(chunks))), scored())
         answers = [answer for answer, _ in whole.answers]
-        _settle(parts, answers)
+        _settle(parts, answers, settings)
         summary = whole.scores()
         episodes: list[Episode] = []
         n_cells = len(names) * len(seeds)

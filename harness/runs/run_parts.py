@@ -89,6 +89,14 @@ def read_part(part: Path, layouts: Sequence[int], actions: Sequence[str]) -> Ite
         episodes = tuple(episode for episode in episodes if episode.episode not in numbers)
 
 
+def decided_in(part: Path, actions: Sequence[str]) -> Decisions:
+    """Return the decisions in the folder of a part, some of a run's episodes.
+
+    `actions` are the names of the meta-actions. Raises UserError if a file is broken.
+    """
+    return whole(part, lambda part: _read_tables(part, actions)[0])
+
+
 def facts_of(part: Path) -> list[AnswerFacts]:
     """Return the answers in the folder of a part of a run, without their texts.
 

@@ -5,9 +5,11 @@ what they said, and whether a run can do without them.
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 from harness.core import work
 from harness.core.errors import printable
+from harness.runs.decisions import Decisions
 from harness.runs.folder import Run, read
 from harness.runs.records import Answer, AnswerFacts, Role, is_helper
 
@@ -83,12 +85,38 @@ class Tally:
         )
 
 
+Counted = TypeVar("Counted", bound=Answer | AnswerFacts)
+
+
+def of_use(answers: Iterable[Counted], decisions: Iterable[Decisions]) -> Iterator[Counted]:
+    """Yield answers without those of helpers where no condition asks helpers.
+
+    `--ask all` asks them at every decision point, and no figure depends on what is lost there.
+    `decisions` are all that were made with the answers, some at a time. Where no condition asks at
+    any decision point, all answers are yielded.
+    """
+    scenes = set[str]()
+    for some in decisions:
+        asks = some.flags("triggered")
+        scenes |= {
+            scene for scene, rows in some.scenes.items() if asks[rows.start : rows.stop].any()
+        }
+    for answer in answers:
+        if not scenes or not is_helper(answer.role) or answer.scene in scenes:
+            yield answer
+
+
 def tally(run: Run) -> Tally:
     """Return how many requests of a finished run, by role, got an answer, and how many an error.
 
-    A role is who is asked: `ego`, `helper` or `merge` (the ego after it heard messages).
+    A role is who is asked: `ego`, `helper` or `merge` (the ego after it heard messages). Helpers
+    are left out where no condition asks any (`of_use`).
     """
-    return Tally(run.answers if run.answers.errors else ())
+    if not run.answers.errors:
+        return Tally()
+    if run.manifest.ask == "all":
+        return Tally(of_use(run.answers, run.decisions.pieces()))
+    return Tally(run.answers)
 
 
 def lacking(run: Run) -> Iterator[Answer]:
