@@ -52,7 +52,7 @@ def compared(worse_once: tuple[Path, Path]) -> Comparison:
         ("success_rate.high < 0", []),
         ("success_rate.high < 0.6", ["6g"]),
         ("6g:success_rate.low < -0.9", ["6g"]),
-        ("success_rate.low < -1", []),
+        ("success_rate.low <= -1", ["6g"]),
         # Alike in all episodes: 0 stands for its ends.
         ("latency_proxy_ms.high >= 0", ["single-local", "6g"]),
         ("latency_proxy_ms > 5", []),
@@ -138,12 +138,19 @@ def test_a_condition_with_colons_in_its_name_has_gates_too(
         ("sucess_rate < 0", "'sucess_rate'; did you mean 'success_rate'? known: success_rate, "),
         ("success_rate.middle < 0", "interval in --fail-if 'middle'; known: high, low"),
         ("5g:success_rate < 0", "unknown condition of --fail-if '5g:success_rate < 0' '5g'"),
+        ("6g:success_rate < -5", "'6g:success_rate < -5' passes whatever was run: a difference of "
+            "success_rate is from -1 to 1, where 0.01 is one point; give a number on that scale"),
+        ("success_rate < -1", "passes whatever was run"),
+        ("success_rate.high > 1", "passes whatever was run"),
+        ("success_rate >= -1", "fails whatever was run"),
+        ("late_rate < 10", "fails whatever was run"),
+        ("optimal_brier > 2", "is from -2 to 2; give"),
     ],
 )  # fmt: skip
 def test_a_gate_that_cannot_be_read_is_one_line(
     gate: str, said: str, runs: tuple[Path, Path], harness: Harness
 ) -> None:
-    options = ("--fail-if", "success_rate < -1", "--fail-if", gate, "--html", "page.html")
+    options = ("--fail-if", "success_rate < -0.9", "--fail-if", gate, "--html", "page.html")
     code, out, err = harness("compare", *runs, *options)
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert said in err

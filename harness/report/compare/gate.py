@@ -62,6 +62,7 @@ def gate(
     names: Sequence[str] = (),
     place: str = "CONDITION",
     example: str = "6g:success_rate < -0.01",
+    scale: tuple[float, float] = (-math.inf, math.inf),
 ) -> Gate:
     """Parse the text of a gate and return it.
 
@@ -72,9 +73,12 @@ def gate(
         names: allowed metrics; if empty, those in which runs are compared.
         place: for the error message, what stands before the colon.
         example: for the error message, a valid gate.
+        scale: the least and the greatest value of all of `names`; without those, that of a
+            difference follows from the metric.
 
     Raises:
-        UserError: the text is no gate, or its metric is unknown.
+        UserError: the text is no gate, its metric is unknown, or no value could make it pass or
+            fail.
     """
     match = _GATE.fullmatch(text)
     try:
@@ -86,11 +90,24 @@ def gate(
             f"--fail-if {printable(text)!r} cannot be read; give [{place}:]METRIC[.low|.high] OP "
             f"NUMBER with OP one of {' '.join(OPERATORS)}, such as {example!r}"
         )
-    names = names or [name for name, m in METRICS.items() if m.compared]
-    if match["metric"] not in names:
-        raise unknown("metric of --fail-if", match["metric"], names)
+    compared = [name for name, m in METRICS.items() if m.compared]
+    if match["metric"] not in (names or compared):
+        raise unknown("metric of --fail-if", match["metric"], names or compared)
     if match["end"] not in (None, *ENDS):
         raise unknown(f"end of {match['metric']}'s interval in --fail-if", match["end"], ENDS)
+    what, (least, most) = match["metric"], scale
+    if not names:
+        what, most = f"a difference of {what}", METRICS[what].most
+        least = -most
+    # Each operator holds from a number on, up or down.
+    holds = OPERATORS[match["op"]]
+    if holds(least, number) == holds(most, number):
+        verdict = "fails" if holds(least, number) else "passes"
+        points = ", where 0.01 is one point" if most == 1 else ""
+        raise UserError(
+            f"--fail-if {printable(text)!r} {verdict} whatever was run: {what} is from {least:g} "
+            f"to {most:g}{points}; give a number on that scale, such as {example!r}"
+        )
     condition = match["condition"]
     return Gate(
         text,

@@ -34,6 +34,7 @@ TRIALS = {
             "--twin mirrored --dataset roundabout-entry-v1": "traffic goes round one way",
             "--fail-if 'ids:success_rate < 1'": "known: failed_rate, invariance_rate, tv_distance",
             "--fail-if 'letters:invariance_rate < 1'": "unknown twin of --fail-if",
+            "--fail-if 'mirrored:invariance_rate < 90'": "invariance_rate is from 0 to 1, where 0.01",
             "--fail-if often": "such as 'mirrored:invariance_rate < 0.9'",
             "--sample 0": "--sample 0",
         },

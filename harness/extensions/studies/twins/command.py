@@ -83,7 +83,8 @@ def command(
         if name not in TWINS:
             raise unknown("--twin", name, TWINS)
     example = "mirrored:invariance_rate < 0.9"
-    gates = [gate(typed, scoring.METRICS, "TWIN", example) for typed in fail_if or ()]
+    form = (scoring.METRICS, "TWIN", example, scoring.SCALE)
+    gates = [gate(typed, *form) for typed in fail_if or ()]
     whole = load.load(load.find(dataset), None if sample else limit)
     options.say_all(limit, [whole])
     if limit is None and sample is None:

@@ -14,6 +14,7 @@ from harness.report.compare.gate import OPERATORS, Gate, Verdict
 
 ROLES = ("ego", "helper", "fusion")
 METRICS = ("invariance_rate", "tv_distance", "failed_rate")
+SCALE = (0.0, 1.0)  # their least and greatest value
 ROUNDING = 1e-9
 
 
