@@ -62,20 +62,18 @@ def choice_of(run: Run, numbers: Sequence[int], dataset: Dataset | None) -> Choi
     return selection.choice(numbers, dataset) if selection else None
 
 
-def episodes_of(run: Run, given: Path | None = None) -> Dataset:
-    """Return the episodes of a run on frozen (recorded) scenes, as a part of its dataset.
+def check_episodes(run: Run, dataset: Dataset) -> None:
+    """Raise UserError if a run has other episodes than are selected as it states.
 
-    `given` is the folder of the dataset; None finds it. Raises UserError as `dataset_of` does, or
-    if the episodes are not those that are selected as the run states: then nobody knows by what
-    they were chosen.
+    For a run that something is learnt from: nobody knows by what these were chosen. `dataset` is
+    the run's, or a part of it; the run is one on frozen (recorded) scenes.
     """
-    dataset, world = dataset_of(run, given), run.manifest.world
+    whole, world = dataset.whole, run.manifest.world
     assert isinstance(world, FrozenScenes)
-    choice = choice_of(run, dataset.episodes, dataset)
-    numbers = choice.numbers if choice else dataset.episodes
+    choice = choice_of(run, whole.episodes, whole)
+    numbers = choice.numbers if choice else whole.episodes
     if run.grid.episodes != tuple(numbers[: world.limit]):
         raise UserError(f"{printable(run.path)}: {OTHER_EPISODES}; make the run again")
-    return dataset.of_episodes(run.grid.episodes)
 
 
 def _datasets(run: Run, scenes: FrozenScenes) -> Iterator[Path]:

@@ -46,7 +46,7 @@ from harness.evaluate.walk import Fuses
 from harness.report.caveats import lost_messages, stated_elsewhere
 from harness.runs.contradictions import sound
 from harness.runs.records import Answer
-from harness.runs.run_dataset import episodes_of
+from harness.runs.run_dataset import dataset_of
 from harness.runs.success import Success, alike
 from harness.runs.unanswered import Tally, tally
 from harness.studies.axes import Setting
@@ -123,7 +123,7 @@ class ReplayedRun:
         self.name = str(manifest.variant)
         self.seeds = manifest.seeds
         self.points = points_of(self.run)
-        frozen = episodes_of(self.run, dataset)
+        frozen = dataset_of(self.run, dataset).of_episodes(self.run.grid.episodes)
         self.dataset = replace(frozen, kept=KEPT)
         self.episodes = len(self.dataset.episodes)
         self.clusters = self.dataset.clusters

@@ -28,7 +28,7 @@ from harness.runs.fit import check_answerers, check_seeds, question_of, weights_
 from harness.runs.folder import Run
 from harness.runs.records import FrozenScenes
 from harness.runs.reliability import likelihood_nats
-from harness.runs.run_dataset import check_scenes, episodes_of
+from harness.runs.run_dataset import check_episodes, check_scenes, dataset_of
 
 TEMPERATURES = np.geomspace(COOLEST, HOTTEST, 241)  # that are tried: 2.5 % apart, and 1 among them
 DIGITS = 6  # of a prior
@@ -112,10 +112,11 @@ def calibrate(
         )
     check_answerers(run)
     answerers = manifest.answerers
-    data = episodes_of(run, dataset)
+    data = dataset_of(run, dataset).of_episodes(run.grid.episodes)
     forest = data.forest
     first, last = int(forest.seeds.min()), int(forest.seeds.max())
     check_seeds(name, WHAT, first, last)
+    check_episodes(run, data)
     rebuilt.refuse(data)
     check_scenes(run, data)
     refuse_others(run)

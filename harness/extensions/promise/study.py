@@ -39,7 +39,7 @@ from harness.extensions.promise.promises import (
 from harness.extensions.promise.risk import Order, best, p_values, units_needed
 from harness.runs.alike import different, setup
 from harness.runs.fit import check_answerers, check_seeds, question_of, weights_of
-from harness.runs.run_dataset import check_scenes
+from harness.runs.run_dataset import check_episodes, check_scenes
 from harness.runs.success import Success
 from harness.studies.axes import Setting, described
 from harness.studies.replayed_run import ReplayedRun, counted
@@ -170,6 +170,8 @@ def check(runs: Sequence[ReplayedRun], tune: ReplayedRun) -> None:
     report, *elsewhere = runs
     name = printable(tune.run.path)
     check_answerers(tune.run)
+    for run in (report, tune):
+        check_episodes(run.run, run.dataset)
     check_choice(report, tune)
     check_seeds(f"--tune {name}", WHAT, *seed_range(tune))
     low, high = seed_range(report)

@@ -25,6 +25,7 @@ from harness.core.seeds import Purpose, purposes, seeds_text
 from harness.dataset import rebuilt
 from harness.extensions.schedules.choices import Choices, Choose, choices, refuse_idle
 from harness.extensions.schedules.learnt import INPUTS, Learnt, Network, Stated, Weights, inputs
+from harness.runs.run_dataset import check_episodes
 from harness.studies.replayed_run import ReplayedRun, counted, refuse_twice
 
 UNITS = 12
@@ -52,6 +53,7 @@ def layouts(stored: ReplayedRun, wanted: Purpose, reported: Sequence[ReplayedRun
             f"{printable(stored.run.path)}: {seeds_text(first, count)}; give a run on {wanted} "
             "layouts, which `harness dataset build --seed` makes"
         )
+    check_episodes(stored.run, stored.dataset)
     rebuilt.refuse(stored.dataset, [run.dataset for run in reported])
     return (
         f"{stored.name} on {stored.dataset.name}, {seeds_text(first, count)}, "

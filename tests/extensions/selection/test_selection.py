@@ -193,7 +193,7 @@ def test_nothing_is_learnt_from_a_run_whose_episodes_are_others_than_it_states(
     digested(run)
     said = "run: episodes.csv has other episodes than run.json says that were selected; make"
     for typed in (
-        "study sweep run --over tau --condition 6g",
+        "study promise run --tune run --condition 6g --at-most 50",
         f"model calibrate run --dataset {small_path} --out c.toml",
         f"run export run --sft sft.jsonl --dataset {small_path}",
     ):

@@ -28,7 +28,7 @@ from harness.extensions.learn.training.questions import question
 from harness.prompts import readout
 from harness.runs.folder import Run
 from harness.runs.records import ASKED, Answer, FrozenScenes
-from harness.runs.run_dataset import check_scenes, dataset_of, episodes_of
+from harness.runs.run_dataset import check_episodes, check_scenes, dataset_of
 from harness.runs.sources import prompt_of
 
 ROUNDING = 1e-9  # of probabilities that sum to 1
@@ -62,8 +62,9 @@ def write(
         _check_seeds(what, {episode.layout_seed for episode in run.episodes})
         # What a run says of its layouts is a table that may be edited; its questions are the
         # dataset's.
-        layouts = episodes_of(run, dataset)
+        layouts = dataset_of(run, dataset).of_episodes(run.grid.episodes)
         _check_seeds(what, layouts.seeds)
+        check_episodes(run, layouts)
         rebuilt.refuse(layouts)
     lines = pairs(run, dataset) if margin is None else preferences(run, margin, dataset)
     write_whole(path, msgspec.json.Encoder().encode_lines(lines))
