@@ -354,6 +354,14 @@ def test_a_run_of_no_known_format_is_refused(value: object, run: Path) -> None:
     assert str(raised.value).isprintable()
 
 
+@pytest.mark.parametrize("place", ["identity", "made-up"])
+def test_a_manifest_that_nests_deep_is_broken(place: str, run: Path) -> None:
+    stated = json.loads((run / "run.json").read_text())
+    text = json.dumps({**stated, place: {"helpers": "HERE"}})
+    (run / "run.json").write_text(text.replace('"HERE"', '[{"helpers":' * 200 + "1" + "}]" * 200))
+    assert "nests more than 32 deep" in refused(run, "run.json")
+
+
 @pytest.mark.parametrize("text", ["[]", "3", "null"])
 def test_a_manifest_that_is_no_object_is_refused(text: str, run: Path) -> None:
     (run / "run.json").write_text(text)

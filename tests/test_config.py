@@ -142,6 +142,8 @@ def test_what_is_no_toml_is_said_of_the_file(tmp_path: Path) -> None:
         b"a = " + b"9" * 5000,
         b"a = 0x" + b"f" * 5000,
         b"a = " + b"[" * 3000,
+        b"a = " + b"[" * 40 + b"]" * 40,
+        b"".join(b"a" + b".a" * 90 + b" = {" for _ in range(9)) + b"}" * 9,
     ):
         file.write_bytes(data)
         with pytest.raises(UserError, match=r"^r is no TOML: .*; fix the file$"):

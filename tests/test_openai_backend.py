@@ -344,6 +344,7 @@ def one(message: Any) -> bytes:
             "the answer is no JSON: it begins '\\x1f\ufffd\\x08\\x00garbage'",
         ),
         (b"\xff\xfe{", "the answer is no JSON: it begins '\ufffd\ufffd{'"),
+        (b"[" * 600 + b"]" * 600, f"the answer is no JSON: it begins '{'[' * 39}\u2026'"),
         (b"[" * 100_000, f"the answer is no JSON: it begins '{'[' * 39}\u2026'"),
         (b"null", "the answer is no chat completion"),
         (b"[]", "the answer is no chat completion"),

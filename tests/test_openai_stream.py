@@ -156,6 +156,9 @@ def test_a_server_that_refuses_to_stream_is_asked_for_the_whole_from_then_on() -
         ([b"data: " + b"[" * 100_000 + b"\n\n"], 
             "a piece of the stream is "
             f"no JSON: {'[' * 165}…", 1),
+        ([b"data: " + b"[" * 600 + b"]" * 600 + b"\n\n"],
+            "a piece of the stream is "
+            f"no JSON: {'[' * 165}…", 1),
         ([b"data: 3\n\n"], "a piece of the stream is no part of a chat completion", 1),
         ([{"choices": [{"delta": {"content": 3}}]}],
          "a piece of the stream is no part of a chat completion", 1),

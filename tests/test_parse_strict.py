@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from judging import PLACEHOLDERS, ROLES, hundredths, judged_strict, unhurried
 
 from harness.parsing.answer import read
-from harness.parsing.parse import Repair, Status, parse
+from harness.parsing.parse import Parsed, Repair, Status, parse
 from harness.parsing.strict import fitting
 from harness.prompts.answer_schema import FORMS, Shape
 
@@ -208,3 +208,21 @@ def test_a_key_that_no_text_can_hold_is_no_strict_answer_and_no_fault_of_ours(
     shares = '{"SLOWER":0.2,"IDLE":0.5,"FASTER":0.3}'
     for text in (f'{{"{key}":1,"action_distribution":{shares}}}', f'{{"{key}":{shares}}}'):
         assert parse(text, **Shape(role, ACTIONS)._asdict()).status is not Status.STRICT
+
+
+@pytest.mark.parametrize("role", FORMS)
+@pytest.mark.parametrize("depth", [33, 300, 600, 950, 3000])
+def test_an_answer_that_nests_deep_cannot_be_read_whoever_calls(role: str, depth: int) -> None:
+    """What Python's own limit allows depends on the callers; what is an answer must not."""
+    inner = "[" * depth + "]" * depth
+
+    def at(callers: int, text: str) -> Parsed:
+        return at(callers - 1, text) if callers else parse(text, **Shape(role, ACTIONS)._asdict())
+
+    for text in (
+        f'{{"action_distribution":{{"SLOWER":{inner},"IDLE":0.3,"FASTER":0.7}}}}',
+        '{"a":' * depth + inner + "}" * depth,
+    ):
+        assert at(0, text) == at(300, text)
+        assert at(0, text).intent is None
+    assert at(0, f'{{"a":{"[" * 31}0{"]" * 31}}}').status is Status.MISSING_ACTION

@@ -39,6 +39,7 @@ from typing import (
 
 import msgspec
 
+from harness.core.depth import shallow
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import text_of
 
@@ -106,7 +107,7 @@ def loads(text: str, where: str) -> dict[str, Any]:
         repr(
             tables
         )  # which fails for a number of thousands of hexadecimal digits, as messages would
-        return tables
+        return shallow(tables)
     except (ValueError, RecursionError) as error:  # also raised for too many digits or brackets
         mend = "put a text in quotes" if str(error).startswith("Invalid value") else "fix the file"
         raise UserError(f"{where} is no TOML: {printable(error)}; {mend}") from None
@@ -118,7 +119,7 @@ def json_loads(text: str, where: str) -> Any:
     `where` names the text in messages. Raises UserError if it is not JSON.
     """
     try:
-        return msgspec.json.decode(text)
+        return shallow(msgspec.json.decode(text))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{where} is no JSON: {printable(error)}; fix the file") from None
 

@@ -12,9 +12,8 @@ import unicodedata
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
+from harness.core.depth import MOST_DEPTH, shallow
 from harness.parsing.status import Repair
-
-MAX_DEPTH = 32
 
 # Possessive: no digit is given back, which would take a second look at each.
 _DIGITS = r"(?:\d++(?:[.．]\d*+)?|[.．]\d++)(?:[eE][-+]?\d*+)?"
@@ -89,9 +88,17 @@ def from_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return members if len(members) == len(pairs) else Repeated(members)
 
 
+class _Decoder(json.JSONDecoder):
+    """Refuses what nests deeper than almost-JSON may, with a ValueError."""
+
+    def raw_decode(self, s: str, idx: int = 0) -> tuple[Any, int]:
+        value, end = super().raw_decode(s, idx)
+        return shallow(value), end
+
+
 # As a float, an integer may have any number of digits; one too large becomes infinite instead of an
 # error.
-DECODER = json.JSONDecoder(object_pairs_hook=from_pairs, parse_int=float)
+DECODER = _Decoder(object_pairs_hook=from_pairs, parse_int=float)
 
 
 @dataclass(frozen=True)
@@ -169,7 +176,7 @@ class _Reader:
         raise Broken(self.meant)
 
     def _value(self, depth: int) -> Any:
-        if depth > MAX_DEPTH:
+        if depth > MOST_DEPTH:
             raise Broken(self.meant)
         token = self._take()
         if token.text == "{" and token.kind == "mark":

@@ -22,6 +22,7 @@ from msgspec import Struct
 from harness.core import work
 from harness.core.arrays import Ints
 from harness.core.config import LONGEST_S
+from harness.core.depth import shallow
 from harness.core.errors import UserError, printable, sayable
 from harness.core.files import BROKEN, bytes_of, text_of
 from harness.core.formats import SUITE
@@ -337,7 +338,7 @@ def read(path: Path) -> Run:
 
 
 def _record(file: Path) -> Any:
-    return msgspec.json.decode(text_of(file, "record"))
+    return shallow(msgspec.json.decode(text_of(file, "record")))
 
 
 def _slow_s(model: Mapping[str, Any]) -> float:

@@ -39,15 +39,12 @@ def error_words(payload: Any) -> str:
     That is at `error`, `error.message`, `message` or `detail`.
     """
     reason = None
-    try:
-        while isinstance(payload, dict):
-            metadata = payload.get(_REASON[0])
-            reason = reason or (metadata.get(_REASON[1]) if isinstance(metadata, dict) else None)
-            texts = [payload[name] for name in _WORDS if payload.get(name)]
-            payload = texts[0] if texts else json.dumps(payload)
-        return f"{payload}: {reason}" if isinstance(reason, str) else str(payload)
-    except RecursionError:
-        return "an error that is nested too deeply"
+    while isinstance(payload, dict):
+        metadata = payload.get(_REASON[0])
+        reason = reason or (metadata.get(_REASON[1]) if isinstance(metadata, dict) else None)
+        texts = [payload[name] for name in _WORDS if payload.get(name)]
+        payload = texts[0] if texts else json.dumps(payload)
+    return f"{payload}: {reason}" if isinstance(reason, str) else str(payload)
 
 
 def fault_in(payload: Any, of_chat: bool = True) -> Fault | None:

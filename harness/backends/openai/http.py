@@ -20,6 +20,7 @@ from harness.backends.openai.faults import error_words, fault_in, may_pass, plai
 from harness.backends.openai.stream import Stream
 from harness.backends.openai.unpacking import Packed, Unpacker
 from harness.backends.servers import Server
+from harness.core.depth import shallow
 from harness.core.errors import UserError, printable
 
 CONNECT_S = 10.0  # a running server answers sooner
@@ -171,7 +172,7 @@ class Client:
         Returns the value and the success.
         """
         try:
-            payload = json.loads(data.decode("utf-8-sig", "replace"))
+            payload = shallow(json.loads(data.decode("utf-8-sig", "replace")))
             if self._key:
                 # Encoded again first, since JSON has many spellings of one text.
                 payload = json.loads(self._without_key(json.dumps(payload, ensure_ascii=False)))

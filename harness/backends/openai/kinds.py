@@ -3,7 +3,6 @@
 import asyncio
 import json
 from collections.abc import Awaitable, Callable, Mapping
-from contextlib import suppress
 from typing import Any
 
 from harness.backends.card import Thinking
@@ -195,6 +194,4 @@ def entry_of(payload: Any, key: str, model: str) -> dict[str, Any] | None:
 
 def as_text(value: Any) -> str:
     """Return what a server states as text: a text as it is, any other value as JSON."""
-    with suppress(RecursionError):
-        return value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-    return "nested too deeply"
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True)

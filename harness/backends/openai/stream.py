@@ -11,6 +11,7 @@ from typing import Any
 
 from harness.backends.openai.faults import Fault, fault_in, may_pass
 from harness.backends.openai.said import REFUSAL, THOUGHTS, NoText, in_texts
+from harness.core.depth import shallow
 
 # the last piece has the token counts
 ASKED = {"stream": True, "stream_options": {"include_usage": True}}
@@ -64,11 +65,11 @@ class Stream:
         if self._kind == b"error":
             error: Any = text
             with suppress(ValueError, RecursionError):
-                error = json.loads(text)
+                error = shallow(json.loads(text))
             self._break_off(fault_in(error) or fault_in({"error": error}) or Fault(text))
             return
         try:
-            self._piece(json.loads(text), at_s)
+            self._piece(shallow(json.loads(text)), at_s)
         except (ValueError, RecursionError):
             self.fault, self.again = f"a piece of the stream is no JSON: {text}", False
         except NoText as error:

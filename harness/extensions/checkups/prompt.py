@@ -11,6 +11,7 @@ from harness.backends.base import Backend, Completion, Role
 from harness.backends.card import Card
 from harness.backends.cards import resolve
 from harness.backends.registry import capabilities, open_backend
+from harness.core.depth import shallow
 from harness.core.errors import Unanswered, UserError, printable
 from harness.core.progress import Progress
 from harness.evaluate.agent import Agent
@@ -217,6 +218,6 @@ def _echoes(answer: Answer) -> bool:
 def _value(text: str) -> Any:
     """Return the value of a JSON text, so that spaces do not count; the text where it is none."""
     try:
-        return json.loads(text)
+        return shallow(json.loads(text))
     except (ValueError, RecursionError):
         return text

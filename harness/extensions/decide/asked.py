@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from harness.backends.base import Completion
+from harness.core.depth import MOST_DEPTH, shallow
 from harness.core.errors import printable
 from harness.prompts.decision import Question
 
 MOST_QUESTIONS = 64  # of one request
 MOST_OPTIONS = 255  # of one question, as other servers of the class
-# of data: each level indents all below it, so that a small request could fill the memory
-MOST_DEPTH = 32
 
 
 class Refusal(Exception):
@@ -128,20 +127,15 @@ def text_of(content: Any) -> str:
     A text stays as it is; anything else, which comes from JSON, is written as JSON. Raises Refusal
     if it is nested too deep.
     """
-    _check_depth(content, MOST_DEPTH)
+    try:  # each level indents all below it, so that a small request could fill the memory
+        shallow(content)
+    except ValueError:
+        raise Refusal(
+            f"data is nested more than {MOST_DEPTH} deep; give it flatter", code="depth"
+        ) from None
     return (
         content if isinstance(content, str) else json.dumps(content, indent=2, ensure_ascii=False)
     )
-
-
-def _check_depth(content: Any, left: int) -> None:
-    if isinstance(content, dict | list):
-        if not left:
-            raise Refusal(
-                f"data is nested more than {MOST_DEPTH} deep; give it flatter", code="depth"
-            )
-        for inner in content.values() if isinstance(content, dict) else content:
-            _check_depth(inner, left - 1)
 
 
 def with_options(

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from harness.core.depth import shallow
 from harness.core.errors import UserError, printable, unknown
 from harness.core.files import canonical_json
 from harness.core.strangers import strangers, watched
@@ -247,7 +248,7 @@ def raised(error: Exception) -> str:
 
 def _changed(name: str, changes: str) -> dict[str, Any]:
     try:
-        changed = json.loads(changes)
+        changed = shallow(json.loads(changes))
         if not isinstance(changed, dict):
             raise ValueError(type(changed).__name__)
     except (ValueError, RecursionError) as error:

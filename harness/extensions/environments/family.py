@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from harness.core.depth import shallow
 from harness.core.errors import UserError, printable
 from harness.core.files import text_of
 
@@ -40,7 +41,7 @@ class Environments:
             return name
         file = Path(typed[CONFIG])
         try:
-            name = environment.named(typed[ENV], json.loads(text_of(file, "settings")))
+            name = environment.named(typed[ENV], shallow(json.loads(text_of(file, "settings"))))
             name.encode()  # JSON can write half a character, which no file can hold
         except (OSError, ValueError, RecursionError) as error:
             raise UserError(
