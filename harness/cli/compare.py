@@ -1,6 +1,7 @@
 """`harness compare`: two finished runs against each other."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from os.path import realpath
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -14,6 +15,7 @@ from harness.core.errors import UserError, in_range, printable
 from harness.core.formats import refuse_data
 
 if TYPE_CHECKING:
+    from harness.report.compare.gate import Gate
     from harness.report.compare.logs import ComparedLogs
 
 LISTED = 10  # episodes, decisions and requests of each kind that are listed
@@ -34,7 +36,7 @@ def command(
         "are from "
         "0 to 1; .low and .high are the ends of the 95 % interval; without CONDITION, the gate is "
         "on every "
-        "condition. Repeatable. Exit code 1 if a gate fails.",
+        "condition, and A and B must have the same. Repeatable. Exit code 1 if a gate fails.",
     ),
     show: int | None = typer.Option(
         None,
@@ -86,18 +88,16 @@ def command(
         comparison = reader.compare(a, b)
         _show_logs(comparison, fail_if or (), most, junit, as_markdown, as_json)
     gates = [gate(typed) for typed in fail_if or ()]
-    if reasons := [
-        f"{words} ({printable(run)})" for run in (a, b) if gates and (words := why(run))
-    ]:
-        lacks = (
-            f"{'; '.join(reasons)}: the model could not be asked, so that --fail-if has nothing to "
-            "judge"
-        )
-        if junit:
-            save([text.junit_of_none([each.text for each in gates], lacks)], junit, "--junit")
-        raise UserError(f"{lacks}; type the command of the run again")
-    difference = compared(pair(a, b))
-    verdicts = [judge(each, difference) for each in gates]
+    reasons = {printable(run): why(run) for run in (a, b)} if gates else {}
+    unasked = [f"{words} ({run})" for run, words in reasons.items() if words]
+    with _in_junit(gates, junit):
+        if unasked:
+            raise UserError(
+                f"{'; '.join(unasked)}: the model could not be asked, so that --fail-if has "
+                "nothing to judge; type the command of the run again"
+            )
+        difference = compared(pair(a, b))
+        verdicts = [judge(each, difference) for each in gates]
     if html:
         from harness.report.compare import page
 
@@ -129,24 +129,21 @@ def _show_logs(
     as_json: bool,
 ) -> NoReturn:
     """Print the comparison of two logs of another program, and end the command."""
-    from harness.core.junit import Case
     from harness.core.junit import junit as test_suite
-    from harness.report.compare import logs, text, words
+    from harness.report.compare import logs, text
     from harness.report.compare.gate import gate, judge_changes
     from harness.report.page import save
 
     gates = [gate(typed, logs.METRICS, logs.PLACE, logs.EXAMPLE) for typed in fail_if]
-    if gates and comparison.unsure:
-        lacks = f"{comparison.unsure}, so that --fail-if has nothing sure to judge"
-        if junit:
-            save([text.junit_of_none([each.text for each in gates], lacks)], junit, "--junit")
-        raise UserError(f"{lacks}; finish the logs, or leave --fail-if out")
-    verdicts = [judge_changes(each, comparison.changes) for each in gates]
+    with _in_junit(gates, junit):
+        if gates and comparison.unsure:
+            raise UserError(
+                f"{comparison.unsure}, so that --fail-if has nothing sure to judge; finish the "
+                "logs, or leave --fail-if out"
+            )
+        verdicts = [judge_changes(each, comparison.changes, comparison.alone) for each in gates]
     if junit:
-        cases = []
-        for verdict in verdicts:
-            failure = words.judged(verdict) if verdict.failed else None
-            cases.append(Case(comparison.title, verdict.gate, failure))
+        cases = [text.case(comparison.title, verdict) for verdict in verdicts]
         save([test_suite("harness compare", cases)], junit, "--junit")
     if as_json:
         echo_json(comparison.mapping(verdicts, show))
@@ -154,3 +151,17 @@ def _show_logs(
         render = comparison.markdown if as_markdown else comparison.terminal
         typer.echo(render(verdicts, show))
     raise typer.Exit(1 if any(verdict.failed for verdict in verdicts) else 0)
+
+
+@contextmanager
+def _in_junit(gates: "Sequence[Gate]", junit: Path | None) -> Iterator[None]:
+    """Enter a context in which gates are judged; what refuses that is in JUnit's XML, too."""
+    from harness.report.compare.text import junit_of_none
+    from harness.report.page import save
+
+    try:
+        yield
+    except UserError as error:
+        if junit:
+            save([junit_of_none([each.text for each in gates], f"{error}")], junit, "--junit")
+        raise

@@ -14,13 +14,14 @@ class Case:
     """Describe one test case of a JUnit report.
 
     `of` is the class of tests it belongs to. `failure` says why it failed and `error` why it has no
-    result; both are None if it passed.
+    result; both are None if it passed. `said` is what else is said of it, as its output.
     """
 
     of: str  # the class
     name: str  # the case's own name
     failure: str | None = None  # why it failed; None if it passed
     error: str | None = None  # why it has no result; None if it has one
+    said: str | None = None  # what else is said of it, as its output
 
 
 def junit(name: str, cases: Sequence[Case]) -> str:
@@ -39,4 +40,6 @@ def junit(name: str, cases: Sequence[Case]) -> str:
             SubElement(element, "error", message=printable(case.error, WHOLE))
         elif case.failure is not None:
             SubElement(element, "failure", message=printable(case.failure, WHOLE))
+        if case.said is not None:
+            SubElement(element, "system-out").text = printable(case.said, WHOLE)
     return tostring(suite, encoding="unicode", xml_declaration=True) + "\n"

@@ -12,8 +12,9 @@ from xml.etree import ElementTree
 
 import pytest
 from changing import ends
-from run_on_disk import Row, answers_of, change, configure
+from run_on_disk import Row, answers_of, change, configure, made_up
 
+from harness.coordination.named_points import POINTS
 from harness.core.statistics import Estimate
 from harness.report.compare.difference import Comparison, Difference, compare
 from harness.report.compare.gate import gate, judge
@@ -82,6 +83,7 @@ def test_gates_decide_the_exit_code(
     assert told["passed"] is not bool(failed)
     assert [where["condition"] for gate in told["gates"] for where in gate["failed_in"]] == failed
     assert [gate["gate"] for gate in told["gates"]] == gates
+    assert {*map(tuple, [gate["conditions"] for gate in told["gates"]])} == {("single-local", "6g")}
 
 
 @pytest.mark.parametrize(
@@ -377,8 +379,30 @@ def test_gates_are_test_cases_of_junit(worse_once: tuple[Path, Path], harness: H
     )
     assert "in 6g (-0.25)" in failed.find("failure").get("message", "")
     assert passed.find("failure") is None
+    judged = [case.findtext("system-out") for case in suite]
+    assert judged == ["judged: 6g", "judged: single-local, 6g"]
     code, _, err = harness("compare", *worse_once, "--junit", "gates.xml")
     assert (code, err) == (2, "harness: --junit writes gates; give one or more with --fail-if\n")
+
+
+@pytest.mark.parametrize("which", ["A", "B"])
+def test_a_gate_on_all_conditions_does_not_pass_where_a_run_lacks_one(
+    which: str, tmp_path: Path, harness: Harness
+) -> None:
+    whole, part = (
+        made_up(tmp_path / "whole"),
+        made_up(tmp_path / "part", points=[POINTS["single-local"]]),
+    )
+    both = (whole, part) if which == "A" else (part, whole)
+    typed = ("compare", *both, "--junit", "gates.xml", "--fail-if")
+    code, out, err = harness(*typed, "success_rate < -1")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert f"is on all, and only {which} has 6g; compare two that have the same, or name" in err
+    [case] = ElementTree.parse("gates.xml").getroot()
+    assert f"only {which} has 6g" in case.find("error").get("message", "")
+    [named] = re.findall(r"both have: '(.*)'", err)
+    assert harness(*typed, named)[0] == 0
+    assert ElementTree.parse("gates.xml").findtext("testcase/system-out") == "judged: single-local"
 
 
 def test_no_number_has_more_than_four_figures() -> None:

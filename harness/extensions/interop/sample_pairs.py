@@ -103,6 +103,12 @@ class SampleComparison:
             changes[each.scorer] = of_no_width(each.change) if is_alike else each.change
         return changes
 
+    @property
+    def alone(self) -> Mapping[str, list[str]]:
+        """Return the names of the scorers that only log `A` has, and of those that only `B` has."""
+        a, b = self.a.scores, self.b.scores
+        return {"A": [name for name in a if name not in b], "B": [n for n in b if n not in a]}
+
     @cached_property
     def other_prompts(self) -> int:
         """Return how many of the common answers had another prompt in each log, if both say it."""

@@ -73,7 +73,10 @@ def mapping(comparison: SampleComparison, verdicts: Sequence[Verdict], most: int
     gates = []
     for verdict in verdicts:
         failed_in = [{"scorer": name, "value": value} for name, value in verdict.failed]
-        gates.append({"gate": verdict.gate, "passed": not failed_in, "failed_in": failed_in})
+        scorers, passed = list(verdict.conditions), not failed_in
+        gates.append(
+            {"gate": verdict.gate, "scorers": scorers, "passed": passed, "failed_in": failed_in}
+        )
     return {
         "a": _log(a, most),
         "b": _log(b, most),
@@ -81,8 +84,8 @@ def mapping(comparison: SampleComparison, verdicts: Sequence[Verdict], most: int
         "answers": len(comparison.answers),
         "only_in_a": _answers(comparison.only_a, most),
         "only_in_b": _answers(comparison.only_b, most),
-        "scorers_only_in_a": [name for name in a.scores if name not in b.scores],
-        "scorers_only_in_b": [name for name in b.scores if name not in a.scores],
+        "scorers_only_in_a": comparison.alone["A"],
+        "scorers_only_in_b": comparison.alone["B"],
         "scorers_with_other_options": comparison.other_options,
         "answers_with_other_prompts": comparison.other_prompts,
         "scorers": [_scorer(difference, most) for difference in comparison.differences],
@@ -107,8 +110,7 @@ def _facts(comparison: SampleComparison, most: int) -> Iterator[str]:
     for name, keys in (("A", comparison.only_a), ("B", comparison.only_b)):
         if keys:
             yield f"only in {name}, left out: {len(keys)}: {_some([_name(k) for k in keys], most)}"
-    for name, log, other in (("A", a, b), ("B", b, a)):
-        scorers = [scorer for scorer in log.scores if scorer not in other.scores]
+    for name, scorers in comparison.alone.items():
         if scorers:
             yield f"scorers only in {name}, left out: {_some(scorers, most)}"
     if comparison.other_options:

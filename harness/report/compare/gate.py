@@ -48,12 +48,13 @@ class Gate:
 class Verdict:
     """Hold the result of a gate, a test that a comparison may fail.
 
-    `gate` is its text, and `failed` has each condition in which it failed with the value that did
-    it; empty if it passed. A condition is a named set of settings of the radio, of asking helpers
-    and of fusing their messages.
+    `gate` is its text, `conditions` are those that it judged, and `failed` has each in which it
+    failed with the value that did it; empty if it passed. A condition is a named set of settings of
+    the radio, of asking helpers and of fusing their messages.
     """
 
     gate: str  # its text, as it was typed
+    conditions: tuple[str, ...]  # names of those that it judged
     failed: tuple[tuple[str, float], ...]  # condition and value, wherever it failed
 
 
@@ -126,7 +127,8 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
     messages.
 
     Raises:
-        UserError: the gate's condition is not compared, or the difference is unknown there.
+        UserError: the gate's condition is not compared, a run lacks one that it is on, or the
+            difference is unknown there.
     """
     changes: dict[str, Estimate | None] = {}
     for condition in comparison.conditions:
@@ -135,7 +137,7 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
             if each.metric == gate.metric:
                 change = each.change
                 changes[condition.condition] = of_no_width(change) if each.is_alike else change
-    return judge_changes(gate, changes)
+    return judge_changes(gate, changes, comparison.pair.alone)
 
 
 def of_no_width(change: Estimate) -> Estimate:
@@ -143,20 +145,32 @@ def of_no_width(change: Estimate) -> Estimate:
     return replace(change, low=change.value, high=change.value)
 
 
-def judge_changes(gate: Gate, changes: Mapping[str, Estimate | None]) -> Verdict:
+def judge_changes(
+    gate: Gate, changes: Mapping[str, Estimate | None], alone: Mapping[str, Sequence[str]]
+) -> Verdict:
     """Return in which conditions a gate, a test of a difference, fails.
 
-    `changes` has the difference of the gate's metric by condition, None where it is not known. Of
-    logs of other programs, the conditions are scorers.
+    `changes` has the difference of the gate's metric by condition, None where it is not known, and
+    `alone` the conditions that only `A` or only `B` has. Of logs of other programs, the conditions
+    are scorers.
 
     Raises:
-        UserError: the gate's condition is not compared, or the difference is unknown there.
+        UserError: the gate's condition is not compared, one side lacks a condition that the gate is
+            on, or the difference is unknown there.
     """
     if gate.condition is not None and gate.condition not in changes:
         raise unknown(f"condition of --fail-if {printable(gate.text)!r}", gate.condition, changes)
+    for side, names in alone.items():
+        if names and gate.condition is None:
+            raise UserError(
+                f"--fail-if {printable(gate.text)!r} is on all, and only {side} has "
+                f"{printable(', '.join(names), 60)}; compare two that have the same, or name what "
+                f"both have: {printable(f'{next(iter(changes))}:{gate.text}')!r}"
+            )
+    judged = [name for name in changes if gate.condition in (None, name)]
     failed = []
     for name, change in changes.items():
-        if gate.condition in (None, name):
+        if name in judged:
             value = float(getattr(change, gate.end)) if change else math.nan
             if math.isnan(value):
                 # A gate that passes because nothing is known would guard nothing.
@@ -171,4 +185,4 @@ def judge_changes(gate: Gate, changes: Mapping[str, Estimate | None]) -> Verdict
             # Means over seeds carry rounding errors, which decide no gate.
             if OPERATORS[gate.op](round(value, 9), gate.number):
                 failed.append((name, value))
-    return Verdict(gate.text, tuple(failed))
+    return Verdict(gate.text, tuple(judged), tuple(failed))

@@ -20,14 +20,16 @@ class ComparedLogs(Protocol):
     """Describe the comparison of two logs, A and B, whose answers are paired.
 
     A scorer is what gives an answer a number. `changes` has for each scorer B - A and its 95 %
-    interval, in the unit of its scores. `unsure` says why gates, tests of a difference, have
-    nothing sure to judge; empty if they have.
+    interval, in the unit of its scores; `alone` the scorers that only `A` or only `B` has. `unsure`
+    says why gates, tests of a difference, have nothing sure to judge; empty if they have.
     """
 
     @property
     def title(self) -> str: ...
     @property
     def changes(self) -> Mapping[str, Estimate]: ...
+    @property
+    def alone(self) -> Mapping[str, Sequence[str]]: ...
     @property
     def unsure(self) -> str: ...
 

@@ -124,6 +124,16 @@ class Pair:
         of_condition = side.values[metric][grid.conditions.index(condition)]
         return np.asarray(of_condition[np.ix_(seeds, episodes)].T)
 
+    @property
+    def alone(self) -> dict[str, list[str]]:
+        """Return the names of the conditions that only run `A` has, and those that only `B` has.
+
+        A condition is a named set of settings of the radio, of asking helpers and of fusing their
+        messages.
+        """
+        a, b = self.a.run.conditions, self.b.run.conditions
+        return {"A": [name for name in a if name not in b], "B": [n for n in b if n not in a]}
+
     @cached_property
     def clusters(self) -> Ints | None:
         """Return the number of each shared episode's cluster, (E,); None if each is of its own.

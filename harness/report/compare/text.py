@@ -231,14 +231,19 @@ def junit(comparison: Comparison, verdicts: Sequence[Verdict]) -> str:
     """
     pair = comparison.pair
     runs = f"{printable(words.who(pair.b))} against {printable(words.who(pair.a))}"
-    cases = [Case(runs, v.gate, words.judged(v) if v.failed else None) for v in verdicts]
-    return test_suite("harness compare", cases)
+    return test_suite("harness compare", [case(runs, verdict) for verdict in verdicts])
+
+
+def case(of: str, verdict: Verdict) -> Case:
+    """Return a gate's verdict as a test case, of the class `of`, that says what it judged."""
+    failure = words.judged(verdict) if verdict.failed else None
+    return Case(of, verdict.gate, failure, said=f"judged: {', '.join(verdict.conditions)}")
 
 
 def junit_of_none(gates: Sequence[str], reason: str) -> str:
     """Return gates as test cases with an error, in JUnit's XML.
 
-    It is for a comparison that is impossible because a model did not answer; `reason` says why,
+    It is for gates that cannot be judged, such as where a model did not answer; `reason` says why,
     with file names in place of paths. `gates` are their texts.
     """
     given = places.text(reason)
@@ -310,7 +315,12 @@ def _answers_flipped(flipped: AnswersFlipped, most: int) -> dict[str, Any]:
 
 def _gate(verdict: Verdict) -> dict[str, Any]:
     failed_in = [{"condition": name, "value": value} for name, value in verdict.failed]
-    return {"gate": verdict.gate, "passed": not verdict.failed, "failed_in": failed_in}
+    return {
+        "gate": verdict.gate,
+        "conditions": list(verdict.conditions),
+        "passed": not verdict.failed,
+        "failed_in": failed_in,
+    }
 
 
 def changed_answers(held: AnswersHeld, most: int | None = None) -> list[dict[str, Any]]:

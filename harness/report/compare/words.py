@@ -275,7 +275,7 @@ def paired(pair: Pair) -> str:
     """Return a phrase on how many episodes and seeds two runs share, and what only one has."""
     text = f"{crossed(len(pair.episodes), len(pair.seeds))} of {where(pair.a.run)}"
     for name, side in (("A", pair.a), ("B", pair.b)):
-        conditions = [c for c in side.run.conditions if c not in pair.conditions]
+        conditions = pair.alone[name]
         episodes = len(side.run.grid.episodes) - len(pair.episodes)
         if conditions:
             text += f"; only {name} has {', '.join(conditions)}"

@@ -140,9 +140,9 @@ def test_gates_are_on_scorers(harness: Harness) -> None:
         assert harness(*typed)[0] == code
         assert ("<failure" in Path("gates.xml").read_text()) == bool(code)
     shown = json.loads(harness("compare", a, b, "--json", "--fail-if", "score < 0")[1])
-    assert (shown["passed"], shown["gates"][0]["failed_in"]) == (
-        False, [{"scorer": "match", "value": -0.5}],
-    )  # fmt: skip
+    [gate_of_all] = shown["gates"]
+    assert (gate_of_all["scorers"], gate_of_all["passed"]) == (["match"], False)
+    assert gate_of_all["failed_in"] == [{"scorer": "match", "value": -0.5}]
 
 
 def test_a_gate_that_has_nothing_sure_to_judge_is_refused(harness: Harness) -> None:
@@ -152,10 +152,13 @@ def test_a_gate_that_has_nothing_sure_to_judge_is_refused(harness: Harness) -> N
     erring = log("erring.eval", [sample(0), failed, sample(2)])
     unknown = log("unknown.eval", [sample(n, "maybe") for n in range(3)])
     part = log("part.eval", [sample(n) for n in range(2)])
+    more = {"match": {"value": "C"}, "f1": {"value": 1}}
+    scored = log("scored.eval", [sample(n, scores=more) for n in range(3)])
     for b, gate, reason in (
         (begun, "score < 0", "begun.eval has status started"),
         (erring, "score < 0", "1 answer of A or B failed with an error"),
         (unknown, "score < 0", "no number has 3 answers of A or B"),
+        (scored, "score < 0", "is on all, and only B has f1; compare two"),
         (part, "score < 0", "one log alone has 1 answer"),
         (whole, "other:score < 0", "unknown condition of --fail-if"),
         (whole, "success_rate < 0", "unknown metric of --fail-if"),

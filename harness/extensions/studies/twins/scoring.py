@@ -161,15 +161,14 @@ def judge(gate: Gate, table: Sequence[Row]) -> Verdict:
     judged = [row for row in table if gate.condition in (None, row.twin.name)]
     if not judged:
         raise unknown(f"twin of {option}", gate.condition or "", {row.twin.name for row in table})
-    failed = []
+    places, failed = list[str](), []
     for row in judged:
-        value, where = (
-            float(getattr(getattr(row, gate.metric), gate.end)),
-            f"{row.twin.name} {row.role}",
-        )
+        value = float(getattr(getattr(row, gate.metric), gate.end))
+        where = f"{row.twin.name} {row.role}"
+        places.append(where)
         if np.isnan(value):
             # A gate that passes because nothing is known would guard nothing.
             raise UserError(f"{option}: {where} has no such number; ask about more episodes")
         if OPERATORS[gate.op](round(value, 9), gate.number):
             failed.append((where, value))
-    return Verdict(gate.text, tuple(failed))
+    return Verdict(gate.text, tuple(places), tuple(failed))
