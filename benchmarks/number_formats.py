@@ -3,9 +3,10 @@
     python benchmarks/number_formats.py [--answer readout] [--formats openvino:auto ...]
 
 Prompts of v10, spread over the scenes of a dataset, at temperature 0 on a CPU in batches of 8 after
-one that warms up. An answer is compared with that of transformers in float32: its text, its
-likeliest action, and the greatest difference of a probability. What a format wrote is kept in the
-folder `--out`, and is read there and not made again.
+one that warms up, read-outs in one order of letters. An answer is compared with that of
+transformers in float32: its text, its likeliest action, and the greatest difference of a
+probability. What a format wrote is kept in the folder `--out`, and is read there and not made
+again.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from harness.backends import cards
-from harness.backends.base import Request
+from harness.backends.base import Letters, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.dataset.load import find, load
@@ -84,7 +85,9 @@ def main() -> None:
 def questions(given: argparse.Namespace) -> list[Request]:
     """Return as many questions, to all that are asked in scenes spread over a dataset."""
     data, count = load(find(given.dataset)), given.prompts
-    agent = Agent(cards.resolve(given.model), versions.load("v10"), given.answer)
+    letters: Letters | None = "raw" if given.answer == "readout" else None
+    card, prompt = cards.resolve(given.model), versions.load("v10")
+    agent = Agent(card, prompt, given.answer, letters=letters)
     spec = Spec(agent, FrozenSource(data), (), (0,))
     every = list(requests(spec, data.scenes(data.courses())))
     by_scene = groupby(every, lambda request: request.id.partition("/")[0])
