@@ -5,7 +5,7 @@ A run's stored answers are played again under each rule, attack and share of att
 have the same episodes, channel draws and attackers, so differences are paired by episode.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property, lru_cache, partial
@@ -31,7 +31,7 @@ from harness.core.versions import versions
 from harness.dataset.load import Scene
 from harness.evaluate.spec import files_of
 from harness.evaluate.walk import Decided
-from harness.extensions.trust.attacks import count_of_attackers
+from harness.extensions.trust.attacks import attacks_of, count_of_attackers
 from harness.extensions.trust.strongest_lies import (
     StrongestLies,
     strongest_lies,
@@ -197,7 +197,8 @@ def shares_of(text: str) -> tuple[float, ...]:
         raise UserError(
             f"--share {printable(text)}: nobody attacks; give a share above 0 as well: 0,1/3"
         )
-    return tuple(dict.fromkeys(share for share in shares if share))
+    by_text = {f"{share:.10g}": share for share in reversed(shares) if share}
+    return tuple(reversed(by_text.values()))
 
 
 def cell_of(key: Key, result: WalkResult) -> Cell:
@@ -433,6 +434,14 @@ def run_bench(
                 f"--share {share:g}: this is nobody of {helpers} helpers, the most there are; give "
                 f"1/{2 * helpers} or more"
             )
+    attacks = _different(attacks, attacks_of)
+    for attack in attacks:
+        parts = attack.split("+")
+        if point.stream is None and EXCLUDED in parts and len(parts) > 1:
+            raise UserError(
+                f"--attacks {printable(attack)}: {EXCLUDED} leaves the attackers out, whatever "
+                "else they would do; leave it out"
+            )
     if set(attacks) == {EXCLUDED}:
         raise UserError(f"--attacks {EXCLUDED}: it is played beside any attack; name one that lies")
     unfused = point.idle("consensus")
@@ -441,10 +450,11 @@ def run_bench(
             f"--rules {','.join(rules)}: no rule changes anything: {unfused}; leave it out"
         )
     usual = [rule for rule in RULES if INTENTS in reads(rule)]
-    of_model = [rule for rule in rules if rule == EGO_PROMPT]  # which lies are looked for alone
-    arithmetic = [rule for rule in rules if rule != EGO_PROMPT]
+    different = _different([BASE, *rules], partial(_as_rule, point))
+    of_model = [rule for rule in different if rule == EGO_PROMPT]  # which lies are looked for alone
+    arithmetic = [rule for rule in different if rule != EGO_PROMPT]
     default = () if unfused or rules else (*usual, CAPPED)
-    every_rule = dict.fromkeys([BASE, *(arithmetic or default)])
+    every_rule = dict.fromkeys([*arithmetic, *default])
     if of_model and not run.asks:
         raise UserError(f"--no-model: {EGO_PROMPT} asks the model about messages; leave it out")
     run.check([under(point, rule, PEACE, 0.0) for rule in of_model])
@@ -509,13 +519,11 @@ def run_bench(
                 lies[rule] = StrongestLies.of(values)
             run.settle()
             progress(1)
+    unsearched = [rule for rule in (*every_rule, *of_model) if rule not in lies]
     [[alone]] = run.walked(
         [Setting(condition, OperatingPoint.of("never asks"), run.vehicles)], seeds
     )
     run.settle()
-    caveats = [*run.caveats]
-    if not_searched:
-        caveats.append(f"No strongest lie is looked for: {not_searched}.")
     return Bench(
         run.name,
         run.run.source,
@@ -524,11 +532,44 @@ def run_bench(
         cells,
         alone.ends[SUCCESS],
         Success(run.dataset.dangerous, run.dataset.clusters),
-        tuple(caveats),
+        (*run.caveats, *_unsearched(unsearched, not_searched)),
         unfused,
         lies,
         int(count_of_attackers(shares[0], helpers)),
     )
+
+
+def _different(texts: Sequence[str], meaning: Callable[[str], Hashable]) -> list[str]:
+    """Return the texts without those that mean what an earlier one does, spelt otherwise."""
+    by_meaning = dict[Hashable, str]()
+    for text in texts:
+        by_meaning.setdefault(meaning(text), text)
+    return list(by_meaning.values())
+
+
+def _as_rule(point: OperatingPoint, rule: str) -> OperatingPoint:
+    """Return an operating point with a rule, whatever its text.
+
+    Raises UserError if the text has a setting that changes nothing.
+    """
+    of_rule = under(point, rule, PEACE, 0.0)
+    name, *settings = rule.split(":")
+    for setting in settings:
+        key = setting.partition("=")[0]
+        if why := of_rule.idle(key):
+            raise UserError(f"--rules {printable(rule)}: {key} changes nothing: {why}; give {name}")
+    return of_rule.changed(name=point.name)
+
+
+def _unsearched(rules: Sequence[str], reason: str) -> Iterator[str]:
+    """Yield a sentence on the rules whose strongest lies were not looked for, and why."""
+    if reason:
+        yield f"No strongest lie is looked for: {reason}."
+    elif rules:
+        yield (
+            f"The strongest lies against {', '.join(rules)} were not looked for: of a package's "
+            "rule with memory, not all courses can be followed."
+        )
 
 
 def _found_lies(*options: Any) -> dict[str, Floats]:

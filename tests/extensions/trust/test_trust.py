@@ -288,6 +288,11 @@ def test_what_no_message_holds_cannot_be_attacked(
     [
         ("6g", ("ego-prompt",), "proxy is no language model and cannot fuse messages"),
         ("6g:attack=liar", ("linear",), "it has an attack; leave it out"),
+        (
+            "6g",
+            ("ego-prompt:weight_cap=0.3",),
+            "weight_cap changes nothing: consensus ego-prompt weighs no distances; give ego-prompt",
+        ),
     ],
 )
 def test_a_bench_that_cannot_be_played_is_one_line(
@@ -295,6 +300,29 @@ def test_a_bench_that_cannot_be_played_is_one_line(
 ) -> None:
     with pytest.raises(UserError, match=said):
         run_bench(ReplayedRun(done.out), condition, rules, (), (THIRD,), (0,), tmp_path, Watched())
+
+
+def test_what_is_spelt_in_two_ways_is_played_once(done: Evaluated, tmp_path: Path) -> None:
+    rules = names_of(
+        "--rules", "linear:weight_cap=1,median,median:weight_cap=0.250", ("linear", "median")
+    )
+    attacks = names_of("--attacks", "liar,liar:says=one-hot", ("liar",))
+    shares = shares_of("1/3,0.33333333333")
+    assert shares == (THIRD,)
+    again = (*rules, "median:weight_cap=0.25")
+    stored = ReplayedRun(done.out)
+    bench = run_bench(stored, "6g", again, attacks, shares, (0,), tmp_path, Watched())
+    assert (bench.rules, bench.attacks) == (("linear", *rules[1:]), ("liar",))
+    assert set(bench.strongest_lies) == {"linear", *rules[1:]}
+
+
+@pytest.mark.parametrize("attack", ["absent+absent", "silent+absent"])
+def test_an_attack_of_who_is_absent_is_one_line(
+    attack: str, done: Evaluated, tmp_path: Path
+) -> None:
+    options = ("6g", (), (attack,), (THIRD,), (0,))
+    with pytest.raises(UserError, match="absent leaves the attackers out, whatever else they"):
+        run_bench(ReplayedRun(done.out), *options, tmp_path, Watched())
 
 
 def test_of_objects_a_model_is_asked_about_lists_of_liars(done: Evaluated, tmp_path: Path) -> None:
@@ -334,6 +362,7 @@ def test_a_study_of_kept_cells_says_again_what_was_left_out(small: Dataset, tmp_
         return run_bench(without, *options, tmp_path / "bench", Watched()).caveats
 
     first = caveats()
+    assert "No strongest lie is looked for: the model is not asked." in first[-1]
     assert any("left out episodes that reach one of" in caveat for caveat in first)
     assert caveats() == first
     kept = tmp_path / "bench" / "cells.jsonl"

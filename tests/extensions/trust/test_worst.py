@@ -275,7 +275,10 @@ def test_of_a_packages_rule_with_memory_nothing_is_said(
     bench = run_bench(stored, *options, Watched())
     assert bench.rules == ("linear", "grudge")
     assert set(bench.strongest_lies) == {"linear"}
-    assert trust_study(bench).tables[0].title.startswith("33 %")
+    study = trust_study(bench)
+    assert study.tables[0].title.startswith("33 %")
+    [said] = study.caveats
+    assert said.startswith("The strongest lies against grudge were not looked for: of a package's")
 
 
 def test_a_share_that_rounds_has_as_many_liars_as_the_attacks(
