@@ -70,7 +70,7 @@ def settings(
     runs = [source for source in sources if isinstance(source, ReplayedRun)]
     vehicles = min(run.vehicles for run in runs)
     name, result = CROSS.join(axis.name for axis in axes), list[Setting]()
-    for condition in conditions:
+    for condition in distinct_names(runs, conditions):
         start = point_of(runs, condition)
         lists = [given or usual_at(axis, start) for axis, given in zip(axes, grids, strict=True)]
         for axis, some in zip(axes, lists, strict=True):
@@ -134,6 +134,17 @@ def point_of(runs: Sequence[ReplayedRun], name: str) -> OperatingPoint:
             f"--condition {printable(name)} has no channel; nothing of it can be varied"
         )
     return point
+
+
+def distinct_names(runs: Sequence[ReplayedRun], names: Sequence[str]) -> list[str]:
+    """Return the names of sets of settings without those that are an earlier one, spelt otherwise.
+
+    `6g:tau=0.70` is `6g:tau=0.7`. Raises UserError as `point_of` does.
+    """
+    by_settings = dict[OperatingPoint, str]()
+    for name in names:
+        by_settings.setdefault(point_of(runs, name).changed(name="any"), name)
+    return list(by_settings.values())
 
 
 def usual(runs: Sequence[ReplayedRun], conditions: Sequence[str]) -> dict[str, tuple[Setting, ...]]:

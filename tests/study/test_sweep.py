@@ -259,6 +259,12 @@ def test_a_size_below_the_runs_is_refused_where_all_vehicles_would_still_be_hear
         assert settings([source], [AXES["tau"]], [(0.5,)], [condition])
 
 
+def test_a_condition_in_two_spellings_is_swept_once(source: ReplayedRun) -> None:
+    names = ["6g:max_helpers=1", "6g", "6g:tau=0.70", "6g:max_helpers=1,tau_nats=0.7"]
+    points = settings([source], [AXES["loss"]], [(0.1, 0.2)], names)
+    assert [point.condition for point in points] == [name for name in names[:2] for _ in range(2)]
+
+
 @pytest.mark.exhaustive
 def test_many_points_are_walked_in_parts(
     source: ReplayedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

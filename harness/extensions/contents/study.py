@@ -37,7 +37,7 @@ from harness.studies.axes import Setting, axis_of, described, grid
 from harness.studies.play import by_episode, metric_columns
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import corrected, refuse_other
-from harness.studies.sweep import point_of, settings
+from harness.studies.sweep import distinct_names, point_of, settings
 from harness.world.lookouts import radios
 from harness.world.parameters import Parameters, frames
 
@@ -430,7 +430,7 @@ def panels_of(
             f"--grid: {len(grids)} given for {len(over)} of --over; give one for each, in order"
         )
     if conditions or over:
-        conditions = conditions or [BASE]
+        conditions = distinct_names(runs, conditions or [BASE])
         axes = list(zip_longest(over, grids))  # None where an axis has no grid
         varied = [(condition, *axis) for condition in conditions for axis in axes]
     else:

@@ -44,7 +44,7 @@ from harness.runs.success import Success
 from harness.studies.axes import Setting, described
 from harness.studies.replayed_run import ReplayedRun, counted
 from harness.studies.study import refuse_other
-from harness.studies.sweep import point_of
+from harness.studies.sweep import distinct_names, point_of
 
 DELTA = 0.05
 AT_MOST = (0.01, 0.02, 0.05, 0.1)
@@ -83,7 +83,7 @@ def run_promise(
     """
     report, *elsewhere = runs
     names = conditions or usual(tune)
-    points = list(dict.fromkeys(point_of([tune], name) for name in names))
+    points = [point_of([tune], name) for name in distinct_names([tune], names)]
     if not points:
         raise UserError(
             f"{printable(tune.run.path)}: no condition has a channel; give --condition 6g"
