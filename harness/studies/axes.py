@@ -163,6 +163,19 @@ def usual_at(axis: Axis, point: OperatingPoint) -> tuple[Value, ...]:
     return tuple(value for value in grid(axis) if not axis.worded or _allows(axis, point, value))
 
 
+def refusal(axis: Axis, point: OperatingPoint) -> str:
+    """Return why an operating point does not allow the last of an axis's default values, in words.
+
+    An axis is what a sweep varies, such as packet loss; an operating point is a set of settings.
+    The text is empty if it does.
+    """
+    try:
+        axis.at(point, grid(axis)[-1])
+    except UserError as error:
+        return str(error)
+    return ""
+
+
 def _named() -> dict[str, Callable[[], Collection[str]]]:
     """Return the settings of extensions that name something,
     and what returns the names that there are.

@@ -26,6 +26,7 @@ from harness.studies.axes import (
     crossed,
     described,
     grid,
+    refusal,
     usual_at,
 )
 from harness.studies.figures.axes import interval_of, lead_in
@@ -77,7 +78,7 @@ def settings(
             if axis.worded and some in ((), (NONE,)):
                 raise UserError(
                     f"--over {axis.name}: {printable(condition)} allows none of its usual values; "
-                    "give others with --grid, or another --condition"
+                    f"give others with --grid, or another --condition ({refusal(axis, start)})"
                 )
             if axis.field is None and (most := max(map(float, some))) > vehicles:
                 raise UserError(

@@ -57,7 +57,13 @@ class Careful(Part, frozen=True, kw_only=True):
         if other := promise(self.promise).other_setting(point):
             key, now, then = other
             allowed = "left out" if then is None else printable(then)
-            raise wrong(key, now, f"{allowed} {where}, which was made so")
+            thresholds = [f"{n}={v:g}" for n, v in self.implies().items() if v is not None]
+            raise wrong(
+                key,
+                now,
+                f"{allowed} {where}, which was made so; to vary it without what is promised, give "
+                f"{','.join(thresholds)} in place of the promise",
+            )
 
     def obstacle(self, point: "OperatingPoint", run: RunFacts) -> str | None:
         if not self.promise:
@@ -66,8 +72,10 @@ class Careful(Part, frozen=True, kw_only=True):
         if run.several_decide:
             return f"{what} is of one ego; leave out --agents"
         for agent in run.agents:
-            if reason := file.obstacle(agent.settings(), run.scenario):
-                return f"{what} {reason}; {_AGAIN}"
+            settings = agent.settings()
+            if reason := file.obstacle(settings, run.scenario):
+                version = printable(settings["prompt"]["version"], 40)
+                return f"{what} {reason}; {_AGAIN}, of runs of this model with --prompt {version}"
         setup = {"ties": run.ties, "temperature": run.temperature, "flip": run.agents[0].flip}
         reason = file.obstacle_of_setup(point, **setup)
         return reason and f"{what} {reason}; {_AGAIN}"

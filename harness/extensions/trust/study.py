@@ -49,7 +49,7 @@ from harness.runs.estimates import over_episodes
 from harness.runs.headline import SUCCESS
 from harness.runs.places import mean_by_place
 from harness.runs.success import Success
-from harness.studies.axes import NONE, Setting, axis_of, usual_at
+from harness.studies.axes import NONE, Setting, axis_of, refusal, usual_at
 from harness.studies.figures.described import Draws
 from harness.studies.play import WalkResult
 from harness.studies.replayed_run import ReplayedRun
@@ -425,7 +425,8 @@ def run_bench(
     attacks = attacks or [str(name) for name in usual_at(axis_of("attack"), point) if name != NONE]
     if not attacks:
         raise UserError(
-            f"--condition {printable(condition)}: it allows none of the usual attacks; give another"
+            f"--condition {printable(condition)}: it allows none of the usual attacks; give "
+            f"another ({refusal(axis_of('attack'), point)})"
         )
     helpers = run.vehicles - 1
     for share in shares:

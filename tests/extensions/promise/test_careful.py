@@ -24,6 +24,7 @@ from harness.extensions.promise.study import usual
 from harness.runs.decisions import Decisions
 from harness.runs.fit import write
 from harness.runs.folder import Run, read
+from harness.studies.axes import AXES, refusal
 
 pytestmark = pytest.mark.usefixtures("svg_alone")
 
@@ -113,6 +114,8 @@ def rewrite(project: Path, old: str, new: str) -> None:
         ("v2x:promise=p", "profile is 'v2x'; it must be 6g where promise is p, which was made so"),
         ("6g:promise=p,max_helpers=1", "max_helpers is 1; it must be 3 where promise is p"),
         ("6g:promise=p,loss=0.5", "loss is 0.5; it must be left out where promise is p"),
+        ("6g:promise=p,loss=0.5", "; to vary it without what is promised, give tau_nats=0.3,"),
+        ("6g:promise=p,loss=0.5", ",careful_nats=0.9 in place of the promise"),
         ("single-local:promise=p", "profile is None; it must be 6g where promise is p"),
         ("6g:promise=q", "unknown promise 'q'; known: never, p; `harness study promise"),
         ("6g:careful_nats=-1", "careful_nats is -1.0; it must be nats, 0 or more"),
@@ -123,6 +126,13 @@ def test_what_a_promise_does_not_hold_for_is_refused(project: Path, text: str, s
         named_point(text)
     assert says in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_sweep_of_what_a_promise_fixes_says_what_to_type(project: Path) -> None:
+    said = refusal(AXES["consensus"], named_point("6g:promise=p"))
+    assert "where promise is p, which was made so; to vary it" in said
+    assert said.endswith("give tau_nats=0.3,careful_nats=0.9 in place of the promise")
+    assert not refusal(AXES["consensus"], named_point("6g:tau_nats=0.3,careful_nats=0.9"))
 
 
 @pytest.mark.parametrize(
@@ -158,6 +168,11 @@ def test_a_file_that_promises_nothing_is_refused(
     ("more", "says"),
     [
         ("--ties first", "was made with ties drawn, not first; make one with `harness study"),
+        (
+            "--prompt v3",
+            "was fitted with prompt.version v2, not v3; make one with `harness study "
+            "promise`, of runs of this model with --prompt v3",
+        ),
         ("--latency ego=0.3", 'was made with latency {"ego_s":0.145,'),
     ],
 )
