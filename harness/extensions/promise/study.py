@@ -197,8 +197,13 @@ def check(runs: Sequence[ReplayedRun], tune: ReplayedRun) -> None:
 def check_choice(report: ReplayedRun, tune: ReplayedRun) -> None:
     """Raise UserError unless the layouts of both runs are chosen by chance, or by the same danger.
 
-    Layouts that are chosen by their outcome promise nothing of others.
+    Layouts that are chosen by their outcome promise nothing of others, nor does their number.
     """
+    if tune.run.manifest.interim_looks:
+        raise UserError(
+            f"--tune {printable(tune.run.path)}: how many layouts it has was decided by looks at "
+            "their outcome; give a run that could not stop early"
+        )
     of_tune, of_report = choice_of(tune), choice_of(report)
     if of_tune != of_report or "--only" in of_tune:
         raise UserError(
