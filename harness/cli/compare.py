@@ -12,7 +12,6 @@ from harness.cli import options
 from harness.cli.next_command import after_comparison
 from harness.cli.terminal import echo_json
 from harness.core.errors import UserError, in_range, printable
-from harness.core.formats import refuse_data
 
 if TYPE_CHECKING:
     from harness.report.compare.gate import Gate
@@ -65,7 +64,7 @@ def command(
     from harness.report.compare.difference import compare as compared
     from harness.report.compare.gate import gate, judge
     from harness.report.compare.pair import pair
-    from harness.report.page import refuse_less, save
+    from harness.report.page import refuse_less, refuse_other, save
     from harness.runs.unanswered import why
 
     if as_markdown and as_json:
@@ -77,7 +76,7 @@ def command(
         if file and file.is_dir():
             raise UserError(f"{option} {printable(file)} is a folder; name a file in it")
         if file:
-            refuse_data(option, file)
+            refuse_other(option, file)
     if html and junit and realpath(html) == realpath(junit):
         raise UserError(f"--html and --junit name one file, {printable(html)}; name two")
     if junit and not fail_if:

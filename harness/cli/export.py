@@ -166,6 +166,9 @@ def command(
         return
     source, folder = read(run), out or run
     if junit:
+        from harness.report.page import refuse_other
+
+        refuse_other("--junit", junit)
         refuse(source)
     target = files.get(option)
     if target:

@@ -73,6 +73,7 @@ def write_report(
     """
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
+    refuse_other("--out", out)
     decisions = Decisions(runs, prompts, full)
     refuse_less(out, decisions.lacks(), "--out")
     save(_pieces(runs, decisions, progress, workers), out, "--out")
@@ -104,13 +105,30 @@ def refuse_less(out: Path, lacks: Mapping[str, str], option: str) -> None:
             )
 
 
+def refuse_other(option: str, out: Path) -> None:
+    """Raise UserError if a page or a table of tests would replace what is neither, or a run's data.
+
+    An empty file may be replaced. `option` names the command-line option that gave the file.
+    """
+    refuse_data(option, out)
+    if not out.is_file():
+        return
+    with opened(out, "rows") as file:
+        head = file.read(HEAD)
+    if head and not re.search(rb"SwarmDrive Harness</title>|<testsuites?[ >]", head):
+        raise UserError(
+            f"{option} {printable(out)} is a file that no command here wrote, and would be lost; "
+            "name another file, or delete it"
+        )
+
+
 def save(pieces: Iterable[str], out: Path, option: str) -> None:
     """Write a page's pieces to a file, which is replaced only once it is whole.
 
     `pieces` are texts, one after the other. Raises UserError, with the name of the command-line
     option (`option`), if the file cannot be written, or is data of a run.
     """
-    refuse_data(option, out)
+    refuse_other(option, out)
     try:
         with replacing(out) as part, part.open("w", encoding="utf-8", newline="") as file:
             file.writelines(pieces)

@@ -171,11 +171,14 @@ def test_a_gate_on_what_is_not_known_is_refused_and_does_not_pass(
 
 
 def test_options_that_cannot_be_are_one_line(runs: tuple[Path, Path], harness: Harness) -> None:
+    Path("mine").write_text("mine")
     for options, said in (
         (("--json", "--markdown"), "--markdown and --json: give one of them"),
         (("--show", "-1"), "--show -1 is out of range"),
         (("--html", "."), "--html . is a folder; name a file in it"),
         (("--html", "a/run.json"), "--html a/run.json is a file of a run, suite or dataset, whi"),
+        (("--html", "mine"), "--html mine is a file that no command here wrote"),
+        (("--junit", "mine", "--fail-if", "late_rate > 0"), "--junit mine is a file that no comm"),
         (("--html", "x", "--junit", "./x", "--fail-if", "success_rate drops > 1"), "two"),
         (("--html", "a/run.json/page.html"), "--html a/run.json/page.html cannot be written"),
     ):

@@ -666,7 +666,10 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
     done = CliRunner().invoke(app, [str(run), "--out", str(out)])
     assert done.output == f"wrote {out}\n"
     assert out.is_file()
+    notes = tmp_path / "notes.md"
+    notes.write_text("mine")
     for arguments, message in (
+        ([run, "--out", notes], "is a file that no command here wrote, and would be lost; name"),
         ([tmp_path], r"is no finished run: it has no run.json"),
         ([run, "--out", tmp_path], "is a folder; name a file in it"),
         ([run, "--out", out / "page.html"], "cannot be written"),
@@ -675,6 +678,8 @@ def test_the_command_says_where_it_wrote_and_refuses_what_is_no_run(run, tmp_pat
     ):
         with pytest.raises(UserError, match=message):
             CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
+    assert notes.read_text() == "mine"
+    assert CliRunner().invoke(app, [str(run), "--out", str(out)]).output == f"wrote {out}\n"
 
 
 @pytest.mark.exhaustive

@@ -272,11 +272,13 @@ def board(
     """
     from harness.extensions.benchmark import board as boards
     from harness.extensions.benchmark.rescore import Here
+    from harness.report.page import refuse_other
 
     if realpath(out) in map(realpath, files):
         raise UserError(f"--out {printable(out)} is one of the files to rank; name another file")
     if out.is_dir():
         raise UserError(f"--out {printable(out)} is a folder; name a file in it")
+    refuse_other("--out", out)
     here, entries, left_out = Here(), list["Rescored"](), list[str]()
     with ExitStack() as stack:
         for file in dict.fromkeys(files):

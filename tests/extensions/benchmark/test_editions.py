@@ -662,6 +662,14 @@ def test_a_board_does_not_take_the_place_of_a_file_that_it_ranks(
     assert made.read_bytes() == before
 
 
+def test_a_board_does_not_take_the_place_of_what_is_no_page(project: Harness, made: Path) -> None:
+    Path("notes.md").write_text("mine")
+    code, _, err = project("benchmark", "board", made, "--out", "notes.md")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "--out notes.md is a file that no command here wrote, and would be lost" in err
+    assert Path("notes.md").read_text() == "mine"
+
+
 def test_a_board_for_a_folder_is_refused_before_a_file_is_read(project: Harness) -> None:
     code, out, err = project("benchmark", "board", "missing.zip", "--out", "editions")
     assert (code, out) == (2, "")
