@@ -206,7 +206,7 @@ def test_what_a_run_cannot_have_is_one_line(commit: str, harness: Typed) -> None
     for words, why in {
         "study sweep {run}/drive": "was driven",
         "run merge {run}/proxy {run}/drive --out merged": "is no shard",
-        "eval --model replay:{run}/begun": "is no finished run",
+        "eval --model replay:{run}/begun": "is no finished run, and the command that began it conti",
     }.items():
         code, _, error = harness(*words.format(run=HERE / commit).split())
         assert (code, error.count("\n")) == (2, 1)

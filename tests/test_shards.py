@@ -159,6 +159,10 @@ def test_a_shard_says_what_to_do_with_it_and_goes_on(
         f"wrote {shard}: 2 of 6 episodes, shard 2/3; merge all 3 shards with "
         "`harness run merge FOLDER... --out FOLDER`\n"
     )
+    for typed in (("report", shard), ("compare", shard, shard), ("run", "check", shard)):
+        code, out, said = harness(*typed)
+        assert (code, out) == (2, "")
+        assert "is a shard of a run; `harness run merge` makes one of all its shards" in said
     for other in (["--shard", "1/3"], []):
         code, _, said = harness(*DRIVE, *other, "--out", shard)
         assert (code, "was begun with another shard;" in said) == (2, True)

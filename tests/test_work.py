@@ -149,6 +149,10 @@ def test_settings_that_differ_are_named(tmp_path: Path) -> None:
     ) as raised:
         work.same(tmp_path, {"seed": 1, "limit": 3}, {"seed": 2})
     assert "repeat its settings (seed 2), delete it" in str(raised.value)
+    now = {"channels": {"mine": {"loss": 0.1}, "6g": {}}, "kept": {"calibrations": {"cz": "a"}}}
+    before = {"channels": {"mine": {"loss": 0.2}, "6g": {}}, "kept": {"calibrations": {"cz": "b"}}}
+    with pytest.raises(UserError, match="another channels/mine/loss, kept/calibrations/cz; repeat"):
+        work.same(tmp_path, now, before)
     stated = {"ask": "all", "ties": "fir\nst", "identity": "f" * 64, "dtype": None, "tags": []}
     with pytest.raises(UserError, match=r"settings \(ask all, ties fir\\nst\), delete") as raised:
         work.same(tmp_path, {}, stated)

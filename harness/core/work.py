@@ -29,6 +29,7 @@ LOCK = "lock"
 UNANSWERED = "unanswered.txt"  # why the work stopped, if the model could not be asked
 MOST_WORDS = 10_000  # characters of it that are read
 GONE_S = 3.0  # seconds until the processes of a killed command are gone
+LEVELS = 3  # of tables of settings that a message goes down, as to `kept/calibrations/mine`
 SHORT = 30  # most characters of a setting's value that a message has
 
 
@@ -140,12 +141,24 @@ def same(
             key: str(value) for key, value in before.items() if isinstance(value, str | int | float)
         }
         short = ", ".join(f"{key} {value}" for key, value in words.items() if len(value) <= SHORT)
-        what = typed() or f"another {', '.join(differing)}"
+        what = typed() or f"another {', '.join(_changes(now, stored))}"
         repeated = f" ({short})" if short and what.startswith("another ") else ""
         raise UserError(
             f"--out {printable(out)} was begun with {printable(what)}; repeat its "
             f"settings{printable(repeated)}, delete it, or choose another folder"
         )
+
+
+def _changes(now: Any, stored: Any, depth: int = LEVELS, within: str = "") -> list[str]:
+    """Return the names of settings that differ; of tables in them, such as of channels, by path."""
+    if not depth or not (isinstance(now, Mapping) and isinstance(stored, Mapping)):
+        return [within]
+    names = list[str]()
+    for key in {**now, **stored}:
+        if now.get(key) != stored.get(key):
+            path = f"{within}/{key}" if within else str(key)
+            names += _changes(now.get(key), stored.get(key), depth - 1, path)
+    return names
 
 
 def held(out: Path) -> bool:

@@ -25,7 +25,7 @@ from harness.core.config import LONGEST_S
 from harness.core.depth import shallow
 from harness.core.errors import UserError, printable, sayable
 from harness.core.files import BROKEN, bytes_of, text_of
-from harness.core.formats import SUITE
+from harness.core.formats import CONFIG, SUITE, WORK
 from harness.core.memory import uncollected
 from harness.core.statistics import cluster_numbers
 from harness.runs import formats
@@ -354,6 +354,11 @@ def _other_than_run(path: Path) -> str:
         return "a suite; give the folder of one of its runs"
     if reason := work.unanswered(path):
         return f"no finished run, since its model could not be asked: {reason}"
+    with suppress(OSError, ValueError, RecursionError):
+        start = msgspec.json.decode(text_of(path / WORK / CONFIG, "record"), type=work.WorkStart)
+        if start.shard:
+            return "a shard of a run; `harness run merge` makes one of all its shards"
+        return "no finished run, and the command that began it continues it"
     if path.is_file():
         return "a file; a run is a folder, made by `harness eval` or `harness drive`"
     return (
