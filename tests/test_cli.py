@@ -165,6 +165,22 @@ def test_a_dataset_in_place_of_settings_is_told_where_it_goes(
     )
 
 
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("eval proxy", "proxy is a model, and no settings; type `harness eval --model proxy`"),
+        ("drive replay:r", "replay:r is a model, and no settings; type `harness drive --model"),
+        ("drive --limit 3", "--limit is none of `harness drive`; give --episodes in `harness"),
+        ("eval --scenario x", "--scenario is none of `harness eval`; give --dataset in `harness"),
+        ("eval --condition 6g:tau", "'6g:tau': tau has no value; give it one, as in 6g:window_s="),
+    ],
+)
+def test_what_stands_in_a_wrong_place_is_told_where_it_goes(
+    typed: str, said: str, harness: Harness
+) -> None:
+    assert said in one_line(harness(*typed.split()))
+
+
 def test_a_dataset_that_is_none_is_one_line(harness: Harness, tmp_path: Path) -> None:
     assert "unknown dataset 'nowhere'" in one_line(harness("eval", "--dataset", "nowhere"))
     (tmp_path / "empty").mkdir()

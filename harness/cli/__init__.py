@@ -68,6 +68,15 @@ MACHINE = frozenset(
 )
 
 
+# What the other way to make a run calls it, by command and option.
+MEANT = {
+    ("drive", "--limit"): "--episodes",
+    ("drive", "--dataset"): "--scenario",
+    ("eval", "--episodes"): "--limit",
+    ("eval", "--scenario"): "--dataset",
+}
+
+
 # new objects; at 700, as usual, imports and tables are walked again and again
 COLLECT_AFTER = 50_000
 
@@ -138,8 +147,11 @@ def _typed() -> None:
             print(message)
             sys.exit(2)
         command = context.info_name if context else ""
-        if gone := _part_of_gone(command, getattr(error, "option_name", "")):
-            message = f"{error.option_name} is {gone}"
+        option = getattr(error, "option_name", "")
+        if gone := _part_of_gone(command, option):
+            message = f"{option} is {gone}"
+        elif meant := MEANT.get((command, option)):
+            message = f"{option} is none of `harness {command}`; give {meant}"
         path = context.command_path if context else "harness"
         typed = printable(" ".join(["harness", *sys.argv[1:]]))
         _fail(f"{printable(message.removesuffix('.'), 300)} in `{typed}`; see `{path} --help`")

@@ -120,7 +120,8 @@ def echo_note(run: "Run", is_warned: bool) -> None:
     if not limits:
         return
     more = len(limits) - (not is_warned)
-    rest = f"({amount(more, 'more note')} and all tables: --verbose)"
+    beside = f"{amount(more, 'more note')} and " if more else ""
+    rest = f"({beside}all tables: --verbose)"
     if is_warned:
         echo_text(rest)
     else:

@@ -28,9 +28,9 @@ def command(
     sayable_path("folder", folder)
     place = folder.resolve()  # `absent/../mine` is there once `absent` is made
     try:
-        if place.exists() and (
-            not place.is_dir() or {path.name for path in place.iterdir()} - {".git"}
-        ):
+        if place.exists() and not place.is_dir():
+            raise UserError(f"{printable(folder)} is a file; give a new folder, or an empty one")
+        if place.exists() and {path.name for path in place.iterdir()} - {".git"}:
             raise UserError(f"{printable(folder)} is not empty; give a new folder, or an empty one")
         place.mkdir(parents=True, exist_ok=True)
         # so that a full disk leaves nothing half-written

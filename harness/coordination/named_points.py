@@ -55,7 +55,7 @@ def named_point(text: str) -> OperatingPoint:
     settings: dict[str, Any] = {}
     radio: dict[str, str] = {}
     for setting in rest.split(",") if colon else ():
-        key, _, value = setting.partition("=")
+        key, equals, value = setting.partition("=")
         field, scale = SHORT.get(key, (key, 1.0))
         if field not in typed_settings() and field not in channel_settings:
             if gone := gone_setting(field):
@@ -63,6 +63,11 @@ def named_point(text: str) -> OperatingPoint:
             allowed = (*typed_settings(), *SHORT, *channel_settings)
             raise unknown(
                 f"setting of operating point {name}", key, allowed, f"; as in {name}:window_s=0.3"
+            )
+        if not equals:
+            raise UserError(
+                f"operating point {printable(text)!r}: {printable(key)} has no value; give it one, "
+                f"as in {name}:window_s=0.3"
             )
         after_colon = value.partition(":")[2].partition("=")[0]
         if after_colon in SHORT or after_colon in (*typed_settings(), *channel_settings):

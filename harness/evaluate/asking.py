@@ -97,7 +97,7 @@ def _say_unread(card: Card, prompt: str) -> None:
     command = shlex.join(["harness", "prompt", "check", other, "--model", cards.argument(card)])
     print(
         f"harness: none of the first answers of {printable(card.name)} to prompt {prompt} could "
-        f"be read, and the run goes on; try another: `{printable(command, 300)}`; `harness prompt "
+        f"be read; try another: `{printable(command, 300)}`; `harness prompt "
         "list` shows all",
         file=sys.stderr,
     )

@@ -601,6 +601,10 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
         if _is_dataset(str(place)):
             words = printable(shlex.join(["harness", "eval", "--dataset", str(place)]), 2000)
             raise UserError(f"{printable(place)} is a dataset, and no settings; type `{words}`")
+        if _is_card(str(place)) or str(place).startswith("replay:"):
+            command = COMMANDS[str(world.__struct_config__.tag)]
+            words = printable(shlex.join(["harness", command, "--model", str(place)]), 2000)
+            raise UserError(f"{printable(place)} is a model, and no settings; type `{words}`")
         raise UserError(
             f"{where}: there is no such file; give a {FILE} or the folder of a run that has one, "
             "which runs have since 0.3; for another, type the command in its run.json"

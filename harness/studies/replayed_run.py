@@ -58,8 +58,8 @@ WALKS = 1 << 15  # most that are walked together, unless one grid point has more
 KEPT = 1 << 14
 FEW = 8  # share of them that is walked first, so that who waits sees results soon
 _GIVE_IT = (
-    "to ask it, give --model with its folder, .gguf file or hub id, or write a card "
-    "models/NAME.toml"
+    "to ask it, give --model with its folder, .gguf file, hub id or server's address, or write a "
+    "card models/NAME.toml"
 )
 OWN = ("ego", "helper")  # roles that have one answer a vehicle
 LEFT_OUT, ASKED, LOST = "left-out", "asked", "lost"  # what results lack; a role follows the others

@@ -155,13 +155,9 @@ def test_a_folder_that_is_not_empty_is_refused_and_left(harness: Harness, tmp_pa
     (tmp_path / "full").mkdir()
     (tmp_path / "full/x\x1b").touch()
     (tmp_path / "file").touch()
-    for name in ("full", "file"):
-        said = harness("init", name)
-        assert said == (
-            2,
-            "",
-            f"harness: {name} is not empty; give a new folder, or an empty one\n",
-        )
+    for name, state in (("full", "not empty"), ("file", "a file")):
+        said = f"harness: {name} is {state}; give a new folder, or an empty one\n"
+        assert harness("init", name) == (2, "", said)
     assert os.listdir(tmp_path / "full") == ["x\x1b"]
     code, out, err = harness("init", "file/below")
     assert (code, out) == (2, "")

@@ -160,6 +160,13 @@ def test_a_gate_that_cannot_be_read_is_one_line(
     assert not Path("page.html").exists()
 
 
+def test_a_run_beside_itself_is_said_to_be(runs: tuple[Path, Path], harness: Harness) -> None:
+    code, out, err = harness("compare", runs[0], runs[0])
+    assert (code, err) == (0, "")
+    assert "A and B are one folder" in " ".join(out.split())
+    assert "(0 more" not in out
+
+
 def test_a_gate_on_what_is_not_known_is_refused_and_does_not_pass(
     runs: tuple[Path, Path], harness: Harness
 ) -> None:

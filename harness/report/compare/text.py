@@ -90,7 +90,8 @@ def _brief_lines(comparison: Comparison, verdicts: Sequence[Verdict]) -> Iterato
     yield from words.caveats(pair, (Kind.VOID, Kind.CAVEAT))
     notes = words.caveats(pair, (Kind.LIMIT,))
     if notes:
-        yield f"{first_note(notes[0])} ({len(notes) - 1} more: --verbose)"
+        more = f" ({len(notes) - 1} more: --verbose)" if len(notes) > 1 else ""
+        yield f"{first_note(notes[0])}{more}"
     for verdict in verdicts:
         yield words.judged(verdict)
 

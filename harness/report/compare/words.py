@@ -286,6 +286,9 @@ def paired(pair: Pair) -> str:
 
 def differing(comparison: Comparison) -> str:
     """Return a phrase with the kinds of settings in which runs differ, such as `model, prompt`."""
+    a, b = (side.run.path.resolve() for side in (comparison.pair.a, comparison.pair.b))
+    if a == b:
+        return "A and B are one folder"
     kinds = list(dict.fromkeys(name.partition(".")[0] for name, _, _ in comparison.settings))
     return f"differ in {', '.join(kinds)}" if kinds else "differ in no setting"
 
