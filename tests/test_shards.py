@@ -301,6 +301,20 @@ def test_no_link_in_a_shard_is_followed(
     assert f"/2/{place} is a link, which no command makes; delete it" in refused(harness, shards)
 
 
+@pytest.mark.slow
+def test_a_merged_run_has_the_command_of_its_settings(
+    split: Path, harness: Typed, tmp_path: Path
+) -> None:
+    shards = copied(split, tmp_path, "1", "2", "3")
+    config = shards[0] / ".work/config.json"
+    stated = json.loads(config.read_text())
+    config.write_text(json.dumps({**stated, "command": ["harness", "drive", "--model", "brake"]}))
+    assert harness("run", "merge", *shards, "--out", "merged", "--quiet")[0] == 0
+    command = json.loads((tmp_path / "merged/run.json").read_text())["command"]
+    assert shlex.split(command)[:-2] == stated["command"]
+    assert (tmp_path / "merged/run.toml").read_text() == (split / "whole/run.toml").read_text()
+
+
 def test_a_shard_with_another_text_of_its_prompt_is_named(
     split: Path, harness: Typed, tmp_path: Path
 ) -> None:

@@ -73,7 +73,7 @@ from harness.runs.records import (
     Latency,
     Manifest,
 )
-from harness.runs.settings import FILE, of_words, text_of
+from harness.runs.settings import FILE, Settings, of_words, text_of, words
 from harness.runs.stopping import InterimLooks
 from harness.runs.summary import Figures, counted
 from harness.runs.unanswered import Tally, of_use
@@ -224,7 +224,11 @@ def _merged(run_starts: Sequence[RunStart], folders: Sequence[Path], out: Path) 
     )
     tags = tuple(dict.fromkeys(tag for each in run_starts for tag in each.tags))
     created = min(each.created for each in run_starts)
-    whole = msgspec.structs.replace(run_starts[0], shard="", tags=tags, created=created)
+    # A shard may state any words; the settings are those that all shards have.
+    command = words(msgspec.convert(run_starts[0].settings["settings"], Settings))
+    whole = msgspec.structs.replace(
+        run_starts[0], shard="", tags=tags, created=created, command=command
+    )
     made_of = _sources_of(folders, whole.settings)
     if (out / "run.json").exists() and (out / WORK).is_dir():
         # Anybody may have written what a stopped merge finished, and the shards are here.
