@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache, wraps
 from glob import escape
 from io import BufferedReader
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeVar
 
@@ -284,7 +285,7 @@ def refuse_links(path: Path) -> None:
     It guards what is read or copied from a folder that somebody else may have made: a link leads
     anywhere, to any file of whoever reads it.
     """
-    for place in (path, *path.rglob("*")):
+    for place in chain([path], path.rglob("*")):  # the first before any of what it leads to
         if place.is_symlink():
             raise UserError(f"{printable(place)} is a link, which no command makes; delete it")
 
