@@ -125,7 +125,7 @@ def test_a_name_of_a_sweeps_axis_means_the_same_in_a_condition(name):
         ("6g:", "unknown setting of operating point 6g ''"),
         ("6g:windows_s=0.3", "did you mean 'window_s'?"),
         ("6g:profile=v2x", "unknown setting of operating point 6g 'profile'"),
-        ("6g:tau_nats", "tau_nats is ''; it must be a finite number"),
+        ("6g:tau_nats", "tau_nats has no value; give it one, as in 6g:window_s=0.3"),
         ("6g:max_helpers=1.5", "max_helpers is '1.5'; it must be a whole number"),
         ("6g:on_demand=yes", "on_demand is 'yes'; it must be true or false"),
         ("6g:loss=nan", "loss is nan; it must be a probability"),
