@@ -45,6 +45,9 @@ def ls(folder: options.Reports = Path("reports"), as_json: options.Json = False)
             typer.echo(
                 f"{'':8}{share} of the ego's answers could be read: it drives by the fallback"
             )
+        if run.pick:
+            chosen = printable(f"of episodes chosen by {run.pick}", WIDTH - 8)
+            typer.echo(f"{'':8}{chosen}")
         if run.tags:
             typer.echo(f"{'':8}{printable('tags: ' + ', '.join(run.tags), WIDTH - 8)}")
     if not listed:

@@ -36,10 +36,13 @@ class Choice:
 class Selection(ABC):
     """Choose which episodes a run uses, such as a random sample, by an extension's settings.
 
-    `chosen_by` names these settings. It is a base class; objects do not change.
+    `chosen_by` names these settings, and `by_chance` those of them that look at no episode, such as
+    a sample's. It is a base class; objects do not change.
     """
 
     chosen_by: ClassVar[tuple[str, ...]]  # names of the settings of its extension that choose it
+    # those of them that draw, and look at no episode
+    by_chance: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def opened(self, settings: Mapping[str, Any]) -> "Selection | None":
@@ -83,6 +86,17 @@ def lacking(record: Mapping[str, Any]) -> str | None:
     """
     owners = [owner_of_plugin("settings", name) for name in record]
     return next((owner for owner in owners if owner and owner not in extensions()), None)
+
+
+def pick(record: Mapping[str, Any]) -> str:
+    """Return the options that chose a run's episodes by anything but chance, as one text.
+
+    Whoever chose them may have looked at what happens in them, so that they say nothing of others.
+    `record` is the `selection` that the run states, values by name. Empty if nothing chose so.
+    """
+    blind = {"of", *[name for each in SELECTIONS.values() for name in each.by_chance]}
+    chosen = {name: value for name, value in record.items() if name not in blind}
+    return " ".join(f"--{name} {printable(value, 40)}" for name, value in chosen.items())
 
 
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:

@@ -16,6 +16,7 @@ from harness.core.figures import PERCENT, amount
 from harness.core.places import text
 from harness.core.plugins import Plugins
 from harness.core.statistics import FEWEST, too_few
+from harness.dataset.select import pick
 from harness.parsing.status import Status
 from harness.prompts.readout import MOST_SHARE
 from harness.report.apart import said_of
@@ -379,6 +380,12 @@ def stated_elsewhere(run: Run) -> Iterator[str]:
             "wrote: no model was asked here. Its name, and tokens and seconds of answers, are as "
             "stated: nobody here counted or timed them."
         )
+
+
+def picked(run: Run) -> Iterator[str]:
+    """Yield by which options a run's episodes were chosen, if by anything but chance."""
+    if chosen := pick(run.manifest.world.selection):
+        yield f"The episodes were chosen by {chosen}: figures and intervals are of such alone."
 
 
 def beyond_sources(run: Run) -> Iterator[str]:

@@ -76,6 +76,7 @@ OF_RUNS: Mapping[Kind, Sequence[Source[Runs]]] = {
         caveats.of_one_name,
         each(caveats.moved_system),
         each(caveats.by_letter),
+        each(caveats.picked),
         each(caveats.beyond_sources),
         each(caveats.stopped),
         each(ignores_input),

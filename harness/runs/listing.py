@@ -41,6 +41,7 @@ class Listed:
     % interval. `unread` is the share of the ego's answers that could not be parsed. `state` says
     whether it is finished or broken, and `why` how an unfinished run goes on, or what is wrong with
     a broken one. `date` is when it began, or a study was last written.
+    `pick` has the options that chose its episodes by anything but chance.
     """
 
     name: str  # its folder, relative to the folder that is listed
@@ -66,6 +67,7 @@ class Listed:
     high: float | None = None  # its upper end
     unread: float | None = None  # share of the ego's answers that could not be parsed
     metric: str | None = None  # name of the metric that `success` is, balanced or plain success
+    pick: str = ""  # options that chose its episodes by anything but chance; empty for none
 
 
 def runs(folder: Path) -> list[Listed]:
@@ -163,7 +165,9 @@ def _finished_entry(path: str, has_summary: bool, written: datetime) -> Listed:
         if config["format"] != formats.FORMAT:
             return listed
         listed = replace(listed, kind=KINDS[config["world"]["kind"]], date=_date(config["created"]))
-        listed = replace(_with_config(listed, config), why="summary.csv")
+        selection = config["world"].get("selection")
+        chosen = _pick(selection) if selection else ""
+        listed = replace(_with_config(listed, config), why="summary.csv", pick=chosen)
         if not has_summary:
             return listed
         rows = _rows(path)
@@ -290,6 +294,12 @@ def _with_success(
         unread=unread[0] if unread else None,
         metric=metric,
     )
+
+
+def _pick(selection: dict[str, Any]) -> str:
+    from harness.dataset.select import pick  # imported here because it is slow
+
+    return pick(selection)
 
 
 def _doubted(config: dict[str, Any], rows: Rows) -> set[str]:

@@ -4,7 +4,7 @@ They are chosen on tune layouts, from a grid that is fixed before, by tests that
 (`risk`), and verified on report layouts. Other runs show what happens where nothing is promised.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from harness.core.figures import amount
 from harness.core.progress import Progress
 from harness.core.seeds import purposes, seeds_text
 from harness.dataset import rebuilt
+from harness.dataset.select import pick
 from harness.extensions.promise.blind import blind_outcomes
 from harness.extensions.promise.grid import Grid, grid_of
 from harness.extensions.promise.outcomes import (
@@ -48,7 +49,6 @@ from harness.studies.sweep import distinct_names, point_of
 
 DELTA = 0.05
 AT_MOST = (0.01, 0.02, 0.05, 0.1)
-BY_CHANCE = ("sample", "sample_seed")  # of what selects layouts; all else looks at them
 
 
 def run_promise(
@@ -224,9 +224,7 @@ def check_all(tune: ReplayedRun) -> None:
 
 def choice_of(run: ReplayedRun) -> str:
     """Return the options that choose the layouts of a run by anything but chance, as one text."""
-    selection: Mapping[str, Any] = run.run.manifest.world.selection
-    chosen = {name: value for name, value in selection.items() if name not in BY_CHANCE}
-    return " ".join(f"--{name} {printable(value, 40)}" for name, value in chosen.items())
+    return pick(run.run.manifest.world.selection)
 
 
 def seed_range(run: ReplayedRun) -> tuple[int, int]:

@@ -16,10 +16,12 @@ class Episodes(Selection):
     """Select the episodes of a run that meet all conditions that are set; None sets none.
 
     The danger is the vehicle that the ego would meet if it drove on, and a sector, such as `left`,
-    the side from which it comes. `chosen_by` names the settings that choose this selection.
+    the side from which it comes. `chosen_by` names the settings that choose this selection, and
+    `by_chance` those of them that draw.
     """
 
     chosen_by: ClassVar[tuple[str, ...]] = ("only", "danger", "sample", "sample_seed")
+    by_chance: ClassVar[tuple[str, ...]] = ("sample", "sample_seed")
 
     only: str | None = None  # numbers and ranges such as `3,10:20`; a range leaves out its end
     danger: str | None = None  # the sector that the hidden danger comes from, or `none`

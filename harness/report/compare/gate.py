@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from harness.core.errors import UserError, printable, unknown
+from harness.core.figures import amount
 from harness.core.statistics import Estimate
 from harness.report.compare.difference import Comparison
 from harness.runs.metrics import METRICS
@@ -127,9 +128,17 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
     messages.
 
     Raises:
-        UserError: the gate's condition is not compared, a run lacks one that it is on, or the
-            difference is unknown there.
+        UserError: the gate's condition is not compared, a run lacks one that it is on, the
+            difference is unknown there, or a run was chosen to lack episodes of the other.
     """
+    pair = comparison.pair
+    for side, chosen in pair.left_out.items():
+        other = pair.b if side == "A" else pair.a
+        lacks = amount(len(other.run.grid.episodes) - len(pair.episodes), "episode")
+        raise UserError(
+            f"--fail-if {printable(gate.text)!r}: {side} lacks {lacks} of the other run by "
+            f"{chosen}, perhaps for how they end; compare two runs that are chosen alike"
+        )
     changes: dict[str, Estimate | None] = {}
     for condition in comparison.conditions:
         changes[condition.condition] = None
@@ -137,7 +146,7 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
             if each.metric == gate.metric:
                 change = each.change
                 changes[condition.condition] = of_no_width(change) if each.is_alike else change
-    return judge_changes(gate, changes, comparison.pair.alone)
+    return judge_changes(gate, changes, pair.alone)
 
 
 def of_no_width(change: Estimate) -> Estimate:

@@ -15,6 +15,7 @@ from harness.core.errors import UserError, printable
 from harness.core.memory import uncollected
 from harness.core.places import nameless
 from harness.core.statistics import joined_clusters
+from harness.dataset.select import pick
 from harness.report.runs import parameters_apart
 from harness.report.words import facts
 from harness.runs.contradictions import sound
@@ -133,6 +134,21 @@ class Pair:
         """
         a, b = self.a.run.conditions, self.b.run.conditions
         return {"A": [name for name in a if name not in b], "B": [n for n in b if n not in a]}
+
+    @cached_property
+    def left_out(self) -> dict[str, str]:
+        """Return by which options run `A`, and run `B`, lacks episodes of the other.
+
+        These are options that choose episodes by anything but chance, such as by what happens in
+        them; a run that lacks none by them, or whose other run was chosen alike, is left out.
+        """
+        options = {}
+        for name, run, other in (("A", self.a.run, self.b.run), ("B", self.b.run, self.a.run)):
+            chosen = pick(run.manifest.world.selection)
+            is_alike = chosen == pick(other.manifest.world.selection)
+            if chosen and not is_alike and set(other.grid.episodes) - set(run.grid.episodes):
+                options[name] = chosen
+        return options
 
     @cached_property
     def clusters(self) -> Ints | None:

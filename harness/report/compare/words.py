@@ -274,13 +274,15 @@ def _by_stopping_rule(pair: Pair) -> Iterator[str]:
 def paired(pair: Pair) -> str:
     """Return a phrase on how many episodes and seeds two runs share, and what only one has."""
     text = f"{crossed(len(pair.episodes), len(pair.seeds))} of {where(pair.a.run)}"
-    for name, side in (("A", pair.a), ("B", pair.b)):
+    for name, side, other in (("A", pair.a, "B"), ("B", pair.b, "A")):
         conditions = pair.alone[name]
         episodes = len(side.run.grid.episodes) - len(pair.episodes)
         if conditions:
             text += f"; only {name} has {', '.join(conditions)}"
         if episodes:
             text += f"; {name} has {amount(episodes, 'more episode')}"
+            if chosen := pair.left_out.get(other):
+                text += f", left out of {other} by {chosen}"
     return text
 
 

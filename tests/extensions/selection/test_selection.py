@@ -4,6 +4,7 @@ import json
 import shlex
 import shutil
 from collections.abc import Callable
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,42 @@ def test_a_run_says_which_and_its_command_and_file_select_them_again(harness: Ty
     code, _, error = harness("run", "check", "a")
     assert (code, error.count("\n")) == (2, 1)
     assert "its settings have world.sample_seed 0, and beside them it is 7" in error
+
+
+@pytest.mark.slow
+def test_what_was_chosen_by_more_than_chance_is_said_and_passes_no_gate(
+    harness: Typed, small_path: Path
+) -> None:
+    for name, *choice in (
+        ("whole",),
+        ("some", "--only", "0:3"),
+        ("fewer", "--only", "0:3", "--sample", "2"),
+        ("sample", "--sample", "2"),
+        ("first", "--limit", "2"),
+    ):
+        words = ("--dataset", small_path, "--seeds", "0:1", "--condition", "single-local")
+        code, out, _ = harness("eval", *words, *choice, "--out", f"runs/{name}")
+        said = "The episodes were chosen by --only 0:3: figures and intervals are of such alone."
+        is_said = said in " ".join(out.split())
+        assert (code, is_said) == (0, "--only" in choice)
+        assert (said in unescape(Path(f"runs/{name}/report.html").read_text())) == is_said
+    assert harness("run", "ls", "runs")[1].count("of episodes chosen by --only 0:3") == 2
+    gate = ("--fail-if", "success_rate < -0.5")
+    for a, b, lacks, n in (
+        ("whole", "some", "B", "1 episode"),
+        ("some", "whole", "A", "1 episode"),
+        ("whole", "fewer", "B", "2 episodes"),
+        ("some", "fewer", "", ""),
+        ("whole", "sample", "", ""),
+        ("first", "some", "", ""),
+    ):
+        code, out, error = harness("compare", f"runs/{a}", f"runs/{b}", *gate)
+        refused = f"success_rate < -0.5': {lacks} lacks {n} of the other run by --only 0:3, "
+        assert (code, out == "", refused in error) == (
+            (2, True, True) if lacks else (0, False, False)
+        )
+    out = harness("compare", "runs/whole", "runs/some")[1]
+    assert "A has 1 more episode, left out of B by --only 0:3;" in " ".join(out.split())
 
 
 @pytest.mark.exhaustive
