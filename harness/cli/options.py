@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Argument, Context, Option, echo
 
+from harness.core import resources
 from harness.core.errors import UserError, printable
 from harness.core.extensions import owner_of_plugin
 from harness.runs import settings as stated
@@ -383,17 +384,19 @@ def _gathering(command: Any, name: str, added: Sequence[inspect.Parameter]) -> A
     return as_command(typed, command, [*parameters[:place], *added, *parameters[place + 1 :]])
 
 
-def check_new_file(option: str, path: Path, named: str = "it") -> None:
-    """Raise UserError unless a TOML file can be written that runs name afterwards.
+def check_new_file(option: str, path: Path, kind: str) -> str:
+    """Return what to say of a TOML file that is written to be named by runs; empty for nothing.
 
-    `path` was given as `option`; `named` is what runs name, in words.
+    It is where they would find it. `path` was given as `option`, and `kind` is the folder of such
+    files, as `schedules`. Raises UserError if its name is none for it, or is taken.
     """
     if path.suffix != ".toml":
         raise UserError(f"{option} {printable(path)}: end it in .toml")
     if path.exists():
         raise UserError(
-            f"{option} {printable(path)} is there already; give a new name, since runs name {named}"
+            f"{option} {printable(path)} is there already; give a new name, since runs name {kind}"
         )
+    return "" if resources.finds(kind, path) else f"; runs find it in {kind}/ of a project"
 
 
 def scenario_name(name: str | None, of_family: Mapping[str, str]) -> str:

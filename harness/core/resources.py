@@ -83,6 +83,11 @@ def find(kind: str, name: str) -> Path:
     return existing[0] if existing else candidates[0]
 
 
+def finds(kind: str, path: Path) -> bool:
+    """Return whether a file at this path is found by its name, as one of a kind like `channels`."""
+    return path.absolute().parent in _folders(kind)
+
+
 def card_to_copy(model: str) -> str | None:
     """Return a sentence on where to copy a model card from that no longer ships; None for others.
 

@@ -31,13 +31,13 @@ def command(
     from dataclasses import asdict
     from typing import cast, get_args
 
-    from harness.extensions.calibration.calibrations import Level
+    from harness.extensions.calibration.calibrations import FOLDER, Level
     from harness.extensions.calibration.fitting import calibrate
     from harness.runs.fit import write
 
     if level not in get_args(Level):
         raise unknown("--level", level, get_args(Level))
-    options.check_new_file("--out", out)
+    where = options.check_new_file("--out", out, FOLDER)
     calibration, fitted = calibrate(
         run, cast(Level, level), dataset, shlex.join(["harness", *sys.argv[1:]])
     )
@@ -57,4 +57,5 @@ def command(
         )
     typer.echo(
         f"wrote {printable(out)}: {calibration.level}, fitted on {printable(calibration.fitted_on)}"
+        f"{where}"
     )

@@ -60,7 +60,6 @@ def command(
     from typing import cast, get_args
 
     from harness.core.memory import uncollected
-    from harness.core.resources import MARKER
     from harness.extensions.promise.outcomes import unable
     from harness.extensions.promise.page import promise_study
     from harness.extensions.promise.promises import FOLDER, Harm
@@ -75,10 +74,10 @@ def command(
         for value in values:
             if not 100 * LEAST <= value < 100:
                 raise UserError(f"{name} {value:g}: give percent, between {100 * LEAST:g} and 100")
+    looked_for = ""
     if write is not None:
-        options.check_new_file("--write", write)
-        in_folder = write.absolute().parent == Path(FOLDER).absolute()
-        if in_folder and not Path(MARKER).is_file():
+        looked_for = options.check_new_file("--write", write, FOLDER)
+        if looked_for and write.absolute().parent == Path(FOLDER).absolute():
             raise UserError(
                 f"--write {printable(write)}: no project is here that could use it, `harness init` "
                 "makes one"
@@ -106,4 +105,4 @@ def command(
     if write is not None and level.chosen is None:
         raise UserError(f"{unable(result, level)}; no file is written")
     if write is not None and not (as_json or quiet):
-        typer.echo(f"wrote {printable(write)}")
+        typer.echo(f"wrote {printable(write)}{looked_for}")

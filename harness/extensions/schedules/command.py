@@ -41,7 +41,7 @@ def learn(
     from harness.extensions.schedules.learning import ROUNDS, run_learn
     from harness.studies.replayed_run import ReplayedRun
 
-    options.check_new_file("--out", out, "schedules")
+    where = options.check_new_file("--out", out, "schedules")
     point, cards = named_point(condition), options.cards(model)
     command = shlex.join(["harness", *sys.argv[1:]])
     with bar("learning", ROUNDS, quiet=quiet) as progress:
@@ -53,6 +53,7 @@ def learn(
     if not quiet:
         typer.echo(
             f"wrote {printable(out)}: threshold {schedule.threshold:g}, the best on tune layouts"
+            f"{where}"
         )
 
 

@@ -207,7 +207,12 @@ def test_a_calibration_is_of_the_weights_that_it_was_fitted_on(
     identity = {**read(tuned).manifest.identity, "file_sha256": "a" * 64, "states": {"size": 9}}
     configure(tuned, identity=identity)
     command = ("--dataset", small_path, "--out", "calibrations/mine.toml")
-    assert harness("model", "calibrate", tuned, *command)[0] == 0
+    code, said, _ = harness("model", "calibrate", tuned, *command)
+    assert (code, "runs find it" in said) == (0, False)
+    code, said, _ = harness("model", "calibrate", tuned, *command[:3], "mine.toml")
+    assert (code, said.endswith("; runs find it in calibrations/ of a project\n")) == (0, True)
+    code, _, error = harness("model", "calibrate", tuned, *command[:3], "calibrations/mine.toml")
+    assert (code, "give a new name, since runs name calibrations" in error) == (2, True)
     fitted = calibration("mine")
     assert fitted.weights == weights_of(identity)
     assert [*fitted.weights] == ["file_sha256", "states"]

@@ -422,6 +422,11 @@ def test_too_few_sequences_for_a_message_are_refused(drawn_before: None, tmp_pat
         (["--seed", "-1"], "--seed -1 is out of range; give 0 to 2147483647"),
         (["--prompt", "v99"], "unknown prompt 'v99'"),
         (["--prompt", "v2", "do-not-pass"], "--prompt v2: none is for do-not-pass; give v4"),
+        (
+            ["--out", "swarm-tiny"],
+            "swarm-tiny: its name is the model's, and swarm-tiny ships; give",
+        ),
+        (["--out", __file__], ".py is no folder; choose an empty or a new one"),
         (["no-such-road"], "unknown scenario 'no-such-road'"),
         (["occluded-intersection:witnesses=1"], "occluded-intersection is given twice, with other"),
         (

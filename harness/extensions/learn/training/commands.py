@@ -12,7 +12,7 @@ from harness.cli import options
 from harness.cli.progress import bar
 from harness.cli.prompt import Version
 from harness.cli.scenario import ready_to_drive
-from harness.core import extras, resources
+from harness.core import extras, resources, work
 from harness.core.errors import UserError, in_range, printable, unknown
 from harness.core.files import write_whole
 from harness.core.seeds import FIRST, LAST_SEED, purpose, seeds_text
@@ -98,6 +98,7 @@ def distill(
     if threads is not None:
         in_range("--threads", threads, 1, MOST_THREADS)
     in_range("--seed", seed, 0, LAST_SEED)
+    _check_out(out)
     if objective not in OBJECTIVES:
         raise unknown("--objective", objective, OBJECTIVES)
     start, adapt = _base(base, lora, rank, rate, dtype, report)
@@ -217,6 +218,17 @@ def examples(
 def _say_caveat(scenario: "Scenario") -> None:
     if scenario.caveat:
         typer.echo(scenario.caveat)
+
+
+def _check_out(out: Path) -> None:
+    """Raise UserError where a model cannot be made: a file, or a folder of a card's name."""
+    name = out.absolute().name
+    if (resources.folder("models") / f"{name}.toml").is_file():
+        raise UserError(
+            f"--out {printable(out)}: its name is the model's, and {name} ships; give another"
+        )
+    if not out.is_dir():
+        work.start_of(out, work.WorkStart)
 
 
 def _counts(text: str, least: int) -> list[int]:
