@@ -8,5 +8,8 @@ EXTENSION = Extension(
     name="promise",
     commands={"study promise": f"{_HERE}.command:command"},
     studies={"promise": "promise"},
-    adds={"parts": {"promise": f"{_HERE}.part:Careful"}},
+    adds={
+        "parts": {"promise": f"{_HERE}.part:Careful"},
+        "caveats": {"promise": f"{_HERE}.caveat:caveats"},
+    },
 )

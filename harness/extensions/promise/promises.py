@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from harness.coordination.operating_point import OperatingPoint
+from harness.coordination.part_settings import RECORDED, part_of_settings
 from harness.core import resources
 from harness.core.config import Count, convert, toml
 from harness.core.errors import UserError, printable, unknown
@@ -63,8 +64,8 @@ class Promise(Fit):
 
         Returned are its flat name, its value in the condition, and that of the promise.
         """
-        plain = settings_of(OperatingPoint(point.name))
-        return first_unlike(settings_of(point), {**plain, **self.settings})
+        plain = _every_setting(OperatingPoint(point.name))
+        return first_unlike(_every_setting(point), {**plain, **self.settings})
 
     def obstacle(self, agent: Mapping[str, Any], scenario: Scenario) -> str | None:
         reason = super().obstacle(agent, scenario)
@@ -143,6 +144,14 @@ def settings_of(point: OperatingPoint) -> dict[str, Any]:
     """
     record: Mapping[str, Any] = point.record()
     return {k: v for k, v in record.items() if v is not None and k not in CHOSEN}
+
+
+def _every_setting(point: OperatingPoint) -> dict[str, Any]:
+    """Return what `settings_of` does, and defaults of parts that records leave out, too:
+    one that is typed brings its part's others into the record.
+    """
+    every = {RECORDED.get(key, key): point.setting(key) for key in part_of_settings()}
+    return {k: v for k, v in every.items() if v is not None and k not in CHOSEN}
 
 
 def names() -> list[str]:

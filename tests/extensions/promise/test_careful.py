@@ -135,6 +135,16 @@ def test_a_sweep_of_what_a_promise_fixes_says_what_to_type(project: Path) -> Non
     assert not refusal(AXES["consensus"], named_point("6g:tau_nats=0.3,careful_nats=0.9"))
 
 
+@pytest.mark.parametrize("text", ["6g:promise=p,congestion=adaptive", "6g:promise=p,stream=cam"])
+def test_the_setting_that_is_typed_is_named_not_its_parts_first(project: Path, text: str) -> None:
+    pytest.importorskip("harness.extensions.streams")
+    key, value = text.rpartition(",")[2].split("=")
+    with pytest.raises(UserError) as error:
+        named_point(text)
+    said = f"{key} is {value!r}; it must be none where promise is p, which was made so"
+    assert said in str(error.value)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [

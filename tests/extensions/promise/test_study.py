@@ -9,6 +9,7 @@ from runpy import run_path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from run_on_disk import digested, restated
 from studied import Once
 
@@ -16,6 +17,7 @@ from harness.coordination.named_points import named_point
 from harness.core.progress import Progress
 from harness.core.resources import MARKER
 from harness.dataset.load import load
+from harness.extensions.promise.caveat import caveats
 from harness.extensions.promise.grid import SHARES, grid_of
 from harness.extensions.promise.outcomes import Outcome, play
 from harness.extensions.promise.promises import promise
@@ -117,6 +119,10 @@ def test_a_promise_is_chosen_written_and_kept(runs: Path, harness: Typed) -> Non
     played = read(runs / "kept")
     failed = 1 - played.score("6g:promise=p", "success_rate").value
     assert failed == pytest.approx(chosen["harm_value"])
+    assert [*caveats(played.manifest)] == []
+    danger = replace(played.manifest.world, selection={"danger": "none"})
+    [said] = caveats(replace(played.manifest, world=danger))
+    assert said == "Promise p is of all layouts, and says nothing of those chosen by --danger none."
     latency_ms = played.score("6g:promise=p", "latency_proxy_ms").value
     assert latency_ms == pytest.approx(chosen["latency_ms"], abs=0.01)
     tried = (runs / "report/run/promise/settings.csv").read_text().splitlines()[1:]
