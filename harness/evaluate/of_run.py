@@ -1,6 +1,6 @@
 """The evaluation that a finished run is; prompts, channels and networks must be as they were."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
 from typing import Any, cast
@@ -26,7 +26,7 @@ from harness.radio.profiles import CHANNELS
 from harness.runs.contradictions import current
 from harness.runs.folder import Run
 from harness.runs.settings import deciding
-from harness.runs.sources import PROMPTS, prompt_of, refuse_other_files
+from harness.runs.sources import PROMPTS, copies, prompt_of, refuse_other_files
 
 DRIVER = "driver"  # the engine of what has no model and no prompt
 
@@ -89,7 +89,8 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
         ),
     }
     for folder, recorded_there in manifest.kept.items():
-        is_kept = partial(_is_kept, kept.get(folder, {}))
+        alike = {name for where, name in copies(run) if where == folder}
+        is_kept = partial(_is_kept, kept.get(folder, {}), alike)
         records_by_kind[printable(folder.removesuffix("s"))] = recorded_there, is_kept
     if current(run):
         _check_recorded(run, points, kept)
@@ -150,8 +151,9 @@ def check_prompts(run: Run, spec: Spec) -> None:
             )
 
 
-def _is_kept(kept: Mapping[str, Kept], name: str, recorded: Any) -> bool:
-    return name in kept and _same(kept[name].record, recorded)
+def _is_kept(kept: Mapping[str, Kept], alike: Collection[str], name: str, recorded: Any) -> bool:
+    """Whether a file is as a run states; `refuse_other_files` held those `alike` to its copies."""
+    return name in kept and (name in alike or _same(kept[name].record, recorded))
 
 
 def _same(now: Any, recorded: Any) -> bool:

@@ -13,10 +13,11 @@ from typing import Any
 
 from harness.core import resources
 from harness.core.errors import UserError, printable
-from harness.core.files import bytes_of, refuse_links, sha256_bytes, sha256_file
+from harness.core.files import bytes_of, refuse_links, sha256_bytes
 from harness.core.formats import SOURCES
 from harness.prompts import versions
 from harness.prompts.versions import FILES, OPTIONAL, Prompt
+from harness.runs import fit
 from harness.runs.folder import Run
 
 PROMPTS = "prompts"
@@ -90,19 +91,29 @@ def other_files(run: Run) -> dict[tuple[str, str], Path]:
     """Return the files that a run keeps of what its conditions name, and that are others here.
 
     They are paths in the run's folder, by the folder of a project, such as `promises`, and the name
-    in it. A file is another here if the project has none, or one of another digest than `run.json`
-    states.
+    in it. A file is another here if the project has none, or one that differs from the run's in
+    more than words.
     """
-    files, others = read(run.path), dict[tuple[str, str], Path]()
+    others = dict[tuple[str, str], Path]()
+    for (folder, name), data in copies(run).items():
+        here = resources.find(folder, f"{name}.toml")
+        if not here.is_file() or not fit.is_alike(bytes_of(here, "text"), data):
+            others[folder, name] = run.path / SOURCES / folder / f"{name}.toml"
+    return others
+
+
+def copies(run: Run) -> dict[tuple[str, str], bytes]:
+    """Return what a run keeps of the files that its conditions name and whose digests it states.
+
+    They are contents, by the folder of a project, such as `promises`, and the name in it.
+    """
+    files, contents = read(run.path), dict[tuple[str, str], bytes]()
     for folder, by_name in run.manifest.kept.items():
         for name, recorded in by_name.items():
-            file = f"{folder}/{name}.toml"
-            if file not in files or sha256_bytes(files[file]) != recorded:
-                continue
-            here = resources.find(folder, f"{name}.toml")
-            if not here.is_file() or sha256_file(here) != recorded:
-                others[folder, name] = run.path / SOURCES / file
-    return others
+            data = files.get(f"{folder}/{name}.toml")
+            if data is not None and sha256_bytes(data) == recorded:
+                contents[folder, name] = data
+    return contents
 
 
 def refuse_other_files(run: Run) -> None:

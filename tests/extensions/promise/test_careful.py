@@ -1,5 +1,6 @@
 """A careful ego, and the promise that says when it is: the settings of a condition."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -274,6 +275,12 @@ def test_a_run_is_played_by_a_promise_and_keeps_it(
     file.unlink()
     for words in (swept, ("compare", "run", "run")):
         assert harness(*words)[2] == f"harness: run: promise p is not here; {remedy}"
+    in_words = re.sub("(?m)^fitted_on = .*$", 'fitted_on = "in other words"', text)
+    assert in_words != text
+    file.write_text(in_words)
+    for words in (swept, ("compare", "run", "run"), ("run", "check", "run")):
+        code, out, error = harness(*words, "--quiet" if words[0] == "run" else "--json")
+        assert (code, error) == (0, ""), out
     file.write_text(text)
     condition = ("--condition", "6g:promise=p")
     for more, says in (
