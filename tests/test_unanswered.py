@@ -433,6 +433,10 @@ def test_helpers_that_no_condition_asks_make_no_share_of_lost_messages_smaller(
     for who in ("used", "all"):
         code, _, err = ask("eval", *EVAL, "--ask", who, "--out", who)
         assert (code, lost in err) == (3, True), "2 of the 48 that all are asked would be too few"
+    code, out, _ = ask("eval", *EVAL, "--condition", "6g:tau=0", "--out", "more")
+    assert code == 0
+    assert f"Where 6g asks, there is {lost}: its figures are of" in " ".join(out.split())
+    assert "Where single-local" not in out
     monkeypatch.setattr("harness.runs.unanswered.MOST_LOST", 0.1)
     code, out, _ = ask("eval", *EVAL, "--ask", "all", "--out", "all")
     assert (code, lost in " ".join(out.split())) == (0, True)

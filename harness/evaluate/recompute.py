@@ -44,7 +44,7 @@ from harness.runs.records import Episode, FrozenScenes, Latency
 from harness.runs.run_dataset import OTHER_EPISODES, choice_of
 from harness.runs.settings import FrozenSettings
 from harness.runs.stopping import looked_otherwise
-from harness.runs.unanswered import Tally
+from harness.runs.unanswered import tally
 from harness.world import scenarios
 
 RULES = (DRIVER, "proxy")  # engines that are no models
@@ -203,7 +203,7 @@ def refuse_otherwise(run: Run, spec: Spec) -> None:
 
 
 def _unanswered(run: Run) -> str:
-    return f"answers.jsonl has no answer to {Tally(run.answers).counts()}: too many for a result"
+    return f"answers.jsonl has no answer to {tally(run).counts()}: too many for a result"
 
 
 def _of_rule(otherwise: int) -> Iterator[str]:

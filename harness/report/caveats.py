@@ -28,7 +28,7 @@ from harness.runs.listing import UNREAD
 from harness.runs.metric_names import ALL, GAINS
 from harness.runs.metrics import entry
 from harness.runs.records import ClosedLoop, Manifest, Score
-from harness.runs.unanswered import tally
+from harness.runs.unanswered import by_condition, tally
 from harness.world.drivers import BLIND
 from harness.world.parameters import Parameters
 
@@ -208,6 +208,12 @@ def lost_messages(run: Run) -> Iterator[str]:
     """
     if (tallied := tally(run)).words and not tallied.missing:
         yield f"{text(str(tallied))}: each counts as a lost message."
+        for name, of_condition in by_condition(run).items():
+            if of_condition.missing:
+                yield (
+                    f"Where {printable(name)} asks, there is no answer to {of_condition.counts()}: "
+                    "its figures are of so many more lost messages."
+                )
 
 
 def retried(run: Run) -> Iterator[str]:

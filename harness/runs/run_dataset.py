@@ -4,7 +4,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from harness.core.errors import UserError, printable
+from harness.core.errors import UserError, in_range, printable
+from harness.core.seeds import LAST_EPISODE
 from harness.dataset import select
 from harness.dataset.load import Dataset, find, load
 from harness.dataset.select import Choice
@@ -62,17 +63,25 @@ def choice_of(run: Run, numbers: Sequence[int], dataset: Dataset | None) -> Choi
     return selection.choice(numbers, dataset) if selection else None
 
 
-def check_episodes(run: Run, dataset: Dataset) -> None:
+def check_episodes(run: Run, dataset: Dataset | None) -> None:
     """Raise UserError if a run has other episodes than are selected as it states.
 
-    For a run that something is learnt from: nobody knows by what these were chosen. `dataset` is
-    the run's, or a part of it; the run is one on frozen (recorded) scenes.
+    For a run that something is learnt from, or judged by: nobody knows by what these were chosen.
+    `dataset` is that of a run on frozen (recorded) scenes, or a part of it; None of a driven one.
     """
-    whole, world = dataset.whole, run.manifest.world
-    assert isinstance(world, FrozenScenes)
-    choice = choice_of(run, whole.episodes, whole)
-    numbers = choice.numbers if choice else whole.episodes
-    if run.grid.episodes != tuple(numbers[: world.limit]):
+    world, whole = run.manifest.world, dataset and dataset.whole
+    numbers: Sequence[int]
+    if isinstance(world, FrozenScenes):
+        assert whole is not None
+        numbers, most = whole.episodes, world.limit
+    else:
+        of = int(world.selection.get("of", world.episodes))
+        in_range(f"{printable(run.path)}: episodes to select of", of, 1, LAST_EPISODE + 1)
+        numbers, most = range(of), world.episodes
+    choice = choice_of(run, numbers, whole)
+    if choice:
+        numbers = choice.numbers
+    if run.grid.episodes != tuple(numbers[:most]):
         raise UserError(f"{printable(run.path)}: {OTHER_EPISODES}; make the run again")
 
 

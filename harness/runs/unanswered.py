@@ -106,6 +106,32 @@ def of_use(answers: Iterable[Counted], decisions: Iterable[Decisions]) -> Iterat
             yield answer
 
 
+def by_condition(run: Run) -> dict[str, Tally]:
+    """Return how many helpers' questions got an answer where each condition asks, by its name.
+
+    A condition is a named set of settings of the radio, of asking helpers and of fusing their
+    messages; one that asks seldom may lose a larger share than all together. Empty where nothing
+    is lost.
+    """
+    if not run.answers.errors:
+        return {}
+    scenes: dict[str, set[str]] = {name: set() for name in run.conditions}
+    for some in run.decisions.pieces():
+        asks, labels = some.flags("triggered"), some.labels("condition")
+        for scene, rows in some.scenes.items():
+            for row in rows:
+                name = labels[row]
+                if asks[row] and name is not None:
+                    scenes[name].add(scene)
+    tallies = {name: Tally() for name in scenes}
+    for answer in run.answers:
+        if is_helper(answer.role):
+            for name, where in scenes.items():
+                if answer.scene in where:
+                    tallies[name].add([answer])
+    return tallies
+
+
 def tally(run: Run) -> Tally:
     """Return how many requests of a finished run, by role, got an answer, and how many an error.
 

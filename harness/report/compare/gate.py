@@ -11,6 +11,8 @@ from harness.core.figures import amount
 from harness.core.statistics import Estimate
 from harness.report.compare.difference import Comparison
 from harness.runs.metrics import METRICS
+from harness.runs.records import FrozenScenes
+from harness.runs.run_dataset import check_episodes, dataset_of
 
 OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
@@ -129,7 +131,8 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
 
     Raises:
         UserError: the gate's condition is not compared, a run lacks one that it is on, the
-            difference is unknown there, or a run was chosen to lack episodes of the other.
+            difference is unknown there, or a run was chosen to lack episodes of the other, or has
+            others than it states.
     """
     pair = comparison.pair
     for side, chosen in pair.left_out.items():
@@ -139,6 +142,11 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
             f"--fail-if {printable(gate.text)!r}: {side} lacks {lacks} of the other run by "
             f"{chosen}, perhaps for how they end; compare two runs that are chosen alike"
         )
+    runs = pair.a.run, pair.b.run
+    if runs[0].grid.episodes != runs[1].grid.episodes:
+        for run in runs:  # which may state that chance chose its episodes, or nothing
+            is_frozen = isinstance(run.manifest.world, FrozenScenes)
+            check_episodes(run, dataset_of(run) if is_frozen else None)
     changes: dict[str, Estimate | None] = {}
     for condition in comparison.conditions:
         changes[condition.condition] = None

@@ -136,6 +136,14 @@ def test_what_was_chosen_by_more_than_chance_is_said_and_passes_no_gate(
         assert (code, out == "", refused in error) == (
             (2, True, True) if lacks else (0, False, False)
         )
+    shutil.copytree("runs/some", "runs/forged")
+    record = json.loads(Path("runs/forged/run.json").read_text())
+    world = {**record["world"], "selection": {}}
+    Path("runs/forged/run.json").write_text(json.dumps(restated(record, {"world": world})))
+    digested(Path("runs/forged"))
+    code, out, error = harness("compare", "runs/whole", "runs/forged", *gate)
+    assert (code, out) == (2, "")
+    assert "runs/forged: episodes.csv has other episodes than run.json says" in error
     out = harness("compare", "runs/whole", "runs/some")[1]
     assert "A has 1 more episode, left out of B by --only 0:3;" in " ".join(out.split())
 
