@@ -298,7 +298,9 @@ def test_no_link_in_a_shard_is_followed(
     shards = copied(split, tmp_path, "1", "2", "3")
     (shards[1] / place).rename(tmp_path / "secret")
     (shards[1] / place).symlink_to(tmp_path / "secret")
-    assert f"/2/{place} is a link, which no command makes; delete it" in refused(harness, shards)
+    assert f"/2/{place} is a link; put the file itself there, or delete it" in refused(
+        harness, shards
+    )
 
 
 @pytest.mark.slow

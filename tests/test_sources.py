@@ -210,7 +210,7 @@ def test_no_link_among_a_runs_sources_is_followed(
     for typed in (("report", run.path), ("run", "check", run.path)):
         code, out, err = harness(*typed)
         assert (code, out, err.count("\n")) == (2, "", 1)
-        assert f"{place} is a link, which no command makes; delete it" in err
+        assert f"{place} is a link; put the file itself there, or delete it" in err
     with pytest.raises(UserError, match="is a link"):
         prompt_of(run, run.manifest.prompt)
 

@@ -287,7 +287,9 @@ def refuse_links(path: Path) -> None:
     """
     for place in chain([path], path.rglob("*")):  # the first before any of what it leads to
         if place.is_symlink():
-            raise UserError(f"{printable(place)} is a link, which no command makes; delete it")
+            raise UserError(
+                f"{printable(place)} is a link; put the file itself there, or delete it"
+            )
 
 
 @contextmanager

@@ -237,10 +237,9 @@ def _plays(
     remaining = lies.lattice(actions)
     while len(remaining):
         # further actions matter only in episodes that are not lost yet
-        reached_here, ends = reached[kinds.first], gives_away[kinds.first]
-        is_lost = (reached_here & ends).any(axis=1)
-        is_open = lies_heard & ~is_lost & ~reached_here.all(axis=1)
-        places = np.flatnonzero(is_open)
+        is_open = ~(reached & gives_away).any(axis=1) & ~reached.all(axis=1)
+        places = kinds.of_some(is_open)
+        places = places[lies_heard[places]]
         if not len(places):
             return
         count = max(1, AT_ONCE // len(places))
@@ -318,6 +317,13 @@ class _Kinds(NamedTuple):
     first: Ints  # row of the first decision of each kind, `(k,)`
     of_row: Ints  # each decision's kind, `(n,)`
     ties: TieDraws | None  # draws the n decisions' ties
+
+    def of_some(self, rows: Bools) -> Ints:
+        """Return the kinds of which some decision is among `rows`, a mask `(n,)`.
+
+        Ties are drawn for each, so that decisions of one kind may have led elsewhere.
+        """
+        return np.unique(self.of_row[rows])
 
     def spread(self, fused: _Fused) -> Play:
         """Return what comes of a lie in all decisions, from what comes of it in each kind."""

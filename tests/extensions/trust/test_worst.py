@@ -147,6 +147,17 @@ def test_decisions_that_are_alike_end_as_if_each_was_fused(
         assert np.array_equal(values, one_by_one.values()[column]), column
 
 
+def test_a_kind_is_played_on_as_long_as_one_of_its_decisions_is_open() -> None:
+    kinds = worst._Kinds(np.array([0, 3]), np.array([0, 0, 0, 1]), None)
+    of_the_second = np.array([False, True, False, False])
+    assert kinds.of_some(of_the_second).tolist() == [0]
+    fused = worst._Fused(np.array([1, 0]), np.eye(3)[[2, 0]], np.zeros((2, 1)), np.array([0.5, 1]))
+    play = kinds.spread(fused)
+    assert play.rows.tolist() == [3, 0, 1, 2]
+    assert play.action.tolist() == [2, 0, 0, 0]
+    assert play.trust.tolist() == [0.5, 1, 1, 1]
+
+
 def test_without_a_liar_an_episode_ends_as_it_does_in_peace(bench: Bench) -> None:
     for rule, case in bench.strongest_lies.items():
         assert np.array_equal(case.liars > 0, bench.at(rule).success == 1), rule
