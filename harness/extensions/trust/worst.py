@@ -27,7 +27,7 @@ from harness.coordination.plans import Plans
 from harness.coordination.robust import Heads
 from harness.coordination.rules import RULES
 from harness.coordination.trust import trusting_only
-from harness.core.arrays import Bools, Floats, Ints, taken
+from harness.core.arrays import Bools, Floats, Ints, any_of, taken
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.evaluate.fusion import codes_of
@@ -230,14 +230,14 @@ def _plays(
         voices = np.concatenate([decisions.heard.own[:, None], others], axis=1)
         yield from map(kinds.spread, decisions.each(lies.near_others(voices), places))
         return
-    lies_heard = (decisions.heard.on_time & decisions.liars).any(axis=1)
+    lies_heard = any_of(decisions.heard.on_time & decisions.liars)
     is_of_heads = isinstance(RULES[point.fusion.consensus], Heads)
     if is_of_heads and lies.is_likeliest_taken(point):
         lies_heard &= ~_agreed(decisions)
     remaining = lies.lattice(actions)
     while len(remaining):
         # further actions matter only in episodes that are not lost yet
-        is_open = ~(reached & gives_away).any(axis=1) & ~reached.all(axis=1)
+        is_open = ~any_of(reached & gives_away) & any_of(~reached)
         places = kinds.of_some(is_open)
         places = places[lies_heard[places]]
         if not len(places):
