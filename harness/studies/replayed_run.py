@@ -351,9 +351,12 @@ class ReplayedRun:
         others = defaultdict[str, list[str]](list)
         others[LEFT_OUT] = sorted(self.left_out - self._gaps[LEFT_OUT])
         for answer in self._asker.new_answers(self._answers_before):
-            others[f"{ASKED} {answer.role}"].append(answer.id)
+            kinds = [f"{ASKED} {answer.role}"]
             if answer.error is not None:
-                others[f"{LOST} {answer.role}"].append(answer.id)
+                kinds.append(f"{LOST} {answer.role}")
+            for kind in kinds:
+                if answer.id not in self._gaps[kind]:  # else a kept part has it
+                    others[kind].append(answer.id)
         return dict(others)
 
     def recall_gaps(self, gaps: Mapping[str, Collection[str]]) -> None:
