@@ -169,6 +169,10 @@ def test_a_dataset_in_place_of_settings_is_told_where_it_goes(
     ("typed", "said"),
     [
         ("eval proxy", "proxy is a model, and no settings; type `harness eval --model proxy`"),
+        (
+            "eval http://h:1/v1",
+            "is a server, and no settings; give its address with --model: http://h",
+        ),
         ("drive replay:r", "replay:r is a model, and no settings; type `harness drive --model"),
         ("drive --limit 3", "--limit is none of `harness drive`; give --episodes in `harness"),
         ("eval --scenario x", "--scenario is none of `harness eval`; give --dataset in `harness"),

@@ -88,15 +88,21 @@ def lacking(record: Mapping[str, Any]) -> str | None:
     return next((owner for owner in owners if owner and owner not in extensions()), None)
 
 
-def pick(record: Mapping[str, Any]) -> str:
+def pick(record: Mapping[str, Any], with_seeds: bool = False) -> str:
     """Return the options that chose a run's episodes by anything but chance, as one text.
 
     Whoever chose them may have looked at what happens in them, so that they say nothing of others.
     `record` is the `selection` that the run states, values by name. Empty if nothing chose so.
+    `with_seeds` counts draws by another seed than 0, too, which may have been looked for.
     """
-    blind = {"of", *[name for each in SELECTIONS.values() for name in each.by_chance]}
+    blind = {"of"}
+    for selection in SELECTIONS.values():
+        seeds = [record.get(name) for name in selection.by_chance if name.endswith("seed")]
+        if not (with_seeds and any(seeds)):
+            blind |= {*selection.by_chance}
     chosen = {name: value for name, value in record.items() if name not in blind}
-    return " ".join(f"--{name} {printable(value, 40)}" for name, value in chosen.items())
+    options = {name.replace("_", "-"): value for name, value in chosen.items()}
+    return " ".join(f"--{name} {printable(value, 40)}" for name, value in options.items())
 
 
 def drawn(numbers: Sequence[int], sample: int, seed: int, end: int) -> list[int]:

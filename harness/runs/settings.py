@@ -6,6 +6,7 @@ with its help and its panel there.
 """
 
 import json
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -601,6 +602,11 @@ def read(file: Path, world: type[Struct], given: Mapping[str, Any]) -> Settings:
         if _is_dataset(str(place)):
             words = printable(shlex.join(["harness", "eval", "--dataset", str(place)]), 2000)
             raise UserError(f"{printable(place)} is a dataset, and no settings; type `{words}`")
+        if (address := re.match(r"(https?):/+(.+)", str(place))) is not None:
+            raise UserError(
+                f"{printable(place)} is a server, and no settings; give its address with --model: "
+                f"{address[1]}://{printable(address[2], 200)}"
+            )
         if _is_card(str(place)) or str(place).startswith("replay:"):
             command = COMMANDS[str(world.__struct_config__.tag)]
             words = printable(shlex.join(["harness", command, "--model", str(place)]), 2000)

@@ -118,7 +118,7 @@ def test_json_has_every_field_whole(harness: Callable[..., Said], folder: Path) 
     assert code == 0
     assert list(told["live"]) == [
         "name", "kind", "state", "date", "why", "model", "prompt", "answer", "tags", "condition", "success",
-        "low", "high", "unread", "metric",
+        "low", "high", "unread", "metric", "pick",
     ]  # fmt: skip
     assert told["live"]["date"] == json.loads((folder / "live/run.json").read_text())["created"]
 

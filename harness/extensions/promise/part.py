@@ -56,7 +56,7 @@ class Careful(Part, frozen=True, kw_only=True):
                 raise wrong(key, point.setting(key), f"{allowed} {where}")
         if other := promise(self.promise).other_setting(point):
             key, now, then = other
-            allowed = "left out" if then is None else printable(then)
+            allowed = "left out" if then in (None, "") else printable(then)
             thresholds = [f"{n}={v:g}" for n, v in self.implies().items() if v is not None]
             raise wrong(
                 key,

@@ -144,8 +144,8 @@ class Pair:
         """
         options = {}
         for name, run, other in (("A", self.a.run, self.b.run), ("B", self.b.run, self.a.run)):
-            chosen = pick(run.manifest.world.selection)
-            is_alike = chosen == pick(other.manifest.world.selection)
+            chosen = pick(run.manifest.world.selection, with_seeds=True)
+            is_alike = chosen == pick(other.manifest.world.selection, with_seeds=True)
             if chosen and not is_alike and set(other.grid.episodes) - set(run.grid.episodes):
                 options[name] = chosen
         return options

@@ -113,6 +113,7 @@ def test_what_was_chosen_by_more_than_chance_is_said_and_passes_no_gate(
         ("some", "--only", "0:3"),
         ("fewer", "--only", "0:3", "--sample", "2"),
         ("sample", "--sample", "2"),
+        ("sought", "--sample", "2", "--sample-seed", "3"),
         ("first", "--limit", "2"),
     ):
         words = ("--dataset", small_path, "--seeds", "0:1", "--condition", "single-local")
@@ -122,7 +123,7 @@ def test_what_was_chosen_by_more_than_chance_is_said_and_passes_no_gate(
         assert (code, is_said) == (0, "--only" in choice)
         assert (said in unescape(Path(f"runs/{name}/report.html").read_text())) == is_said
     assert harness("run", "ls", "runs")[1].count("of episodes chosen by --only 0:3") == 2
-    gate = ("--fail-if", "success_rate < -0.5")
+    gate, by = ("--fail-if", "success_rate < -0.5"), "--only 0:3"
     for a, b, lacks, n in (
         ("whole", "some", "B", "1 episode"),
         ("some", "whole", "A", "1 episode"),
@@ -130,9 +131,11 @@ def test_what_was_chosen_by_more_than_chance_is_said_and_passes_no_gate(
         ("some", "fewer", "", ""),
         ("whole", "sample", "", ""),
         ("first", "some", "", ""),
+        ("whole", "sought", "B", "2 episodes"),
     ):
+        by = "--sample 2 --sample-seed 3" if b == "sought" else by
         code, out, error = harness("compare", f"runs/{a}", f"runs/{b}", *gate)
-        refused = f"success_rate < -0.5': {lacks} lacks {n} of the other run by --only 0:3, "
+        refused = f"success_rate < -0.5': {lacks} lacks {n} of the other run by {by}, "
         assert (code, out == "", refused in error) == (
             (2, True, True) if lacks else (0, False, False)
         )

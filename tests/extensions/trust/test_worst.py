@@ -19,7 +19,12 @@ from harness.dataset.load import Dataset
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.extensions.trust import lies, worst
 from harness.extensions.trust.attackers import attackers_among
-from harness.extensions.trust.strongest_lies import StrongestLies, space_of, strongest_lies
+from harness.extensions.trust.strongest_lies import (
+    StrongestLies,
+    _named,
+    space_of,
+    strongest_lies,
+)
 from harness.extensions.trust.study import CAPPED, PEACE, Bench, run_bench, trust_study, under
 from harness.extensions.trust.worst_page import strongest
 from harness.runs.headline import SUCCESS
@@ -303,6 +308,14 @@ def test_a_share_that_rounds_has_as_many_liars_as_the_attacks(
     typed = point_of([stored], "6g:attack=brake:share=5/6")
     [[walked]] = stored.walked([Setting("typed", typed, stored.vehicles)], (0,))
     assert np.array_equal(walked.ends[SUCCESS], bench.at("linear", "brake", 5 / 6).success)
+
+
+def test_who_is_in_no_scene_of_a_step_lies_to_nobody(stored: ReplayedRun) -> None:
+    [scene] = stored.dataset.scenes([stored.dataset.forest.ids[stored.dataset.forest.root[0]]])
+    truth = stored.whole([scene])
+    draws = channel_draws(np.array([0]), np.array([1]), np.array([0]), 4, truth.valid.shape[1])
+    helpers = truth.valid.shape[1]
+    assert _named((0, helpers), truth, draws).tolist() == _named((0,), truth, draws).tolist()
 
 
 def test_a_share_of_nobody_is_one_line(stored: ReplayedRun, tmp_path: Path) -> None:
