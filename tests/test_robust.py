@@ -23,6 +23,7 @@ from harness.coordination.robust import (
 )
 from harness.coordination.rules import RULES, reads
 from harness.coordination.trust import Trust, divergence
+from harness.core.errors import UserError
 
 EQUAL = np.full(4, 0.25)
 CAREFUL, DOUBT, BOLD = [0.8, 0.1, 0.1], [0.4, 0.3, 0.3], [0.0, 0.0, 1.0]
@@ -229,6 +230,13 @@ def test_two_in_one_place_are_both_trusted_no_more_but_for_one_that_the_ego_sees
     one_place = places([0.0, 10.0], [0.0, 12.0], [0.0, 30.0])
     assert trusted(one_place) == [False, False, True]
     assert trusted(one_place | {"sensed_m": [10.0, np.nan, np.nan]}) == [True, False, True]
+
+
+def test_where_helpers_come_or_go_memory_is_of_nobody_and_the_rule_says_so():
+    told = messages([DOUBT] * 4, [20, 10, 20, 30])
+    for others in (2, 4):
+        with pytest.raises(UserError, match="helpers come or go during an episode here"):
+            TRUST.fuse(told, TRUST.start(told.heard.shape[:-1], others, 3))
 
 
 def test_where_nobody_looked_nothing_is_held_against_anybody():

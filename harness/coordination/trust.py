@@ -26,7 +26,12 @@ import numpy as np
 from harness.coordination.consensus import Fused, Messages, linear_pool
 from harness.coordination.trigger import entropy_nats, normalised_entropy
 from harness.core.arrays import Bools, Floats, any_of, least_of, length_of, summed
+from harness.core.errors import UserError
 
+COME_AND_GO = (
+    "consensus trust: helpers come or go during an episode here, and the rule knows them by their "
+    "places; take another rule"
+)
 CERTAIN = 1e9  # evidence that nothing outweighs
 CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, time
 
@@ -79,9 +84,12 @@ class Trust:
         The intents are averaged by weight. Each decision first counts for or against each helper.
         `messages` are of one decision of each episode, and `state`, `(..., K)`, is the memory that
         `start` or the episode's last decision returned. `Fused.trust` has each helper's reputation,
-        from 0 to 1, with the present message counted.
+        from 0 to 1, with the present message counted. Raises UserError if the number of helpers is
+        another than at the episode's last decision.
         """
         p, heard = messages.intents, messages.heard
+        if state.shape[-1] != heard.shape[-1] * (2 + p.shape[-1] + CLAIM):
+            raise UserError(COME_AND_GO)
         remembered = state.reshape(*heard.shape, -1)
         last_intents, present_claims = remembered[..., 2:-CLAIM], _claims_of(messages)
         against = np.where(

@@ -25,6 +25,7 @@ from harness.coordination.scheduling import Outlook
 from harness.coordination.sent import SentIntents, Speaker
 from harness.coordination.streams import Sent, Stream, Streamed
 from harness.core.arrays import Bools, Floats, Ints
+from harness.core.errors import UserError
 from harness.core.strangers import strangers
 from harness.dataset.load import Scene
 from harness.evaluate.claims import claims
@@ -585,9 +586,17 @@ class Memory:
         """Return what the rule that fuses messages remembers for n decisions, `(n, K)`.
 
         It is K numbers for each; None at the first decision. `due` has the decisions, each with its
-        episode and seed.
+        episode and seed. Raises UserError if K differs between episodes, as with their helpers.
         """
-        return np.array([self._state[place] for place in due.episodes]) if self._state else None
+        if not self._state:
+            return None
+        states = [self._state[place] for place in due.episodes]
+        if len(set(map(len, states))) > 1:
+            raise UserError(
+                "a consensus rule with memory: helpers come or go during an episode here, so that "
+                "it remembers more in some episodes than in others; take another rule"
+            )
+        return np.array(states)
 
     def keep(self, due: Due, state: Floats) -> None:
         """Store what the rule that fuses messages remembers after n decisions; nothing if K is 0.
