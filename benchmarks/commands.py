@@ -23,7 +23,7 @@ from zipfile import ZipFile
 
 from rows import Row, finish
 
-from harness.core.files import canonical_json, sha256_bytes
+from harness.core.files import canonical_json, digest, sha256_bytes
 from harness.core.resources import DATASET
 from harness.dataset.load import find
 
@@ -158,15 +158,23 @@ def copied(copies: int, out: Path) -> Path:
             names += [(f'"episode_seed":{seed}', f'"episode_seed":{seed + again * episodes}')]
             names += [(f'"episode":{number},', f'"episode":{episode},')]
             tree = json.loads(layouts.read(f"{number:05d}/tree.json"))
-            texts = []
+            texts, ids = [], list[tuple[str, str]]()
             for step in range(len(tree["levels"])):
                 text = layouts.read(f"{number:05d}/{step}.jsonl").decode()
                 for before, after in names:
                     text = text.replace(before, after)
+                lines = []
+                for line in text.splitlines(keepends=True):
+                    scene = json.loads(line)
+                    # an id is the digest of its state, and that has the seed
+                    its_id = f"{episode:05d}-{step}-{digest(scene['state'])[:12]}"
+                    lines.append(line.replace(scene["scene"], its_id))
+                    ids.append((scene["scene"], its_id))
+                text = "".join(lines)
                 file.writestr(f"{episode:05d}/{step}.jsonl", text)
                 texts.append(sha256_bytes(text.encode()))
             text = json.dumps({**tree, "scenes_sha256": texts}, separators=(",", ":"))
-            for before, after in names:
+            for before, after in names + ids:
                 text = text.replace(before, after)
             file.writestr(f"{episode:05d}/tree.json", text)
             trees.append(sha256_bytes(text.encode()))
