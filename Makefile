@@ -71,7 +71,7 @@ check: .venv/dev
 docs: .venv/docs ## the documentation as a site: build/docs/index.html
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --nitpicky docs build/docs
 
-bench: .venv/dev ## the table of benchmarks/README.md, in some ten minutes
+bench: .venv/dev ## the table of benchmarks/README.md, in some 25 minutes
 	$(BIN)/python benchmarks/table.py --page benchmarks/README.md
 
 release: .venv-release/tools ## wheel, sdist, locked list and licences in dist/, tried; PYTHONS="python3.11 python3.13"
