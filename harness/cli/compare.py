@@ -62,7 +62,7 @@ def command(
     """Show what changed from run A to B, by episode and seed. Exit code 1 if a gate fails."""
     from harness.report.compare import logs, text
     from harness.report.compare.difference import compare as compared
-    from harness.report.compare.gate import gate, judge
+    from harness.report.compare.gate import gate, judge, refuse_misstated
     from harness.report.compare.pair import pair
     from harness.report.page import refuse_less, refuse_other, save
     from harness.runs.unanswered import why
@@ -96,6 +96,8 @@ def command(
                 "nothing to judge; type the command of the run again"
             )
         difference = compared(pair(a, b))
+        if gates:
+            refuse_misstated(difference.pair)
         verdicts = [judge(each, difference) for each in gates]
     if html:
         from harness.report.compare import page

@@ -88,8 +88,9 @@ def points_of(run: Run) -> dict[str, OperatingPoint]:
             lambda name, then: _same(SCHEDULES.file_sha256(name), then),
         ),
     }
+    copies_here = copies(run) if manifest.kept else {}
     for folder, recorded_there in manifest.kept.items():
-        alike = {name for where, name in copies(run) if where == folder}
+        alike = {name for where, name in copies_here if where == folder}
         is_kept = partial(_is_kept, kept.get(folder, {}), alike)
         records_by_kind[printable(folder.removesuffix("s"))] = recorded_there, is_kept
     if current(run):

@@ -15,10 +15,9 @@ from harness.backends.card import Card
 from harness.backends.registry import open_backend
 from harness.backends.replay import Kept, LacksAnswer
 from harness.core import work
-from harness.core.errors import Unanswered, UserError, in_range, printable
+from harness.core.errors import Unanswered, UserError, printable
 from harness.core.extensions import part_of
 from harness.core.figures import amount
-from harness.core.seeds import LAST_EPISODE
 from harness.dataset import select
 from harness.dataset.load import Dataset
 from harness.evaluate import latency as latencies
@@ -41,7 +40,7 @@ from harness.prompts import versions
 from harness.runs.contradictions import close, contradictions, current, differing
 from harness.runs.folder import Run, read
 from harness.runs.records import Episode, FrozenScenes, Latency
-from harness.runs.run_dataset import OTHER_EPISODES, choice_of
+from harness.runs.run_dataset import OTHER_EPISODES, choice_of, count_to_select_of
 from harness.runs.settings import FrozenSettings
 from harness.runs.stopping import looked_otherwise
 from harness.runs.unanswered import tally
@@ -161,8 +160,7 @@ def _source(run: Run, dataset: Dataset | None) -> Source:
         return FrozenSource(part, world.limit, choice)
     from harness.evaluate.live_world import LiveSource  # a base install has no simulator
 
-    most = int(world.selection.get("of", world.episodes))
-    in_range(f"{printable(run.path)}: episodes to select of", most, 1, LAST_EPISODE + 1)
+    most = count_to_select_of(run)
     choice = choice_of(run, range(most), None)
     if choice:
         choice = replace(choice, numbers=choice.numbers[: world.episodes])

@@ -63,6 +63,14 @@ def choice_of(run: Run, numbers: Sequence[int], dataset: Dataset | None) -> Choi
     return selection.choice(numbers, dataset) if selection else None
 
 
+def count_to_select_of(run: Run) -> int:
+    """Return of how many episodes those of a driven run were selected, as it states."""
+    world = run.manifest.world
+    of = int(world.selection.get("of", world.episodes))
+    in_range(f"{printable(run.path)}: episodes to select of", of, 1, LAST_EPISODE + 1)
+    return of
+
+
 def check_episodes(run: Run, dataset: Dataset | None) -> None:
     """Raise UserError if a run has other episodes than are selected as it states.
 
@@ -75,9 +83,7 @@ def check_episodes(run: Run, dataset: Dataset | None) -> None:
         assert whole is not None
         numbers, most = whole.episodes, world.limit
     else:
-        of = int(world.selection.get("of", world.episodes))
-        in_range(f"{printable(run.path)}: episodes to select of", of, 1, LAST_EPISODE + 1)
-        numbers, most = range(of), world.episodes
+        numbers, most = range(count_to_select_of(run)), world.episodes
     choice = choice_of(run, numbers, whole)
     if choice:
         numbers = choice.numbers

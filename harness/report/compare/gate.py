@@ -10,6 +10,7 @@ from harness.core.errors import UserError, printable, unknown
 from harness.core.figures import amount
 from harness.core.statistics import Estimate
 from harness.report.compare.difference import Comparison
+from harness.report.compare.pair import Pair
 from harness.runs.metrics import METRICS
 from harness.runs.records import FrozenScenes
 from harness.runs.run_dataset import check_episodes, dataset_of
@@ -123,6 +124,19 @@ def gate(
     )
 
 
+def refuse_misstated(pair: Pair) -> None:
+    """Raise UserError if runs of unlike episodes have others than they state.
+
+    One may state that chance chose its episodes, or nothing did. It is for gates alone, since it
+    reads datasets.
+    """
+    runs = pair.a.run, pair.b.run
+    if runs[0].grid.episodes != runs[1].grid.episodes:
+        for run in runs:
+            is_frozen = isinstance(run.manifest.world, FrozenScenes)
+            check_episodes(run, dataset_of(run) if is_frozen else None)
+
+
 def judge(gate: Gate, comparison: Comparison) -> Verdict:
     """Return in which conditions of a comparison a gate, a test of a difference, fails.
 
@@ -131,8 +145,7 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
 
     Raises:
         UserError: the gate's condition is not compared, a run lacks one that it is on, the
-            difference is unknown there, or a run was chosen to lack episodes of the other, or has
-            others than it states.
+            difference is unknown there, or a run was chosen to lack episodes of the other.
     """
     pair = comparison.pair
     for side, chosen in pair.left_out.items():
@@ -142,11 +155,6 @@ def judge(gate: Gate, comparison: Comparison) -> Verdict:
             f"--fail-if {printable(gate.text)!r}: {side} lacks {lacks} of the other run by "
             f"{chosen}, perhaps for how they end; compare two runs that are chosen alike"
         )
-    runs = pair.a.run, pair.b.run
-    if runs[0].grid.episodes != runs[1].grid.episodes:
-        for run in runs:  # which may state that chance chose its episodes, or nothing
-            is_frozen = isinstance(run.manifest.world, FrozenScenes)
-            check_episodes(run, dataset_of(run) if is_frozen else None)
     changes: dict[str, Estimate | None] = {}
     for condition in comparison.conditions:
         changes[condition.condition] = None
