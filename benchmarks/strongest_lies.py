@@ -20,8 +20,9 @@ from harness.coordination.contents import INTENTS
 from harness.coordination.rules import RULES, reads
 from harness.core.progress import Progress
 from harness.dataset import suites
+from harness.extensions.trust.bench import Bench, Cell
 from harness.extensions.trust.strongest_lies import StrongestLies
-from harness.extensions.trust.study import CAPPED, Bench, Cell, run_bench
+from harness.extensions.trust.study import CAPPED, run_bench
 from harness.extensions.trust.worst_page import worst_tables
 from harness.runs.success import Success
 from harness.studies.replayed_run import ReplayedRun

@@ -78,7 +78,8 @@ def command(
     from harness.coordination.rules import EGO_PROMPT, RULES, reads
     from harness.evaluate.run import read_or_evaluate
     from harness.extensions.trust.attacks import ATTACKS
-    from harness.extensions.trust.study import names_of, run_bench, shares_of, trust_study
+    from harness.extensions.trust.page import trust_study
+    from harness.extensions.trust.study import names_of, run_bench, shares_of
     from harness.studies.replayed_run import ReplayedRun
 
     attack_names = names_of("--attacks", attacks, tuple(ATTACKS))

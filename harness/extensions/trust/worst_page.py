@@ -1,12 +1,13 @@
 """Say in a study of trust what the strongest lies leave of each rule."""
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from harness.core.figures import as_mapping, interval_of, some_of
 from harness.core.statistics import Estimate
+from harness.extensions.trust.bench import Bench
 from harness.extensions.trust.lies import CLAIMS, PLACES, VOICES, WORDS
 from harness.extensions.trust.strongest_lies import StrongestLies, space_of
 from harness.extensions.trust.worst import TRUST
@@ -14,13 +15,10 @@ from harness.report.document import Table
 from harness.runs.estimates import over_episodes
 from harness.studies.study import ends
 
-if TYPE_CHECKING:
-    from harness.extensions.trust.study import Bench
-
 NAMES = {WORDS: "words", PLACES: "and a false place", VOICES: "and three voices"}
 
 
-def strongest(bench: "Bench", rule: str) -> StrongestLies:
+def strongest(bench: Bench, rule: str) -> StrongestLies:
     """Return what the strongest lies do to a rule; attacks that ship and were played are lies."""
     case = bench.strongest_lies[rule]
     for attack in bench.attacks:
@@ -29,7 +27,7 @@ def strongest(bench: "Bench", rule: str) -> StrongestLies:
     return case
 
 
-def worst_headline(bench: "Bench") -> Iterator[str]:
+def worst_headline(bench: Bench) -> Iterator[str]:
     """Yield a sentence on what the strongest lies leave, if they were looked for."""
     if not bench.strongest_lies:
         return
@@ -50,7 +48,7 @@ def worst_headline(bench: "Bench") -> Iterator[str]:
     )
 
 
-def worst_tables(bench: "Bench") -> Iterator[Table]:
+def worst_tables(bench: Bench) -> Iterator[Table]:
     """Yield what the strongest lies leave of each rule, and how many liars it withstands."""
     if not bench.strongest_lies:
         return
@@ -100,7 +98,7 @@ def worst_tables(bench: "Bench") -> Iterator[Table]:
     )
 
 
-def worst_rows(bench: "Bench") -> Iterator[dict[str, Any]]:
+def worst_rows(bench: Bench) -> Iterator[dict[str, Any]]:
     """Yield the rows of `figures.csv` on the strongest lies."""
     for rule in bench.strongest_lies:
         place = {"rule": rule, "attack": WORDS, "share": bench.shares[0]}
@@ -113,7 +111,7 @@ def worst_rows(bench: "Bench") -> Iterator[dict[str, Any]]:
             yield {**place, "metric": f"withstands_{count}_liars", **ends(estimate)}
 
 
-def worst_mapping(bench: "Bench") -> dict[str, Any]:
+def worst_mapping(bench: Bench) -> dict[str, Any]:
     """Return the figures on the strongest lies for `--json`, by rule."""
     rules = dict[str, Any]()
     for rule in bench.strongest_lies:
@@ -123,7 +121,7 @@ def worst_mapping(bench: "Bench") -> dict[str, Any]:
     return rules
 
 
-def _estimates(bench: "Bench", rule: str) -> dict[str, Estimate]:
+def _estimates(bench: Bench, rule: str) -> dict[str, Estimate]:
     """Return the means with intervals of a rule's worst case, by name."""
     case, success_rule = strongest(bench, rule), bench.success_rule
     estimates = {space: success_rule.estimate(success) for space, success in case.success.items()}
@@ -133,13 +131,13 @@ def _estimates(bench: "Bench", rule: str) -> dict[str, Estimate]:
     return {**estimates, "worst_unsafe": unsafe}
 
 
-def _is_exact(bench: "Bench", rule: str) -> bool:
+def _is_exact(bench: Bench, rule: str) -> bool:
     """Return whether no other message could do more to a rule."""
     is_known = bench.strongest_lies[rule].at_least is not None
     return is_known and rule.partition(":")[0] != TRUST
 
 
-def _withstands(bench: "Bench", rule: str) -> list[Estimate]:
+def _withstands(bench: Bench, rule: str) -> list[Estimate]:
     """Return how much success there is with 0, 1, … liars, whoever they are, under a rule."""
     most = max(1, *(int(np.max(case.liars)) for case in bench.strongest_lies.values()))
     case, estimates = strongest(bench, rule), []

@@ -7,7 +7,8 @@ import pytest
 
 from harness.core.arrays import Floats
 from harness.core.figures import some_of
-from harness.extensions.trust.study import BASE, PEACE, Bench, Cell, headline
+from harness.extensions.trust.bench import BASE, PEACE, Bench, Cell
+from harness.extensions.trust.page import headline
 from harness.runs.success import Success
 
 EPISODES = 60

@@ -19,13 +19,15 @@ from harness.dataset.load import Dataset
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.extensions.trust import lies, worst
 from harness.extensions.trust.attackers import attackers_among
+from harness.extensions.trust.bench import PEACE, Bench
+from harness.extensions.trust.page import trust_study
 from harness.extensions.trust.strongest_lies import (
     StrongestLies,
     _named,
     space_of,
     strongest_lies,
 )
-from harness.extensions.trust.study import CAPPED, PEACE, Bench, run_bench, trust_study, under
+from harness.extensions.trust.study import CAPPED, run_bench, under
 from harness.extensions.trust.worst_page import strongest
 from harness.runs.headline import SUCCESS
 from harness.studies.axes import Setting
