@@ -15,7 +15,7 @@ from harness.core.errors import UserError
 from harness.core.progress import Progress
 from harness.dataset.load import load
 from harness.evaluate.asking import Asker
-from harness.evaluate.kept_answers import KeptAnswers
+from harness.evaluate.kept_answers import KeptAnswers, read_kept
 from harness.evaluate.latency import PAPER
 from harness.evaluate.run import read_or_evaluate
 from harness.evaluate.texts import refuse_others
@@ -86,6 +86,16 @@ def test_nor_does_a_run_go_on_from_one_that_was_kept(
     going_on = partial(Asker, spec, lambda: open_backend(spec.ego.card), PAPER, kept=file)
     assert going_on().answers.keys() == {answer.id for answer in answers_of(run)}
     forged = msgspec.structs.replace(answers_of(run)[0], intent=(1.0, 0.0, 0.0))
+    file.unlink()
     KeptAnswers(file).append([forged])
     with pytest.raises(UserError, match=f"{file}: answer {forged.id} states another intent than"):
         going_on()
+
+
+def test_nor_from_one_with_two_answers_to_a_question(run: Path, tmp_path: Path) -> None:
+    answer, file = answers_of(run)[0], tmp_path / "answers.jsonl"
+    KeptAnswers(file).append([answer, answer])
+    assert read_kept(file) == {answer.id: answer}
+    KeptAnswers(file).append([msgspec.structs.replace(answer, raw=f" {answer.raw}")])
+    with pytest.raises(UserError, match=f"has two answers to question {answer.id}; delete"):
+        read_kept(file)

@@ -35,7 +35,8 @@ class KeptAnswers:
 
         That is, since the last call. `cut` removes a chunk at the file's end that was written in
         part. Errors of the engine, which runs the model, do not count as answers. Raises UserError
-        if the file is damaged, and OSError for a pipe or the like in its place.
+        if the file is damaged, or has two different answers to a question, and OSError for a pipe
+        or the like in its place.
         """
         if not is_there(self.file) or (size_b := self.file.stat().st_size) == self._read_b:
             return {}
@@ -53,7 +54,14 @@ class KeptAnswers:
         if cut and self._read_b < size_b:
             with appending(self.file) as file:  # never through a link
                 file.truncate(self._read_b)
-        return {answer.id: answer for answer in answers if answer.error is None}
+        by_id = dict[str, Answer]()
+        for answer in answers:
+            if answer.error is None and by_id.setdefault(answer.id, answer) != answer:
+                raise UserError(
+                    f"{printable(self.file)} has two answers to question {printable(answer.id)}; "
+                    "delete that file, and its questions are asked again"
+                )
+        return by_id
 
     def append(self, answers: Sequence[Answer]) -> None:
         """Append answers to the file as one chunk, which later reads take whole or not at all."""
