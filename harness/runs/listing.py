@@ -139,7 +139,9 @@ def _entry(path: str, root: str) -> Listed | None:
         if has(name):
             return _other_entry(path, name, kind)
     if has("answers.jsonl") or has("summary.csv"):  # the manifest is written last
-        return Listed("", "run", "broken", written, "run.json")
+        linked = os.path.islink(os.path.join(path, "run.json"))
+        why = "run.json is a link out of the folder" if linked else "run.json"
+        return Listed("", "run", "broken", written, why)
     return None
 
 

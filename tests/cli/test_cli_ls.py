@@ -218,6 +218,9 @@ def test_no_link_leads_out_and_none_goes_round(folder: Path, tmp_path: Path) -> 
     names = {one.name for one in runs(folder)}
     assert {"frozen", "latest"} <= names
     assert not {name for name in names if "live" in name or "lent" in name}
+    (folder / "lent/answers.jsonl").touch()
+    [lent] = [one for one in runs(folder) if one.name == "lent"]
+    assert (lent.state, lent.why) == ("broken", "run.json is a link out of the folder")
 
 
 def test_what_is_no_run_is_not_listed(folder: Path) -> None:
