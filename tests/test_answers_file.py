@@ -116,10 +116,6 @@ def test_what_a_dry_run_asks_is_typed_answered_and_scored(
     assert (code, "equal" in said) == (0, True)
     [whose] = ReplayedRun(Path("r")).caveats
     assert "came from a file that another program wrote: no model was asked here" in whose
-    varied = ("--over", "tau", "--grid", "9", "--condition", "6g")
-    code, out, err = harness("study", "sweep", "r", *varied, "--json")
-    assert (code, err) == (0, f"harness: {whose}\n")
-    assert isinstance(json.loads(out), list)
     again = harness("eval", "r", "--out", "again")
     assert again[2] == (
         "harness: settings r/run.toml: a.jsonl is a file of answers, and a file opens no other by "

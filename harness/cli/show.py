@@ -53,7 +53,7 @@ def finish(
 def echo_answer(study: "Study") -> None:
     """Print a study's result, its `answer`, as JSON; a data frame as a list of records.
 
-    What a reader must know first, its `caveats`, is in it; beside records it is told on stderr.
+    What a reader must know first, its `caveats`, is in it, except beside records.
     """
 
     def records(frame: Any) -> Any:
@@ -61,8 +61,6 @@ def echo_answer(study: "Study") -> None:
 
     if hasattr(study.answer, "to_json"):
         typer.echo(study.answer.to_json(orient="records"))
-        for caveat in study.caveats:
-            typer.echo(f"harness: {printable(caveat, 1000)}", err=True)
     else:
         answer = study.answer
         if isinstance(answer, Mapping):
