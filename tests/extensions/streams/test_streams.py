@@ -379,6 +379,7 @@ def test_a_run_counts_what_is_sent_beside_what_is_asked_for(small: Dataset, tmp_
 @pytest.mark.slow
 def test_what_is_sent_unasked_takes_energy(small: Dataset, tmp_path: Path) -> None:
     """As all messages do: a radio's power for as long as they are on air, or a frame at least."""
+    pytest.importorskip("llama_cpp", reason="needs the llama-cpp extra")
     profile = devices.load("orin-nano")
     assert profile.frame_ms is not None
     points = tuple(map(named_point, ("its-g5:stream=cpm,tau_nats=9", "6g:stream=cpm,tau_nats=9")))
