@@ -196,9 +196,8 @@ def test_the_first_layouts_of_a_run_are_a_run_of_the_first_layouts(runs: dict[st
 def test_two_runs_are_compared_corrected_and_gated(
     a: str, b: str, runs: dict[str, Path], harness: Typed
 ) -> None:
-    code, out, _ = harness(
-        "compare", runs[a], runs[b], "--fail-if", "adjusted_success_rate < -0.9", "--json"
-    )
+    gates = "--fail-if", "single-local:adjusted_success_rate < -0.9"
+    code, out, _ = harness("compare", runs[a], runs[b], *gates, "--json")
     assert code == 0
     metrics = json.loads(out)["conditions"][0]["metrics"]
     adjusted, plain = metrics["adjusted_success_rate"], metrics["success_rate"]
