@@ -26,7 +26,8 @@ def scene(
     added = np.array([(0.0, 0.1), (0.5, 0.1), (0.6, 0.4)])
     return Intents(
         np.array(own), np.full((3, 3), 1 / 3), np.array(valid), np.full(4, 10.0), np.array(range_m),
-        np.full(3, 1000.0), np.full(4, 0.145), outlook=Outlook(np.array(unseen), added, np.array(3.0)),
+        np.full(3, 1000.0), np.full(4, 0.145),
+        outlook=Outlook(np.array(unseen), added, np.array(3.0), np.array(2)),
     )  # fmt: skip
 
 

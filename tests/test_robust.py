@@ -235,7 +235,7 @@ def test_two_in_one_place_are_both_trusted_no_more_but_for_one_that_the_ego_sees
 def test_where_helpers_come_or_go_memory_is_of_nobody_and_the_rule_says_so():
     told = messages([DOUBT] * 4, [20, 10, 20, 30])
     for others in (2, 4):
-        with pytest.raises(UserError, match="helpers come or go during an episode here"):
+        with pytest.raises(UserError, match="helpers or voices come or go during an episode here"):
             TRUST.fuse(told, TRUST.start(told.heard.shape[:-1], others, 3))
 
 

@@ -62,7 +62,10 @@ def known(rng: np.random.Generator, n=40, helpers=4, actions=3, regions=2) -> Sc
     return ScheduleInputs(
         own, rng.uniform(0, 1.1, n), may_ask, rng.uniform(1, 90, (n, helpers)) * hole,
         rng.uniform(1, 90, (n, 1 + helpers)), rng.random((n, helpers)) * hole,
-        Outlook(rng.random((n, regions)), rng.random((n, helpers, regions)) * hole[..., None], rng.random(n)),
+        Outlook(
+            rng.random((n, regions)), rng.random((n, helpers, regions)) * hole[..., None],
+            rng.random(n), np.full(n, regions),
+        ),
         rng.random(n),
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from harness.coordination.claims import Claims
 from harness.coordination.plans import Plans
-from harness.core.arrays import Bools, Floats, summed
+from harness.core.arrays import Bools, Floats, Ints, summed
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,9 @@ class Messages:
     # what agents, vehicles that decide for themselves, say of their own motion, for a rule whose
     # `needs` names it; `intents` are then plans. Else None.
     plans: Plans | None = None
+    # number of each helper in its episode, from 0, which it keeps when others leave, `(..., H)`,
+    # for a rule whose `needs` names it; -1 for all where helpers have several voices. Else None.
+    numbers: Ints | None = None
 
 
 class Fused(NamedTuple):

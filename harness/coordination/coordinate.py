@@ -177,6 +177,7 @@ def fuse(
             intents.range_m,
             intents.claims,
             intents.plans,
+            intents.numbers,
         )
         name = point.fusion.consensus
         fused, weights, state, rule_trust = _by_rule(name, messages, fusion.state)

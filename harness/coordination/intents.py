@@ -70,6 +70,9 @@ class Intents:
     # seconds from the decision's start until each helper may send, since it has sent something
     # unasked just before, `(..., H)`; None if none has to wait
     allowed_s: Floats | None = None
+    # number of each helper in its episode, from 0, which it keeps when others leave, `(..., H)`, if
+    # a rule needs it; -1 for all where helpers have several voices. Else None.
+    numbers: Ints | None = None
 
     def take(self, at: Any) -> "Intents":
         """Return what vehicles intend in some of the decisions: those at `at` of the leading axis.
@@ -186,7 +189,7 @@ class Intents:
         selected = {
             name: np.take_along_axis(array, with_ego if name in WITH_EGO else places, axis=-1)
             for name, array in self.arrays().items()
-            if name not in (*OF_EGO, "helpers")
+            if name not in (*OF_EGO, "helpers", "numbers")
         }
         helpers = np.take_along_axis(self.helpers, places[..., None], axis=-2)
         return replace(
@@ -196,6 +199,7 @@ class Intents:
             outlook=self.outlook and self.outlook.of_helpers(places),
             claims=self.claims and self.claims.of_helpers(places),
             plans=self.plans and self.plans.of_helpers(places),
+            numbers=None if self.numbers is None else np.full_like(places, -1),
             **selected,
         )
 

@@ -428,8 +428,8 @@ class OperatingPoint:
         the content what messages hold. What no point needs is not computed. `what` is `in_time`
         (the probability of a reply in the decision window), `outlook` (how much the ego sees of
         where a danger may come from), `lot` (a random draw), `claims` (positions that helpers
-        state), `objects` (the lists of what they see) or `plans` (what vehicles state of their own
-        motion).
+        state), `numbers` (which helpers of their episode they are), `objects` (the lists of what
+        they see) or `plans` (what vehicles state of their own motion).
         """
         return what in self._needs
 

@@ -32,13 +32,22 @@ class Outlook:
     # seconds until the ego reaches the conflict zone at its speed, `(...)`; 0 once it is there, and
     # inf at a standstill
     to_zone_s: Floats
+    # how many regions the ego's road has, `(...)`; those that it has not are seen
+    regions: Ints
 
     def take(self, at: Any) -> "Outlook":
         """Return what egos and helpers see in some of the decisions: those at `at`.
 
         `at` is an array of indices, or a mask, of the leading axis of all arrays.
         """
-        return Outlook(self.unseen[at], self.added[at], self.to_zone_s[at])
+        unseen, added = self.unseen[at], self.added[at]
+        return Outlook(unseen, added, self.to_zone_s[at], self.regions[at])
+
+    def mean(self, values: Floats) -> Floats:
+        """Return the means over a road's own regions of values, `(..., R)` or `(..., H, R)`."""
+        regions = np.maximum(self.regions, 1)
+        of_helpers = values.ndim > self.unseen.ndim
+        return np.asarray(values.sum(axis=-1) / (regions[..., None] if of_helpers else regions))
 
     def of_helpers(self, places: Ints) -> "Outlook":
         """Return what the ego and helpers see, with the helpers reordered, chosen or repeated.

@@ -25,12 +25,12 @@ import numpy as np
 
 from harness.coordination.consensus import Fused, Messages, linear_pool
 from harness.coordination.trigger import entropy_nats, normalised_entropy
-from harness.core.arrays import Bools, Floats, any_of, least_of, length_of, summed
+from harness.core.arrays import Bools, Floats, Ints, any_of, least_of, length_of, summed
 from harness.core.errors import UserError
 
 COME_AND_GO = (
-    "consensus trust: helpers come or go during an episode here, and the rule knows them by their "
-    "places; take another rule"
+    "consensus trust: helpers or voices come or go during an episode here, and the rule does not "
+    "know one from another; take another rule"
 )
 CERTAIN = 1e9  # evidence that nothing outweighs
 CLAIM = 4  # how many numbers of a claim are remembered: place (two), speed, time
@@ -65,7 +65,8 @@ class Trust:
     top_mps: float = 60.0  # the highest speed of a vehicle, m/s
     apart_m: float = 2.5  # the smallest distance between two vehicles, m
     noise: float = 4.0  # how many standard deviations of a beacon's error a true place may be off
-    needs: ClassVar[tuple[str, ...]] = ("claims",)  # the optional field of `Messages` that it reads
+    # the optional fields of `Messages` that it reads
+    needs: ClassVar[tuple[str, ...]] = ("claims", "numbers")
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
         """Return the rule's memory before the first decision of each episode, `(*batch, K)`.
@@ -84,13 +85,13 @@ class Trust:
         The intents are averaged by weight. Each decision first counts for or against each helper.
         `messages` are of one decision of each episode, and `state`, `(..., K)`, is the memory that
         `start` or the episode's last decision returned. `Fused.trust` has each helper's reputation,
-        from 0 to 1, with the present message counted. Raises UserError if the number of helpers is
-        another than at the episode's last decision.
+        from 0 to 1, with the present message counted. Raises UserError if there are helpers whom
+        the memory does not know.
         """
         p, heard = messages.intents, messages.heard
-        if state.shape[-1] != heard.shape[-1] * (2 + p.shape[-1] + CLAIM):
-            raise UserError(COME_AND_GO)
-        remembered = state.reshape(*heard.shape, -1)
+        memory = state.reshape(*heard.shape[:-1], -1, 2 + p.shape[-1] + CLAIM)
+        number = _numbers(messages, memory.shape[-2])[..., None]
+        remembered = np.take_along_axis(memory, number, axis=-2)
         last_intents, present_claims = remembered[..., 2:-CLAIM], _claims_of(messages)
         against = np.where(
             self._false(messages, present_claims, remembered[..., -CLAIM:]),
@@ -106,10 +107,9 @@ class Trust:
         trust = reputation[..., 0] / summed(reputation, axis=-1)
         weights = self._weights(messages, trust)
         intended = np.where(heard[..., None], p[..., 1:, :], last_intents)
-        memory = np.concatenate([reputation, intended, present_claims], axis=-1).reshape(
-            state.shape
-        )
-        return Fused(linear_pool(p, weights), weights, memory, trust)
+        newer, memory = np.concatenate([reputation, intended, present_claims], -1), memory.copy()
+        np.put_along_axis(memory, number, newer, axis=-2)
+        return Fused(linear_pool(p, weights), weights, memory.reshape(state.shape), trust)
 
     def _against(self, messages: Messages, intended: Floats) -> Floats:
         """Return how much speaks against each helper now, from 0 to 1, `(..., H)`."""
@@ -169,6 +169,18 @@ def trusting_only(trusted: Bools, actions: int) -> Floats:
     state = np.full((*trusted.shape, 2 + actions + CLAIM), np.nan)
     state[..., :2] = np.where(trusted[..., None], (CERTAIN, 0.0), (0.0, CERTAIN))
     return state.reshape(len(trusted), -1)
+
+
+def _numbers(messages: Messages, known: int) -> Ints:
+    """Return which of `known` helpers in an episode's memory the helpers are, `(..., H)`."""
+    numbers, shape = messages.numbers, messages.heard.shape
+    if numbers is None or (numbers < 0).any():  # known by their places alone
+        if shape[-1] != known:
+            raise UserError(COME_AND_GO)
+        return np.broadcast_to(np.arange(known), shape)
+    if numbers.max(initial=-1) >= known:
+        raise UserError(COME_AND_GO)
+    return numbers
 
 
 def _claims_of(messages: Messages) -> Floats:

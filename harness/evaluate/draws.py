@@ -16,29 +16,47 @@ OF_ANOTHER_AGENT = 1 << 40
 
 
 @lru_cache(maxsize=1 << 16)
-def _channel_uniforms(seed: int, layout_seed: int, steps: int, helpers: int) -> Floats:
-    return noise.uniforms((2 + steps, helpers), "channel", seed, layout_seed)
+def _channel_uniforms(
+    seed: int, layout_seed: int, steps: int, at_first: int, helpers: int
+) -> Floats:
+    drawn = noise.uniforms((2 + steps, at_first), "channel", seed, layout_seed)
+    if helpers > at_first:
+        # One helper after another, so that more of them change no earlier one's.
+        shape = helpers - at_first, 2 + steps
+        later = noise.uniforms(shape, "channel of later helpers", seed, layout_seed)
+        drawn = np.concatenate([drawn, later.T], axis=-1)
+    return drawn[:, :helpers]
 
 
-def channel_draws(seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int) -> Draws:
+def channel_draws(
+    seed: Ints, layout_seed: Ints, step: Ints, steps: int, helpers: int, at_first: Ints
+) -> Draws:
     """Return the channel's random draws for n decisions: whether messages are lost, and how late.
 
     The draws' keys are the seed of the channel, the seed of the episode's layout (start situation)
     and the number of the decision in its episode, `(n,)` each; so every condition, prompt and model
     has the same draws. Episodes have at most `steps` decisions, and each decision has draws for the
-    links to `helpers` helpers. Whether a link is up is drawn once an episode, jitter at each step.
-    A condition is a named set of settings of the radio, of asking helpers and of fusing their
-    messages.
+    links to `helpers` helpers, by their numbers. Whether a link is up is drawn once an episode,
+    jitter at each step. A condition is a named set of settings of the radio, of asking helpers and
+    of fusing their messages.
+
+    `at_first` is how many helpers the first decision of each decision's episode has, `(n,)`: draws
+    of these depend on it, and on nothing else that is played.
     """
     seeds, seed_index = np.unique(seed, return_inverse=True)
     layouts, layout_index = np.unique(layout_seed, return_inverse=True)
     # One number for each pair: `np.unique` of rows takes several times as long.
-    pairs, pair_of_decision = np.unique(
-        seed_index * len(layouts) + layout_index, return_inverse=True
+    pairs, decision_of_pair, pair_of_decision = np.unique(
+        seed_index * len(layouts) + layout_index, return_index=True, return_inverse=True
     )
     pair_index = np.divmod(pairs, max(len(layouts), 1))
-    keys = zip(seeds[pair_index[0]].tolist(), layouts[pair_index[1]].tolist(), strict=True)
-    uniforms = np.array([_channel_uniforms(s, layout, steps, helpers) for s, layout in keys])
+    keys = zip(
+        seeds[pair_index[0]].tolist(),
+        layouts[pair_index[1]].tolist(),
+        at_first[decision_of_pair].tolist(),
+        strict=True,
+    )
+    uniforms = np.array([_channel_uniforms(s, n, steps, first, helpers) for s, n, first in keys])
     uniforms = uniforms.reshape(len(pairs), 2 + steps, helpers)
     trips = Trips(seed, layout_seed, step, steps)
     return Draws(

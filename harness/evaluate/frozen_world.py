@@ -15,6 +15,7 @@ from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.schema import Edge
 from harness.dataset.select import NONE, Choice
 from harness.evaluate.draws import channel_draws
+from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
 from harness.runs.decisions import by_action
@@ -177,12 +178,14 @@ class FrozenWorld(SceneWorld):
         # where, which action, after how many seconds
         self._decided: list[tuple[Ints, Ints, Floats]] = []
         self._luck: tuple[Bools, Draws] | None = None  # of the decision points just shown
+        self._helpers = Helpers()
 
     def observe(self) -> Sequence[Scene]:
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
         self._shown, self._luck = places[places >= 0], None
         self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._shown.tolist()])
-        self._helpers = max((len(scene.viewers) for scene in self.scenes), default=1) - 1
+        if self.scenes:
+            self._numbers = self._helpers.numbers(self.scenes)
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
@@ -198,11 +201,12 @@ class FrozenWorld(SceneWorld):
         drawn, draws = self._draws()
         if len(at) < np.count_nonzero(drawn):
             draws = draws.take(undecided[drawn])
+        draws = self._numbers.of(draws, at)
         return Due(at, forest.episodes[tree], self._seeds[seed_index], draws)
 
     def _draws(self) -> tuple[Bools, Draws]:
         """Return which seeds and episodes have a decision now under any condition,
-        (S, E), and their draws.
+        (S, E), and their draws, of helpers by their numbers.
 
         All decisions of an episode that are due now are of one step, whatever their condition.
         """
@@ -210,9 +214,12 @@ class FrozenWorld(SceneWorld):
             forest, decisions = self._forest, self.scenario.parameters.decisions
             latest = np.max([walks.at for walks in self._walks.values()], axis=0)
             seed_index, tree = np.nonzero(latest >= 0)
-            seed, step = self._seeds[seed_index], forest.step[latest[seed_index, tree]]
-            draws = channel_draws(seed, forest.seeds[tree], step, decisions, self._helpers)
-            self._luck = latest >= 0, draws
+            at, numbers = latest[seed_index, tree], self._numbers
+            at_first = numbers.at_first[np.searchsorted(self._shown, at)]
+            self._luck = latest >= 0, channel_draws(
+                self._seeds[seed_index], forest.seeds[tree], forest.step[at], decisions,
+                numbers.most, at_first,
+            )  # fmt: skip
         return self._luck
 
     def leave_out(self, point: OperatingPoint, at: Bools) -> None:

@@ -27,6 +27,7 @@ from harness.dataset.select import Choice
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
 from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
+from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metric
 from harness.runs.records import ClosedLoop, Episode
@@ -147,6 +148,7 @@ class LiveWorld(SceneWorld):
             world = World.start(scenario, first_seed + number)
             self._going.append(Trajectory(number, world, courses))
         self._ended: list[Trajectory] = []
+        self._helpers = Helpers()
         self._decisions: list[Decision] = []
         self._step, self._tick, self._ticks = 0, 0, offsets(scenario)
 
@@ -167,6 +169,7 @@ class LiveWorld(SceneWorld):
                 self.scenes = looks(points, self._step, self._ego_alone, before)
                 for (t, agent), scene in zip(self._deciding, self.scenes, strict=True):
                     t.scenes[agent] = scene
+                self._numbers = self._helpers.numbers(self.scenes)
                 return self.scenes
             self._advance()
         return ()
@@ -182,9 +185,11 @@ class LiveWorld(SceneWorld):
             ]
         )
         episode = number[at]
-        helpers = max(len(scene.viewers) for scene in self.scenes) - 1
-        step = np.full(len(at), self._step)
-        draws = channel_draws(seed, self._first_seed + episode, step, self._p.decisions, helpers)
+        draws = channel_draws(
+            seed, self._first_seed + episode, np.full(len(at), self._step), self._p.decisions,
+            self._numbers.most, self._numbers.at_first[at],
+        )  # fmt: skip
+        draws = self._numbers.of(draws, at)
         senders = self._senders(places) if point.needs("plans") else None
         return Due(at, episode, seed, draws, senders)
 

@@ -30,15 +30,15 @@ def outlook(scenario: Scenario, scenes: Sequence[Scene]) -> Outlook:
     n, helpers = len(scenes), max((len(scene.viewers) for scene in scenes), default=1) - 1
     roads = [(seat.road(), places) for seat, places in by_seat(scenes, scenario).items()]
     most = max((len(road.sectors) for road, _ in roads), default=0)
-    unseen, to_zone_s = np.zeros((n, most)), np.zeros(n)
+    unseen, to_zone_s, regions = np.zeros((n, most)), np.zeros(n), np.zeros(n, dtype=int)
     added = np.full((n, helpers, most), np.nan)
     for road, places in roads:
         for i in places:
             seen, sectors = _outlook(road, scenes[i]), len(road.sectors)
-            unseen[i, :sectors], to_zone_s[i] = seen.unseen, seen.to_zone_s
+            unseen[i, :sectors], to_zone_s[i], regions[i] = seen.unseen, seen.to_zone_s, sectors
             added[i, : len(seen.added)] = 0.0  # nothing, where a road has no such region
             added[i, : len(seen.added), :sectors] = seen.added
-    return Outlook(unseen, added, to_zone_s)
+    return Outlook(unseen, added, to_zone_s, regions)
 
 
 def _outlook(road: Road, scene: Scene) -> Outlook:
@@ -59,8 +59,9 @@ def _outlook(road: Road, scene: Scene) -> Outlook:
         )
         regions = len(road.sectors)
         kept = Outlook(
-            _by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s)
-        )
+            _by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s),
+            np.array(regions),
+        )  # fmt: skip
         scene.notes["outlook"] = kept
     return kept
 

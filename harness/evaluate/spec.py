@@ -358,9 +358,10 @@ class Spec:
         it is tried on some scenes.
         """
         for scene in self.source.trial(TRIED, ego_alone=True):
-            graph = truth_graph(self.scenario, scene.state)
+            scenario = self.scenario_of(scene)
+            graph = truth_graph(scenario, scene.state)
             full, empty = (
-                self.ego.rendered(each, self.actions, (), self.scenario.prompt_words)
+                self.ego.rendered(each, self.actions, (), scenario.prompt_words)
                 for each in (graph, graph.blinded())
             )
             if full != empty:

@@ -460,6 +460,8 @@ def _broadcast(point: OperatingPoint, speaker: Speaker, intents: Intents, due: D
     then ask no further questions.
     """
     draws = due.draws
+    if point.needs("numbers"):
+        intents = replace(intents, numbers=draws.numbers)
     if point.stream is None or not point.rewrites.changes.of_attackers or draws.trips is None:
         return speaker.said(intents, draws, due.episode, due.seed)
     of_layout = replace(draws, trips=draws.trips.of_layout())

@@ -164,7 +164,23 @@ class Draws:
         of its link.
         """
         link = np.take_along_axis(self.link, places[..., None], axis=-2)
-        return Draws(link, np.take_along_axis(self.jitter, places, axis=-1), self.trips)
+        jitter = np.take_along_axis(self.jitter, places, axis=-1)
+        return Draws(link, jitter, self.trips and replace(self.trips, helpers=None))
+
+    def numbered(self, numbers: Ints) -> "Draws":
+        """Return the draws for helpers that have `numbers` in their episodes, `(n, H')`, from 0.
+
+        These draws must be of all numbers, in their order.
+        """
+        draws = self.of_helpers(numbers)
+        return replace(draws, trips=self.trips and replace(self.trips, helpers=numbers))
+
+    @property
+    def numbers(self) -> Ints:
+        """Return the number of each helper in its episode, `(..., H)`, by which its draws are."""
+        if self.trips is not None and self.trips.helpers is not None:
+            return self.trips.helpers
+        return np.broadcast_to(np.arange(self.jitter.shape[-1]), self.jitter.shape)
 
     @cached_property
     def packet(self) -> Floats:
@@ -213,7 +229,7 @@ class Draws:
         That is the link of the ego and an antenna on no vehicle.
         """
         none = np.zeros((*self.jitter.shape[:-1], 1))
-        return Draws(np.stack([none, none], axis=-1), none, self._trips)
+        return Draws(np.stack([none, none], axis=-1), none, replace(self._trips, helpers=None))
 
     @cached_property
     def requested(self) -> "Draws":

@@ -37,9 +37,15 @@ class Trips:
     # name of the links that the numbers are for, such as those of an antenna on no vehicle; empty
     # for those among vehicles
     links: str = ""
+    # number of each helper in its episode, from 0, which it keeps when others leave, `(..., H)`;
+    # None if it is the helper's index
+    helpers: Ints | None = None
 
     def take(self, at: Any) -> "Trips":
-        return Trips(self.seed[at], self.layout_seed[at], self.step[at], self.steps, self.links)
+        """Return the keys of the decisions at `at`, indices or a mask of the leading axis."""
+        helpers = None if self.helpers is None else self.helpers[at]
+        keys = self.seed[at], self.layout_seed[at], self.step[at]
+        return Trips(*keys, self.steps, self.links, helpers)
 
     def of_layout(self) -> "Trips":
         """Return the keys of numbers that belong to the layout, whatever the channel's seed is."""
@@ -51,8 +57,13 @@ class Trips:
         `helpers` is H. The first is for the request's wait for a free medium, then follow a pair
         (request, reply) for each helper.
         """
-        pairs_draws, place = self._once_a_pair(_packets, self.steps, helpers)
-        return pairs_draws[place, self.step]
+        pairs_draws, place = self._once_a_pair(_packets, self.steps, self.most(helpers))
+        drawn = pairs_draws[place, self.step]
+        if self.helpers is None:
+            return drawn
+        packets = drawn[..., 1:].reshape(*place.shape, -1, 2)
+        of_helpers = np.take_along_axis(packets, self.helpers[..., None], axis=-2)
+        return np.concatenate([drawn[..., :1], of_helpers.reshape(*place.shape, -1)], axis=-1)
 
     def shadow(self, xy_m: Floats, decorrelation_m: float) -> Floats:
         """Return the shadowing of the link to each of H helpers, `(..., H)`, standard normal.
@@ -62,22 +73,29 @@ class Trips:
         moved `decorrelation_m` (root of the sum of squares).
         """
         helpers = xy_m.shape[-2] - 1
-        waves, place = self._once_a_pair(_waves, helpers)
+        waves, place = self._once_a_pair(_waves, self.most(helpers))
         ego = np.broadcast_to(xy_m[..., :1, :], xy_m[..., 1:, :].shape)
         ends = (
             np.concatenate([ego, xy_m[..., 1:, :]], axis=-1).reshape(place.size, helpers, 4, 1)
             / decorrelation_m
         )
         place, total = place.reshape(-1), np.empty((place.size, helpers))
+        numbers = None if self.helpers is None else self.helpers.reshape(place.size, helpers)
         for start in range(0, len(place), BLOCK):
             block = slice(start, start + BLOCK)
             drawn = waves[place[block]]
+            if numbers is not None:
+                drawn = np.take_along_axis(drawn, numbers[block, :, None, None], axis=1)
             turns = drawn[..., 0] + np.matmul(drawn[..., 1:], ends[block])[..., 0]
             # The fraction of a turn is exact enough in single precision, whose cosine is much
             # faster.
             angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
             total[block] = np.cos(angle).sum(axis=-1)
         return total.reshape(*xy_m.shape[:-2], helpers) * math.sqrt(2 / WAVES)
+
+    def most(self, helpers: int) -> int:
+        """Return for how many helpers to draw, so that each of `helpers` has its number's draws."""
+        return helpers if self.helpers is None else int(self.helpers.max(initial=-1)) + 1
 
     def _once_a_pair(self, drawn: Any, *args: int) -> tuple[Floats, Ints]:
         """Return the draws for each seed and layout, (P, ...),

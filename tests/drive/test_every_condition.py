@@ -29,7 +29,7 @@ from harness.coordination.rules import names
 from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError
 from harness.core.extensions import control_settings
-from harness.dataset.load import Dataset, load
+from harness.dataset.load import Dataset, find, load
 from harness.evaluate.spec import Spec
 from harness.radio.networks import names as networks
 from harness.radio.profiles import CHANNELS
@@ -184,6 +184,27 @@ def test_a_condition_is_played_or_refused_in_one_line(two: Dataset, tmp_path: Pa
         assert resumed.decisions.table.equals(once.decisions.table)
         assert resumed.answers == once.answers
         assert not list(unknown_or_finite(once.decisions))
+
+    holds()
+
+
+@pytest.mark.slow
+def test_an_episode_is_the_same_whatever_else_is_played() -> None:
+    """On roads of SUMO, where layouts have two or three helpers of whom one leaves, or none."""
+    crossing = load(find("sumo-crossing-v1"))
+    whole = crossing.of_episodes(frozenset({0, 3, 6, 9, 12, 14, 29, 36}))
+
+    @settings(max_examples=20)
+    @given(typed=conditions(), number=st.sampled_from(whole.episodes))
+    def holds(typed: Typed, number: int) -> None:
+        spec = played(typed, whole)
+        if spec is None or spec.points[0].elsewhere:
+            return
+        part = opened(typed, whole.of_episodes(frozenset({number})))[0]
+        assert part
+        expected = told(walked(spec, Sees()).decisions)[0]
+        alone = told(walked(part, Sees()).decisions)[0]
+        assert alone == {(number, 0): expected[number, 0]}
 
     holds()
 

@@ -66,7 +66,7 @@ class Relay(Wrapped):
         copies = draws.of(".roadside-ego")
         copy = broadcast(self.channel, links.payload_bits, replace(copies, given=copies.packet))
         ego_site = at_unit.select(EGO)
-        to_ego, shadow = replace(links, site=ego_site), partial(copies.shadow, ego_site.xy_m)
+        to_ego, shadow = replace(links, site=ego_site), partial(copies.of_one.shadow, ego_site.xy_m)
         copied = heard & (
             copies.packet[..., 1] >= link_loss(self.channel, ego_site, shadow, links.payload_bits)
         )
@@ -120,7 +120,7 @@ def by_unit(
     request_draw, policy_draw = np.moveaxis(one_link.packet[..., 0, :], -1, 0)
 
     def lost(size_bits: float) -> Floats:
-        shadow = partial(to_ego.shadow, ego_link.where.xy_m)
+        shadow = partial(one_link.shadow, ego_link.where.xy_m)
         return link_loss(channel, ego_link.where, shadow, size_bits)[..., 0]
 
     wanted = np.any(links.asked, axis=-1)

@@ -24,6 +24,7 @@ from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.dataset.forest import Forest
 from harness.evaluate.draws import channel_draws, tie_draws
+from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.outlook import outlook
 from harness.evaluate.walk import as_sent
 from harness.radio.channel import Draws
@@ -251,9 +252,9 @@ def choices(
     sets = np.zeros((len(members), helpers), dtype=bool)
     for row, some in zip(sets, members, strict=True):
         row[list(some)] = True
-    at, levels = forest.root, list[Level]()
+    at, levels, known = forest.root, list[Level](), Helpers()
     while len(at):
-        level = _level(stored, point, seed, at, sets)
+        level = _level(stored, point, seed, at, sets, known)
         levels.append(level)
         following = forest.child[at[:, None], level.action]
         at = np.unique(following[following >= 0])
@@ -261,7 +262,9 @@ def choices(
     return Choices(forest, sets, tuple(levels))
 
 
-def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, sets: Bools) -> Level:
+def _level(
+    stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, sets: Bools, known: Helpers
+) -> Level:
     dataset, forest = stored.dataset, stored.dataset.forest
     scenario, shape = dataset.scenario, (len(seeds), len(at))
     scenes = dataset.scenes([forest.ids[n] for n in at.tolist()])
@@ -273,9 +276,12 @@ def _level(stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, se
         intents = replace(intents, site=site(places, point.antennas, zones_m, names))
     seed, node = (index.ravel() for index in np.indices(shape))
     steps, width = scenario.parameters.decisions, intents.range_m.shape[1]
+    numbers = known.numbers(scenes)
     draws = channel_draws(
-        seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps, width
-    )
+        seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps,
+        numbers.most, numbers.at_first[node],
+    )  # fmt: skip
+    draws = numbers.of(draws, node)
     intents = as_sent(point, point.prepared(intents.take(node)))
     ties = tie_draws(draws, stored.spec.ties)
     joules = stored.joules(scenes, point)[node]

@@ -67,8 +67,7 @@ def coverage(inputs: ScheduleInputs) -> Floats:
     has what the ego knows before it asks, with leading axes `(...)`.
     """
     assert inputs.outlook is not None
-    regions = max(inputs.outlook.added.shape[-1], 1)
-    return np.where(inputs.may_ask, np.sum(inputs.outlook.added, axis=-1) / regions, np.nan)
+    return np.where(inputs.may_ask, inputs.outlook.mean(inputs.outlook.added), np.nan)
 
 
 def random(inputs: ScheduleInputs) -> Floats:

@@ -152,7 +152,6 @@ def inputs(facts: ScheduleInputs) -> Floats:
     outlook, may_ask = facts.outlook, facts.may_ask
     assert outlook is not None
     ranked = np.sort(facts.own, axis=-1)
-    regions = max(outlook.unseen.shape[-1], 1)
     range_m = np.where(may_ask, facts.range_m, np.inf)
     nearer = (range_m[..., None, :] < range_m[..., :, None]).sum(axis=-1)
     ego_inputs = (
@@ -161,7 +160,7 @@ def inputs(facts: ScheduleInputs) -> Floats:
         facts.own[..., 0],
         facts.own[..., -1],
         outlook.unseen.max(axis=-1, initial=0.0),
-        outlook.unseen.sum(axis=-1) / regions,
+        outlook.mean(outlook.unseen),
         facts.distance_m[..., 0] / FAR_M,
         np.minimum(outlook.to_zone_s, FAR_S) / FAR_S,
         may_ask.sum(axis=-1) - 1.0,
@@ -177,7 +176,7 @@ def inputs(facts: ScheduleInputs) -> Floats:
         unseen_most,
         unseen,
         outlook.added.max(axis=-1, initial=0.0),
-        outlook.added.sum(axis=-1) / regions,
+        outlook.mean(outlook.added),
         facts.range_m / FAR_M,
         facts.distance_m[..., 1:] / FAR_M,
         ego_m,

@@ -55,9 +55,9 @@ class Attackers:
             raise UserError(
                 "attacks need layouts, and the paper's study has none; leave attack out"
             )
-        uniforms = _uniforms(draws.trips, truth.valid.shape[1])
+        uniforms = _uniforms(draws.trips, draws.numbers)
         of_step = _of_helpers(uniforms[..., 1], draws.trips)
-        first, past = self._memory.recall(truth.helpers, episodes)
+        first, past = self._memory.recall(truth.helpers, draws.numbers, episodes)
         sent = truth
         attacking = np.zeros(truth.valid.shape, dtype=bool)
         for attack in self._attacks:
@@ -72,7 +72,10 @@ class Attackers:
 
 
 class _Memory:
-    """What helpers intended at the first step of each play of an episode, and at its last K."""
+    """What helpers intended at the first step of each play of an episode, and at its last K.
+
+    Helpers are known by their numbers in the episode.
+    """
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
@@ -81,23 +84,27 @@ class _Memory:
         self._intended = np.empty((0, 1 + steps, 0, 0))
         self._helpers = np.empty(0, dtype=int)  # how many there were at the first step
 
-    def recall(self, intents: Floats, episodes: Sequence[tuple[int, int]]) -> tuple[Floats, Floats]:
+    def recall(
+        self, intents: Floats, numbers: Ints, episodes: Sequence[tuple[int, int]]
+    ) -> tuple[Floats, Floats]:
         """Return the first intents (n, H, A) and those of K past steps (n, K, H, A);
-        NaN without a step. Those of this step, `intents`, are remembered.
+        NaN without a step. Those of this step, `intents` of helpers with `numbers` (n, H), are
+        remembered.
         """
-        here = intents.shape[1]
         rows = np.array([self._rows.setdefault(place, len(self._rows)) for place in episodes], int)
-        self._grow(*intents.shape[1:])
-        intended, was_there = self._intended[rows], np.arange(here) < self._helpers[rows, None]
-        first = np.where(was_there[..., None], intended[:, 0, :here], intents)
+        self._grow(int(numbers.max(initial=-1)) + 1, intents.shape[2])
+        intended, row = self._intended[rows], rows[:, None]
+        of_helpers = np.take_along_axis(intended, numbers[:, None, :, None], axis=2)
+        was_there = numbers < self._helpers[row]
+        first = np.where(was_there[..., None], of_helpers[:, 0], intents)
         if self._steps:
             self._intended[rows, 2:] = intended[:, 1:-1]
             self._intended[rows, 1] = np.nan
-            self._intended[rows, 1, :here] = intents
+            self._intended[row, 1, numbers] = intents
         new = self._helpers[rows] == 0
-        self._intended[rows[new], 0, :here] = intents[new]
-        self._helpers[rows[new]] = here
-        return first, intended[:, 1:, :here]
+        self._intended[row[new], 0, numbers[new]] = intents[new]
+        self._helpers[rows[new]] = intents.shape[1]
+        return first, of_helpers[:, 1:]
 
     def _grow(self, helpers: int, actions: int) -> None:
         rows, _, most, _ = self._intended.shape
@@ -116,7 +123,7 @@ def attackers_among(share: float, truth: Intents, draws: Draws) -> Bools:
     same helpers attack in all decisions of an episode, as long as the same are present.
     """
     assert draws.trips is not None
-    return _drawn(share, truth, draws.trips, _uniforms(draws.trips, truth.valid.shape[1]))
+    return _drawn(share, truth, draws.trips, _uniforms(draws.trips, draws.numbers))
 
 
 def _drawn(share: float, truth: Intents, trips: Trips, uniforms: Floats) -> Bools:
@@ -139,7 +146,8 @@ def _acted(attack: Attack, sent: Intents, turn: Turn) -> Intents:
             claims = replace(after.claims, from_road_m=sent.claims.from_road_m)
             after = replace(after, claims=claims)
         if after.voice_of is None:
-            after = replace(after, site=sent.site, outlook=sent.outlook, plans=sent.plans)
+            site, outlook, plans = sent.site, sent.outlook, sent.plans
+            after = replace(after, site=site, outlook=outlook, plans=plans, numbers=sent.numbers)
             _refuse_of_others(sent, after, turn.attackers)
         else:
             check_shape("voices", after.voice_of, after.helpers.shape[:2])
@@ -166,7 +174,8 @@ def _with_honest_voices(sent: Intents, after: Intents, attackers: Bools) -> Inte
     voice_of = after.voice_of
     assert voice_of is not None
     before = replace(sent.of_helpers(voice_of), voice_of=voice_of)
-    after = replace(after, site=before.site, outlook=before.outlook, plans=before.plans)
+    site, outlook, plans = before.site, before.outlook, before.plans
+    after = replace(after, site=site, outlook=outlook, plans=plans, numbers=before.numbers)
     present = np.isfinite(after.range_m)
     honest = present & ~np.take_along_axis(attackers, voice_of, axis=1)
     _refuse_of_others(before, after, ~honest)
@@ -212,14 +221,16 @@ def _claimed(intents: Intents) -> dict[str, Any]:
     return arrays
 
 
-def _uniforms(trips: Trips, helpers: int) -> Floats:
+def _uniforms(trips: Trips, numbers: Ints) -> Floats:
     """Return two draws for each helper of the ego, one of the episode and one of the step,
     (n, H, 2).
     """
+    most = int(numbers.max(initial=-1)) + 1
     keys = zip(trips.seed.tolist(), (trips.layout_seed % OF_ANOTHER_AGENT).tolist(), strict=True)
     uniforms = np.array(
-        [_helper_uniforms(seed, layout, trips.steps, helpers) for seed, layout in keys]
+        [_helper_uniforms(seed, layout, trips.steps, most) for seed, layout in keys]
     )
+    uniforms = np.take_along_axis(uniforms, numbers[..., None], axis=1)
     of_step = uniforms[np.arange(len(uniforms)), :, 1 + trips.step]
     return np.stack([uniforms[..., 0], of_step], axis=-1)
 

@@ -224,8 +224,9 @@ class Stale(Attack):
 class Replay(Attack):
     """Attack by stating as one's own the intent of another helper at the last step.
 
-    An intent is a vehicle's probabilities of actions. The other is the next helper in their order,
-    after the last one the first. At an episode's first step it states its own intent.
+    An intent is a vehicle's probabilities of actions. The other is the next helper that is there,
+    in their order, after the last one the first. At an episode's first step it states its own
+    intent.
     """
 
     @property
@@ -233,7 +234,14 @@ class Replay(Attack):
         return 1
 
     def act(self, sent: Intents, turn: Turn) -> Intents:
-        return self.intend(sent, turn, np.roll(turn.past[:, 0], -1, axis=1))
+        present = np.isfinite(turn.truth.range_m)
+        order = np.argsort(~present, axis=1, kind="stable")  # those who are there first
+        count = np.maximum(np.sum(present, axis=1, keepdims=True), 1)
+        following = np.cumsum(present, axis=1) % count
+        other = np.take_along_axis(order, following, axis=1)
+        return self.intend(
+            sent, turn, np.take_along_axis(turn.past[:, 0], other[..., None], axis=1)
+        )
 
 
 @dataclass(frozen=True)

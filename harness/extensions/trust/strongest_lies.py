@@ -171,6 +171,4 @@ def _choices(helpers: int) -> list[tuple[int, ...]]:
 
 
 def _named(chosen: Sequence[int], truth: Intents, draws: Draws) -> Bools:
-    liars = np.zeros(truth.valid.shape, dtype=bool)
-    liars[:, [helper for helper in chosen if helper < len(liars.T)]] = True  # of those in any scene
-    return liars & np.isfinite(truth.range_m)
+    return np.isin(draws.numbers, chosen) & np.isfinite(truth.range_m)

@@ -31,6 +31,7 @@ from harness.core.arrays import Bools, Floats, Ints, any_of, taken
 from harness.dataset.load import Dataset, Scene
 from harness.evaluate.draws import channel_draws, tie_draws
 from harness.evaluate.fusion import codes_of
+from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.walk import Ask, Decided, Due, SceneWorld
 from harness.extensions.trust import lies
 from harness.extensions.trust.attacks import Turn, attacks_of
@@ -117,6 +118,7 @@ class Courses(SceneWorld):
         seed, tree = (index.ravel() for index in np.indices(shape))
         start = Front(seed, tree, self._forest.root[tree], None)
         self._fronts = dict.fromkeys(self._searches, start)
+        self._helpers = Helpers()
         self.lost = {point.name: np.zeros(shape, dtype=bool) for point in self._searches}
         self.unsearchable: set[str] = set()
 
@@ -132,16 +134,19 @@ class Courses(SceneWorld):
         places = [front.at for front in self._fronts.values()]
         self._shown = np.unique(np.concatenate(places))
         self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._shown.tolist()])
-        self._helpers = max((len(scene.viewers) for scene in self.scenes), default=1) - 1
+        if self.scenes:
+            self._numbers = self._helpers.numbers(self.scenes)
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
         front, forest = self._fronts[point], self._forest
         seed, decisions = self._seeds[front.seed], self.scenario.parameters.decisions
-        step = forest.step[front.at]
-        draws = channel_draws(seed, forest.seeds[front.tree], step, decisions, self._helpers)
-        at = np.searchsorted(self._shown, front.at)
-        return Due(at, forest.episodes[front.tree], seed, draws)
+        at, numbers = np.searchsorted(self._shown, front.at), self._numbers
+        draws = channel_draws(
+            seed, forest.seeds[front.tree], forest.step[front.at], decisions,
+            numbers.most, numbers.at_first[at],
+        )  # fmt: skip
+        return Due(at, forest.episodes[front.tree], seed, numbers.of(draws, at))
 
     def plans(self) -> Plans | None:
         return None

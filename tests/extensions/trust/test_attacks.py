@@ -119,7 +119,8 @@ def test_what_is_remembered_is_what_was_intended_at_the_first_step_and_the_last_
         now = number + np.random.default_rng(number).random((len(episodes), helpers, 2))
         now[0, 0] = NAN
         places = [(episode, 0) for episode in sorted(episodes)]
-        first, past = memory.recall(now, places)
+        numbers = np.broadcast_to(np.arange(helpers), now.shape[:2])
+        first, past = memory.recall(now, numbers, places)
         assert past.shape == (len(places), most, helpers, 2)
         for row, (episode, _) in enumerate(places):
             before = history.setdefault(episode, [])

@@ -118,7 +118,8 @@ def loses(stored: ReplayedRun, point: OperatingPoint, node: int) -> bool:
     truth = stored.whole([scene]).take(np.zeros(n, dtype=int))
     seed, layout = np.full(n, stored.seeds[0]), np.full(n, forest.seeds[tree])
     steps = stored.dataset.scenario.parameters.decisions
-    draws = channel_draws(seed, layout, np.full(n, forest.step[node]), steps, truth.valid.shape[1])
+    step, helpers = np.full(n, forest.step[node]), truth.valid.shape[1]
+    draws = channel_draws(seed, layout, step, steps, helpers, np.full(n, helpers))
     liars = attackers_among(THIRD, truth, draws)
     heard = exchange(point, truth, draws)
     ties = FusionInputs(None, None, tie_draws(draws, stored.spec.ties))
@@ -315,8 +316,8 @@ def test_a_share_that_rounds_has_as_many_liars_as_the_attacks(
 def test_who_is_in_no_scene_of_a_step_lies_to_nobody(stored: ReplayedRun) -> None:
     [scene] = stored.dataset.scenes([stored.dataset.forest.ids[stored.dataset.forest.root[0]]])
     truth = stored.whole([scene])
-    draws = channel_draws(np.array([0]), np.array([1]), np.array([0]), 4, truth.valid.shape[1])
-    helpers = truth.valid.shape[1]
+    helpers, zero = truth.valid.shape[1], np.array([0])
+    draws = channel_draws(zero, np.array([1]), zero, 4, helpers, np.array([helpers]))
     assert _named((0, helpers), truth, draws).tolist() == _named((0,), truth, draws).tolist()
 
 
