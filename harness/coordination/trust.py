@@ -171,14 +171,14 @@ def trusting_only(trusted: Bools, actions: int) -> Floats:
     return state.reshape(len(trusted), -1)
 
 
-def _numbers(messages: Messages, known: int) -> Ints:
-    """Return which of `known` helpers in an episode's memory the helpers are, `(..., H)`."""
+def _numbers(messages: Messages, helpers: int) -> Ints:
+    """Return which of the `helpers` in an episode's memory the present ones are, `(..., H)`."""
     numbers, shape = messages.numbers, messages.heard.shape
     if numbers is None or (numbers < 0).any():  # known by their places alone
-        if shape[-1] != known:
+        if shape[-1] != helpers:
             raise UserError(COME_AND_GO)
-        return np.broadcast_to(np.arange(known), shape)
-    if numbers.max(initial=-1) >= known:
+        return np.broadcast_to(np.arange(helpers), shape)
+    if numbers.max(initial=-1) >= helpers:
         raise UserError(COME_AND_GO)
     return numbers
 

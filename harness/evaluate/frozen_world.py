@@ -216,10 +216,8 @@ class FrozenWorld(SceneWorld):
             seed_index, tree = np.nonzero(latest >= 0)
             at, numbers = latest[seed_index, tree], self._numbers
             at_first = numbers.at_first[np.searchsorted(self._shown, at)]
-            self._luck = latest >= 0, channel_draws(
-                self._seeds[seed_index], forest.seeds[tree], forest.step[at], decisions,
-                numbers.most, at_first,
-            )  # fmt: skip
+            keys = self._seeds[seed_index], forest.seeds[tree], forest.step[at], decisions
+            self._luck = latest >= 0, channel_draws(*keys, numbers.most, at_first)
         return self._luck
 
     def leave_out(self, point: OperatingPoint, at: Bools) -> None:

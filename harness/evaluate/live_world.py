@@ -185,10 +185,9 @@ class LiveWorld(SceneWorld):
             ]
         )
         episode = number[at]
-        draws = channel_draws(
-            seed, self._first_seed + episode, np.full(len(at), self._step), self._p.decisions,
-            self._numbers.most, self._numbers.at_first[at],
-        )  # fmt: skip
+        step, at_first = np.full(len(at), self._step), self._numbers.at_first[at]
+        keys = seed, self._first_seed + episode, step, self._p.decisions
+        draws = channel_draws(*keys, self._numbers.most, at_first)
         draws = self._numbers.of(draws, at)
         senders = self._senders(places) if point.needs("plans") else None
         return Due(at, episode, seed, draws, senders)

@@ -58,10 +58,8 @@ def _outlook(road: Road, scene: Scene) -> Outlook:
             distance_m / speed_mps if speed_mps > MOVING_MPS else np.inf if distance_m else 0.0
         )
         regions = len(road.sectors)
-        kept = Outlook(
-            _by_region(road, unseen), np.reshape(added, (-1, regions)), np.array(to_zone_s),
-            np.array(regions),
-        )  # fmt: skip
+        shares = _by_region(road, unseen), np.reshape(added, (-1, regions))
+        kept = Outlook(*shares, np.array(to_zone_s), np.array(regions))
         scene.notes["outlook"] = kept
     return kept
 

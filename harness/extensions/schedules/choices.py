@@ -252,9 +252,9 @@ def choices(
     sets = np.zeros((len(members), helpers), dtype=bool)
     for row, some in zip(sets, members, strict=True):
         row[list(some)] = True
-    at, levels, known = forest.root, list[Level](), Helpers()
+    at, levels, numbering = forest.root, list[Level](), Helpers()
     while len(at):
-        level = _level(stored, point, seed, at, sets, known)
+        level = _level(stored, point, seed, at, sets, numbering)
         levels.append(level)
         following = forest.child[at[:, None], level.action]
         at = np.unique(following[following >= 0])
@@ -263,7 +263,12 @@ def choices(
 
 
 def _level(
-    stored: ReplayedRun, point: OperatingPoint, seeds: Ints, at: Ints, sets: Bools, known: Helpers
+    stored: ReplayedRun,
+    point: OperatingPoint,
+    seeds: Ints,
+    at: Ints,
+    sets: Bools,
+    numbering: Helpers,
 ) -> Level:
     dataset, forest = stored.dataset, stored.dataset.forest
     scenario, shape = dataset.scenario, (len(seeds), len(at))
@@ -276,11 +281,9 @@ def _level(
         intents = replace(intents, site=site(places, point.antennas, zones_m, names))
     seed, node = (index.ravel() for index in np.indices(shape))
     steps, width = scenario.parameters.decisions, intents.range_m.shape[1]
-    numbers = known.numbers(scenes)
-    draws = channel_draws(
-        seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps,
-        numbers.most, numbers.at_first[node],
-    )  # fmt: skip
+    numbers = numbering.numbers(scenes)
+    keys = seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps
+    draws = channel_draws(*keys, numbers.most, numbers.at_first[node])
     draws = numbers.of(draws, node)
     intents = as_sent(point, point.prepared(intents.take(node)))
     ties = tie_draws(draws, stored.spec.ties)

@@ -142,10 +142,8 @@ class Courses(SceneWorld):
         front, forest = self._fronts[point], self._forest
         seed, decisions = self._seeds[front.seed], self.scenario.parameters.decisions
         at, numbers = np.searchsorted(self._shown, front.at), self._numbers
-        draws = channel_draws(
-            seed, forest.seeds[front.tree], forest.step[front.at], decisions,
-            numbers.most, numbers.at_first[at],
-        )  # fmt: skip
+        keys = seed, forest.seeds[front.tree], forest.step[front.at], decisions
+        draws = channel_draws(*keys, numbers.most, numbers.at_first[at])
         return Due(at, forest.episodes[front.tree], seed, numbers.of(draws, at))
 
     def plans(self) -> Plans | None:
