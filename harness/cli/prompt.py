@@ -96,7 +96,7 @@ def show(
     prompt, data = prompts.load(version), load.load(load.find(dataset))
     at = data.scene(scene or next(iter(data.forest.place)))
     viewers = at.viewers if viewer is None else [at.viewer(viewer)]
-    words = data.scenario.prompt_words
+    scenario = at.seat or data.scenario
     reader = pictures.picture_model(prompt, model)
     if reader is None and out:
         raise UserError(f"--out: prompt {version} shows no picture; leave it out")
@@ -105,10 +105,10 @@ def show(
     images: dict[str, Image] = {}
     notes: dict[str, str] = {}
     for name in viewers:
-        rendered = prompt.render(at.graphs[name], data.actions, words=words)
+        rendered = prompt.render(at.graphs[name], data.actions, words=scenario.prompt_words)
         chats[name] = with_system(rendered, system)
         if reader:
-            images[name] = Sight(data.scenario, at.state, name, reader.vision.size_px)
+            images[name] = Sight(scenario, at.state, name, reader.vision.size_px)
             if out:
                 notes[name] = pictures.write(images[name], out / f"{at.id}-{name}.png")
     if as_json:
@@ -167,7 +167,8 @@ def compare(
     before, after, data = prompts.load(a), prompts.load(b), load.load(load.find(dataset))
     at = data.scene(scene or next(iter(data.forest.place)))
     change = difference.change(before, after)
-    sent = difference.sent(before, after, at, data.scenario, counter(tokenizer))
+    scenario = at.seat or data.scenario
+    sent = difference.sent(before, after, at, scenario, counter(tokenizer))
     if as_json:
         fields = ("version", "sha256", "released")
         result = {

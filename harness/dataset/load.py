@@ -76,6 +76,12 @@ class Scene:
     # not known
     before: Callable[[], "Scene | None"] = field(default=Earlier(None), repr=False, compare=False)
 
+    @classmethod
+    def of(cls, record: Record, scenario: Scenario) -> "Scene":
+        """Return a scene of a scenario's own ego, on its layout's road, by its record."""
+        own_road = scenario.has_own_world
+        return cls(record, seat=scenario.at(record.episode_seed) if own_road else None)
+
     @property
     def id(self) -> str:
         return self.record.scene

@@ -27,7 +27,8 @@ from harness.world.scenarios import title
 from harness.world.scene_graph import SceneGraph
 
 TOGETHER = 8  # layouts in a row group, and in memory
-Chat = Callable[[SceneGraph], list[dict[str, str]]]  # what asks a viewer, as messages
+# from a scene graph, and the scenario as its scene has it, to messages that ask the viewer
+Chat = Callable[[SceneGraph, Scenario | None], list[dict[str, str]]]
 
 
 def publish(
@@ -144,7 +145,7 @@ def _row(scene: Scene, chat: Chat) -> dict[str, Any]:
         "step": record.step,
         "danger_sector": record.danger.sector,
         "danger_vehicle": record.danger.vehicle,
-        "prompt": chat(scene.graphs[viewers[0]]),
+        "prompt": chat(scene.graphs[viewers[0]], scene.seat),
         "viewers": list(viewers),
         "scene_graphs": [_json(graph) for graph in scene.graphs.values()],
         "distance_m": [record.distance_m.get(viewer) for viewer in viewers],

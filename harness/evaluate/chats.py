@@ -47,11 +47,12 @@ class Asking:
         """
         return cls(scenario, load(prompt or scenario.prompt), answer)  # type: ignore[arg-type]
 
-    def chat(self, graph: SceneGraph) -> list[dict[str, str]]:
+    def chat(self, graph: SceneGraph, seat: Scenario | None = None) -> list[dict[str, str]]:
         """Return the chat messages that ask one vehicle about a scene, with `role` and `content`.
 
-        `graph` is the vehicle's scene graph, what it knows of the scene.
+        `graph` is the vehicle's scene graph, what it knows of the scene. `seat` is the scenario as
+        the scene has it (`Scene.seat`), with a goal of its own; None if all scenes have one.
         """
-        actions, words = self.scenario.actions, self.scenario.prompt_words
+        actions, words = self.scenario.actions, (seat or self.scenario).prompt_words
         sent = self.prompt.render(graph, actions, (), words, letter=self.answer == "readout")
         return [{**m} for m in in_mode(self.answer, self.prompt, sent, graph, actions, words)]

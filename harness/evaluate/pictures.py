@@ -36,7 +36,8 @@ def picture(
         place = scene.viewers.index(viewer)
         scene = another(spec, scene)
         viewer = scene.viewers[min(place, len(scene.viewers) - 1)]
-    return Sight(spec.scenario, scene.state, viewer, vision.size_px)
+    of_layout = spec.scenario.at(scene.record.episode_seed)
+    return Sight(of_layout, scene.state, viewer, vision.size_px)
 
 
 @lru_cache(maxsize=4)

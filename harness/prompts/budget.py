@@ -69,8 +69,8 @@ def measure(
     sizes = Sizes({call: [] for call in (*ROLES, FUSION, REPAIR)})
 
     def render(scene: Scene, viewer: str, messages: Sequence[Mapping[str, Any]] = ()) -> None:
-        graph = scene.graphs[viewer]
-        rendered = prompt.render(graph, data.actions, messages, words)
+        graph, scenario = scene.graphs[viewer], scene.seat or data.scenario
+        rendered = prompt.render(graph, data.actions, messages, scenario.prompt_words)
         if not count:
             return
         tokens = {FUSION if messages else graph.role: count(rendered) + picture}

@@ -516,6 +516,12 @@ def test_feedback_is_exact_and_counterfactual(small: Dataset) -> None:
     assert all(" m, from " in line and "no message came" in line for line in hidden)
 
 
+def test_feedback_is_on_the_layouts_own_road() -> None:
+    crossing = load(find("sumo-crossing-v1"))
+    lines = [of_decision(played(crossing, episode, 0, (0.2,) * 5)) for episode in range(9, 15)]
+    assert any("was out of sight" in line for line in lines)
+
+
 def test_feedback_says_what_no_message_held(small: Dataset) -> None:
     quiet = next(
         decision

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from evaluating import run as evaluate
 from evaluating import spec_of
@@ -15,8 +16,9 @@ from run_on_disk import ACTIONS, Row, answers_of, change, configure, damage, mad
 from harness.coordination.named_points import POINTS
 from harness.core.files import digest
 from harness.dataset.load import Dataset, find, load
-from harness.extensions.learn.training.lessons import label
+from harness.extensions.learn.training.lessons import Lessons, label
 from harness.extensions.learn.training.pairs import pairs, preferences
+from harness.extensions.learn.training.questions import question
 from harness.parsing.parse import parse
 from harness.parsing.status import Status
 from harness.prompts import versions as prompts
@@ -54,6 +56,18 @@ def run(evaluated: Path, tmp_path: Path) -> Path:
     import shutil
 
     return shutil.copytree(evaluated, tmp_path / "run")
+
+
+def test_a_question_has_the_goal_of_its_layout() -> None:
+    crossing = load(find("sumo-crossing-v1")).of_episodes(frozenset({9}))
+    [scene, *_] = scenes = tuple(crossing.scenes(crossing.courses()))
+    prompt, level = prompts.load("v4"), np.full(5, 0.2)
+    lessons = Lessons(crossing.scenario, (prompt,), scenes, {each.id: level for each in scenes})
+    asked = question(lessons, scene, scene.viewers[0], prompt)
+    task = crossing.scenario.at(crossing.seeds[0]).prompt_words["task"]
+    assert task != crossing.scenario.prompt_words["task"]
+    for messages in (asked.messages, asked.read_out):
+        assert task in messages[0]["content"]
 
 
 def unreadable(row: Row) -> None:

@@ -24,7 +24,7 @@ from harness.coordination.rules import RULES
 from harness.core.errors import UserError
 from harness.core.process import Stop
 from harness.core.statistics import Estimate
-from harness.dataset.load import Dataset
+from harness.dataset.load import Dataset, find, load
 from harness.evaluate import run as evaluation
 from harness.evaluate.agent import Agent
 from harness.extensions.studies.attribution import study as attribution
@@ -133,6 +133,14 @@ def test_a_graph_without_an_object_is_one_that_no_sensor_reported(small: Dataset
                 )
                 assert alike == graph
     assert opened > 10
+
+
+@pytest.mark.slow
+def test_an_object_is_left_out_on_the_layouts_own_road(tmp_path: Path) -> None:
+    crossing = load(find("sumo-crossing-v1")).of_episodes(frozenset({9}))
+    done = run(spec_of(crossing, prompt="v4", points=(SIXG,), seeds=(0,)), tmp_path / "run")
+    found = attribute(ReplayedRun(done.out), SIXG.name, 3, 0)
+    assert {each.role for each in found.left_out} >= {"ego", "helper"}
 
 
 @pytest.mark.slow

@@ -216,7 +216,8 @@ def _reflected(tuning: Tuning, candidate: Mapping[str, str], trace: Played | str
         return {"Inputs": "", "Generated Outputs": "", "Feedback": trace}
     decision, text = of_course(trace)
     prompt: Prompt = rewritten(tuning.base, candidate).prompt
-    graph, scenario = decision.scene.graphs[decision.scene.viewers[0]], decision.dataset.scenario
+    scene = decision.scene
+    graph, scenario = scene.graphs[scene.viewers[0]], scene.seat or decision.dataset.scenario
     user = prompt.render(graph, decision.dataset.actions, words=scenario.prompt_words)[-1][
         "content"
     ]

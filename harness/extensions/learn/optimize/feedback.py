@@ -69,7 +69,8 @@ def _worths(decision: Decision) -> str:
 
 def _unseen(decision: Decision) -> list[str]:
     """Return a sentence for each vehicle in the ego's way that the ego does not see."""
-    scene, scenario = decision.scene, decision.dataset.scenario
+    scene = decision.scene
+    scenario = scene.seat or decision.dataset.scenario
     ego = scene.graphs[scene.viewers[0]]
     truth = truth_graph(scenario, scene.state)
     reported = " ".join(

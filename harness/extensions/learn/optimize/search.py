@@ -89,7 +89,7 @@ def render_all(spec: Spec) -> None:
                 prompt = chosen(spec.ego.prompt, {name: number}).prompt
                 for role in ROLES:
                     if role in graphs:
-                        words = spec.scenario.prompt_words
+                        words = spec.scenario_of(scene).prompt_words
                         prompt.render(graphs[role], spec.actions, words=words)
             except UserError as error:
                 raise UserError(f"alternative {number + 1} of {name}: {error}") from None

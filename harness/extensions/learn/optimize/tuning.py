@@ -226,8 +226,9 @@ class Tuning:
         """Return the characters of the ego's prompt, in the first decision point of each family."""
         length = 0
         for spec in self.specs:
-            ego, words = changed(spec, prompt).ego, spec.scenario.prompt_words
+            ego = changed(spec, prompt).ego
             for scene in spec.source.trial(1, ego_alone=True):
+                words = spec.scenario_of(scene).prompt_words
                 chat = ego.rendered(scene.graphs[scene.viewers[0]], spec.actions, (), words)
                 length += sum(len(message["content"]) for message in chat)
         return length

@@ -69,7 +69,7 @@ def rows(
         name = viewer_of(scene, viewer, float(noise.uniforms((), "viewer", scene.id)))
         graph = scene.graphs[name]
         yield {
-            "prompt": asking.chat(graph),
+            "prompt": asking.chat(graph, scene.seat),
             "scene": scene.id,
             "viewer": name,
             "values": values.table[n].tolist(),

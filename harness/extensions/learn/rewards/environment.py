@@ -214,7 +214,7 @@ class Driving(gymnasium.Env):  # type: ignore[misc] # gymnasium counts as untype
             "viewer": viewer,
         }
         if self._text:
-            return tuple(self.ask.chat(graph)), info
+            return tuple(self.ask.chat(graph, scene.seat)), info
         read = [number for _, number in numbers(graph, self.source.scenario.road())]
         is_known = np.array([number is not None for number in read], np.int8)
         return {

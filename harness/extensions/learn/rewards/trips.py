@@ -254,7 +254,7 @@ class RoadTrip:
     def _look(self) -> None:
         state = self.world.state()
         record = record_of(self.world, state, 0, (state.ego, *state.helpers))
-        self.scene, self.values = Scene(record), self._values()
+        self.scene, self.values = Scene.of(record, self.of.scenario), self._values()
 
     def _values(self) -> Floats:
         actions = self.of.scenario.actions

@@ -142,7 +142,7 @@ def draw(
     for file in files:
         with kept_file(file):
             points += decoder.decode(bytes_of(file, "record"))
-    scenes = tuple(Scene(point.record) for point in points)
+    scenes = tuple(Scene.of(point.record, scenario) for point in points)
     labels = {point.record.scene: np.array(point.label) for point in points}
     return Lessons(scenario, tuple(prompts), scenes, labels)
 

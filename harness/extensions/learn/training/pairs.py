@@ -184,7 +184,7 @@ def _answered(run: Run, folder: Path | None) -> Iterator[tuple[dict[str, Any], s
             asked_with = as_asked(dataset.scenario, scene, stored, source)
             q = question(lessons, asked_with, stored.viewer, prompt, messages)
             texts = sent_messages(agent["image"], q.messages)
-            words = dataset.scenario.prompt_words
+            words = q.scenario.prompt_words
             sent = in_mode(agent["answer"], prompt, texts, q.graph, q.actions, words)
             completion = answer(prompt, q.graph, q.label, q.actions)
             if agent["answer"] in BARE:

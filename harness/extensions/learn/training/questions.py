@@ -128,7 +128,7 @@ def question(
     `lessons` has the scene's soft label, the probabilities of actions that the answer should have.
     `heard` has the helpers' messages that the prompt shows, each as a dict with its `sender`.
     """
-    graph, scenario = scene.graphs[viewer], lessons.scenario
+    graph, scenario = scene.graphs[viewer], scene.seat or lessons.scenario
     sent = prompt.render(graph, scenario.actions, heard, scenario.prompt_words)
     name = key(lessons, scene, viewer, prompt) + ("+m" if heard else "")
     image = Sight(scenario, scene.state, viewer, VISION.size_px) if prompt.image else None

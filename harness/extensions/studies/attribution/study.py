@@ -175,7 +175,7 @@ def _questions(stored: ReplayedRun, scene: Scene) -> Iterator[tuple[Scene, str, 
         listed[viewer] = [graph.nodes[n].id for n in reads]
     for item in dict.fromkeys(chain.from_iterable(listed.values())):
         less = {
-            v: scene_graph(spec.scenario, scene.state, v, [item])
+            v: scene_graph(spec.scenario_of(scene), scene.state, v, [item])
             for v in listed
             if item in listed[v]
         }
