@@ -174,6 +174,7 @@ def test_every_rule_gives_distributions_and_no_episode_anothers(name: str):
                 np.tile(np.arange(3), (20, 1)), np.tile(np.arange(4), (20, 1)), rng.uniform(0, 9, (20, 4)),
                 rng.uniform(0, 3, (20, 4)),
             ),
+            np.tile(np.arange(3), (20, 1)),
         )  # fmt: skip
         fused = rule.fuse(messages, state)
         assert fused.policy.sum(axis=-1) == pytest.approx(1.0)
