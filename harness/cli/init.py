@@ -19,7 +19,6 @@ def command(
 
     Commands that you type in this folder find prompts and cards by name.
     """
-    from shutil import copyfile, copytree
     from tempfile import TemporaryDirectory
 
     from harness.core import resources
@@ -35,14 +34,8 @@ def command(
         place.mkdir(parents=True, exist_ok=True)
         # so that a full disk leaves nothing half-written
         with TemporaryDirectory(dir=place) as draft:
-            # Contents alone: what is installed may be read-only, and a project is there to be
-            # changed.
-            copytree(starter, draft, copy_function=copyfile, dirs_exist_ok=True)
-            copytree(
-                resources.folder("prompts") / PROMPT,
-                Path(draft, "prompts/mine"),
-                copy_function=copyfile,
-            )
+            _copy(starter, Path(draft))
+            _copy(resources.folder("prompts") / PROMPT, Path(draft, "prompts/mine"))
             _name_own(Path(draft, "prompts/mine/prompt.toml"))
             for whole in Path(draft).iterdir():
                 whole.rename(place / whole.name)
@@ -55,6 +48,18 @@ def command(
     if find_spec("llama_cpp") is None:  # the engine of that model
         command = "harness eval settings.toml"
     typer.echo(f"made {printable(folder)}; next: cd there, `{command}`; README.md says more")
+
+
+def _copy(folder: Path, to: Path) -> None:
+    """Copy what a folder holds. Contents alone: what is installed may be read-only."""
+    from shutil import copyfile
+
+    to.mkdir(parents=True, exist_ok=True)
+    for each in sorted(folder.iterdir()):
+        if each.is_dir():
+            _copy(each, to / each.name)
+        else:
+            copyfile(each, to / each.name)
 
 
 def _name_own(file: Path) -> None:

@@ -2,10 +2,12 @@
 cards and datasets are found beside those that ship.
 """
 
+import errno
 import json
 import os
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
@@ -162,6 +164,19 @@ def test_a_folder_that_is_not_empty_is_refused_and_left(harness: Harness, tmp_pa
     code, out, err = harness("init", "file/below")
     assert (code, out) == (2, "")
     assert err.startswith("harness: file/below cannot be made (")
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(
+    harness: Harness, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def copyfile(source: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+
+    monkeypatch.setattr(shutil, "copyfile", copyfile)
+    code, _, error = harness("init", "mine")
+    assert code == 2
+    assert error == "harness: mine cannot be made (No space left on device); give another folder\n"
+    assert not [*Path("mine").iterdir()]
 
 
 def test_an_empty_folder_will_do(harness: Harness, tmp_path: Path) -> None:
