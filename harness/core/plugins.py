@@ -6,18 +6,20 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, cast
 
 from harness.core import resources
 from harness.core.errors import UserError, one_line, printable
-from harness.core.strangers import aside, watched, worded
+from harness.core.strangers import Ended, aside, watched, worded
 
 T = TypeVar("T")
 Said = TypeVar("Said")
 # whether a value is one that a plug-in may state, and which are, in words
 Allowed = tuple[Callable[[Any], bool], str]
 OURS = "swarmdrive-harness"  # the name of this distribution
+MOST_TEXTS = 10_000  # that are read of a plug-in that yields texts
 LOADING_S = 3.0  # after which a line says which package a command waits for
 
 
@@ -161,12 +163,21 @@ def say_once(line: str) -> None:
 def texts(answer: Any, what: str = "its answer") -> list[str]:
     """Return texts that another package gave, as plain `str` without the code of a subclass.
 
-    Raises TypeError, which begins with `what`, if `answer` is anything but an iterable of texts.
+    Raises TypeError or ValueError, which begins with `what`, if `answer` is anything but an
+    iterable of texts in Unicode, or has more than `MOST_TEXTS` and no length.
     """
-    each = () if isinstance(answer, str) else tuple(answer)
+    most = None if hasattr(answer, "__len__") else MOST_TEXTS + 1
+    each = () if isinstance(answer, str) else tuple(islice(answer, most))
     if isinstance(answer, str) or not all(isinstance(text, str) for text in each):
         raise TypeError(f"{what} holds what is no text")
-    return ["".join((text,)) for text in each]
+    if most and len(each) == most:
+        raise ValueError(f"{what} holds more than {MOST_TEXTS} texts")
+    plain = ["".join((text,)) for text in each]
+    try:
+        "".join(plain).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(f"{what} holds half a character, {error.object[error.start]!a}") from None
+    return plain
 
 
 def line_or_none(answer: Any, what: str) -> str | None:
@@ -274,6 +285,8 @@ class Plugins(Mapping[str, T], Generic[T]):
         try:
             with aside(f"{self.group.rpartition('.')[2]} {printable(name)}"):
                 return question(plugin)
+        except Ended as error:
+            raise Failed(str(error)) from error
         except UserError:
             raise
         except Exception as error:  # a package's code

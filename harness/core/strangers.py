@@ -165,9 +165,13 @@ def ends_the_program(error: BaseException) -> bool:
     return not isinstance(error, Exception)
 
 
-def ended(what: str, error: BaseException) -> UserError:
+class Ended(UserError):
+    """Report which code of a package tried to end the program."""
+
+
+def ended(what: str, error: BaseException) -> Ended:
     """Build the UserError for code `what` that tried to end the program by raising `error`."""
-    return UserError(f"{what} ends the program ({_raised(error)}); repair or uninstall the package")
+    return Ended(f"{what} ends the program ({_raised(error)}); repair or uninstall the package")
 
 
 def _raised(error: BaseException) -> str:

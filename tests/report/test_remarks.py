@@ -1,6 +1,8 @@
 """What extensions say of decision points, and that one that fails takes nothing with it."""
 
+import sys
 from collections.abc import Iterator, Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +89,45 @@ def test_what_no_page_can_hold_is_left_out(
     said = [text for text in remarks.sentences(runs) if "said" in text or "odd" in text]
     assert said == ["odd: its package failed: its answer holds what is no text", "<b>said</b> of 1"]
     assert remarks.left_out(runs.runs[0]) == {"00000-0": [{"item": "v1"}]}
+
+
+class Talks:
+    """Says the same for ever, or ends the program."""
+
+    def __init__(self, *words: str) -> None:
+        self.words = words
+
+    def sentences(self, runs: Runs) -> Iterator[str]:
+        return cycle(self.words) if self.words else sys.exit(0)
+
+    def left_out(self, run: Run) -> Any:
+        sys.exit(0)
+
+
+class Half(Says):
+    """Says what no file can hold."""
+
+    def sentences(self, runs: Runs) -> Iterator[Markup]:
+        yield Markup("\ud83d")
+
+
+@pytest.mark.parametrize(
+    ("odd", "reason"),
+    [
+        (Talks("again"), "its answer holds more than 10000 texts"),
+        (Half(), "its answer holds half a character, '\\ud83d'"),
+        (Talks(), "remarks odd ends the program (SystemExit: 0 at "),
+    ],
+)
+def test_who_does_not_stop_or_ends_the_program_takes_nothing_with_it(
+    odd: Any, reason: str, runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked(monkeypatch, odd=odd, mine=Says())
+    said = [text for text in remarks.sentences(runs) if "said" in text or "odd" in text]
+    assert len(said) == 2
+    assert reason in Markup(said[0]).unescape()
+    assert said[1] == "<b>said</b> of 1"
+    assert {"item": "v1"} in remarks.left_out(runs.runs[0])["00000-0"]
 
 
 def test_a_broken_file_of_the_run_is_an_error(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
