@@ -58,11 +58,14 @@ class FusionInputs:
     # call, as with consensus `ego-prompt`
     call: FusionCall | None = None
     # the consensus rule's memory of each decision's episode, `(..., K)`, K numbers of the rule's
-    # own: `Coordination.state` of the episode's last decision. None at the first decision.
+    # own: `Coordination.state` of the episode's last decision. None if all are first decisions.
     state: Floats | None = None
     # draws to decide between actions that are equally likely: takes where several are, `(...)`, and
     # returns a draw in [0, 1) for each such decision, `(k,)`; None takes the first of the actions
     ties: TieDraws | None = None
+    # which decisions are the first of their episodes, `(...)`, whatever `state` has there; None if
+    # none is, or all are
+    first: Bools | None = None
 
 
 @dataclass(frozen=True)
@@ -180,7 +183,7 @@ def fuse(
             intents.numbers,
         )
         name = point.fusion.consensus
-        fused, weights, state, rule_trust = _by_rule(name, messages, fusion.state)
+        fused, weights, state, rule_trust = _by_rule(name, messages, fusion)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
     fused = np.where(heard_any[..., None], fused, heard.own)
     for part in point.more:
@@ -199,16 +202,20 @@ def fuse(
     )
 
 
-def _by_rule(name: str, messages: Messages, state: Floats | None) -> Fused:
-    """Let a rule fuse, from its memory at the episodes' first step if `state` is None.
+def _by_rule(name: str, messages: Messages, fusion: FusionInputs) -> Fused:
+    """Let a rule fuse, from the memory that it begins with at the episodes' first decisions.
 
     A package's rule cannot write to what it gets, nor later to what it returns. Raises UserError if
     it fails, or if what it returns where somebody was heard is no distribution.
     """
     *batch, vehicles, actions = messages.intents.shape
     with worded(f"rule {name}", built_in=name in RULES.built_in):
-        rule = RULES[name]
-        memory = rule.start(tuple(batch), vehicles - 1, actions) if state is None else state
+        rule, memory, first = RULES[name], fusion.state, fusion.first
+        if memory is None:
+            memory = rule.start(tuple(batch), vehicles - 1, actions)
+        elif first is not None and first.any():
+            start = rule.start(tuple(batch), vehicles - 1, actions)
+            memory = np.where(first[..., None], start, memory)
         if name in RULES.built_in:
             return rule.fuse(messages, memory)
         memory = numbers("memory", memory, (*batch, *(np.shape(memory) or (0,))[-1:]))

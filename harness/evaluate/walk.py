@@ -344,7 +344,10 @@ def _steps(
             broadcasts[point] = _broadcast(point, speaker, intents_here, due_here)
             sent[point] = exchange(point, broadcasts[point].intents, broadcasts[point].draws)
             ties_here = tie_draws(draws, ties)
-            fusions[point] = FusionInputs(None, memories[point].recall(due_here), ties_here)
+            memory = memories[point]
+            state = memory.recall(due_here)
+            first = None if state is None else memory.first(due_here)
+            fusions[point] = FusionInputs(None, state, ties_here, first)
         for point, due_here in due.items():
             call_of = partial(ask.call_of_agents, decision_points, due_here.at)
             decide = partial(_decided, point, fusions[point], call_of)
@@ -573,6 +576,9 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
     return np.arange(len(due.at))
 
 
+FIRST = np.zeros(0)  # the memory before an episode's first decision
+
+
 class Memory:
     """Keep what a consensus rule remembers from one decision of an episode to the next.
 
@@ -587,18 +593,27 @@ class Memory:
     def recall(self, due: Due) -> Floats | None:
         """Return what the rule that fuses messages remembers for n decisions, `(n, K)`.
 
-        It is K numbers for each; None at the first decision. `due` has the decisions, each with its
-        episode and seed. Raises UserError if K differs between episodes, as with their helpers.
+        It is K numbers for each, 0 at the first of an episode; None if all are such. `due` has the
+        decisions, each with its episode and seed. Raises UserError if K differs between episodes,
+        as with their helpers.
         """
         if not self._state:
             return None
-        states = [self._state[place] for place in due.episodes]
-        if len(set(map(len, states))) > 1:
+        states = [self._state.get(place, FIRST) for place in due.episodes]
+        lengths = {*map(len, states)} - {0}
+        if not lengths:
+            return None
+        if len(lengths) > 1:
             raise UserError(
                 "a consensus rule with memory: helpers come or go during an episode here, so that "
                 "it remembers more in some episodes than in others; take another rule"
             )
-        return np.array(states)
+        [length] = lengths
+        return np.array([state if len(state) else np.zeros(length) for state in states])
+
+    def first(self, due: Due) -> Bools:
+        """Return which of n decisions are the first of their episodes, `(n,)`."""
+        return np.array([place not in self._state for place in due.episodes], dtype=bool)
 
     def keep(self, due: Due, state: Floats) -> None:
         """Store what the rule that fuses messages remembers after n decisions; nothing if K is 0.

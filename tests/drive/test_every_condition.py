@@ -6,7 +6,7 @@ settle between each other is tried, whoever says it.
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from harness.coordination.schedules import SCHEDULES
 from harness.core.errors import UserError
 from harness.core.extensions import control_settings
 from harness.dataset.load import Dataset, find, load
+from harness.evaluate.live_world import LiveSource
 from harness.evaluate.spec import Spec
 from harness.radio.networks import names as networks
 from harness.radio.profiles import CHANNELS
@@ -207,6 +208,20 @@ def test_an_episode_is_the_same_whatever_else_is_played() -> None:
         assert alone == {(number, 0): expected[number, 0]}
 
     holds()
+
+
+@pytest.mark.slow
+def test_a_rule_begins_to_remember_when_an_agent_first_decides() -> None:
+    """Each of the agents decides first at a time of its own; layouts alone and together."""
+    source = LiveSource(50_000, 2, "all-way-crossing:agent_share=1,clock=apart")
+    point = named_point("6g:tau=0,consensus=trust")
+    both = replace(spec("proxy", (point,), (0,), prompt="v4"), source=source)
+    together = told(driven(both, (0, 1)).decisions)[0]
+    for number in (0, 1):
+        alone = told(driven(both, (number,)).decisions)[0]
+        assert alone == {place: steps for place, steps in together.items() if place in alone}
+    agents = {scene for steps in together.values() for _, scene, *_ in steps}
+    assert len(agents) > 8
 
 
 @pytest.mark.exhaustive
