@@ -600,7 +600,7 @@ class Memory:
         if not self._state:
             return None
         states = [self._state.get(place, FIRST) for place in due.episodes]
-        lengths = {*map(len, states)} - {0}
+        lengths = {len(state) for state in states} - {0}
         if not lengths:
             return None
         if len(lengths) > 1:
