@@ -8,7 +8,7 @@ They differ only in where their decision points come from and where an action le
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -339,7 +339,7 @@ def _steps(
         sent: dict[OperatingPoint, Exchange] = {}
         fusions: dict[OperatingPoint, FusionInputs] = {}
         for point, due_here in due.items():
-            intents_here = heard(point, answers, due_here, streamed)
+            intents_here = _alone(point, heard(point, answers, due_here, streamed))
             speaker, draws = speakers[point], due_here.draws
             broadcasts[point] = _broadcast(point, speaker, intents_here, due_here)
             sent[point] = exchange(point, broadcasts[point].intents, broadcasts[point].draws)
@@ -396,6 +396,17 @@ def _with_needs(
         counts, bits = world.listed() or (None, None)
         intents = replace(intents, objects=counts, object_bits=bits)
     return intents
+
+
+def _alone(point: OperatingPoint, intents: Intents) -> Intents:
+    """Return what vehicles intend without what only another condition needs to know."""
+    needless = [name for name in ("outlook", "claims", "plans") if not point.needs(name)]
+    if not point.physical:
+        needless.append("site")
+    if not point.needs("objects"):
+        needless += ["objects", "object_bits"]
+    nothing: dict[str, Any] = dict.fromkeys(needless)
+    return replace(intents, **nothing)
 
 
 def _decided(

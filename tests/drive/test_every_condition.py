@@ -15,7 +15,7 @@ import pyarrow as pa
 import pytest
 from driving import driven, spec
 from evaluating import says, spec_of, walked
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from harness.backends.base import Completion, Request
@@ -35,7 +35,7 @@ from harness.evaluate.spec import Spec
 from harness.radio.networks import names as networks
 from harness.radio.profiles import CHANNELS
 from harness.runs.decisions import Decisions
-from harness.runs.records import Latency
+from harness.runs.records import Decision, Latency
 
 Place = tuple[int, int]  # episode and seed
 # What frozen scenes assume; a second answer would come after it.
@@ -167,6 +167,11 @@ def told(decisions: Decisions) -> tuple[dict[Place, list[Any]], set[Place]]:
     return {place: sorted(steps) for place, steps in way.items()}, late
 
 
+def rows(spec: Spec) -> list[Decision]:
+    decisions = walked(spec, Sees()).decisions.rounded()
+    return sorted(decisions.records(0, len(decisions)), key=lambda d: (d.episode, d.seed, d.step))
+
+
 @pytest.mark.slow
 def test_a_condition_is_played_or_refused_in_one_line(two: Dataset, tmp_path: Path) -> None:
     """What is played is the same twice, from the beginning and from where it was killed."""
@@ -206,6 +211,45 @@ def test_an_episode_is_the_same_whatever_else_is_played() -> None:
         expected = told(walked(spec, Sees()).decisions)[0]
         alone = told(walked(part, Sees()).decisions)[0]
         assert alone == {(number, 0): expected[number, 0]}
+
+    holds()
+
+
+@pytest.mark.slow
+def test_a_condition_is_the_same_whatever_other_one_is_played(two: Dataset) -> None:
+    @settings(max_examples=20)
+    @given(typed=conditions(), other=conditions())
+    def holds(typed: Typed, other: Typed) -> None:
+        one, beside = played(typed, two), played(other, two)
+        if one is None or beside is None or one.points[0].name == beside.points[0].name:
+            return
+        both = replace(one, points=(beside.points[0], one.points[0]))
+        assert [d for d in rows(both) if d.condition == one.points[0].name] == rows(one)
+
+    holds()
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("clock", ["together", "apart"])
+def test_a_condition_of_agents_is_the_same_whatever_other_one_is_played(clock: str) -> None:
+    source = LiveSource(50_000, 1, f"all-way-crossing:agent_share=1,clock={clock}")
+
+    def of_agents(*points: OperatingPoint) -> list[Decision]:
+        live = replace(spec("swarm-tiny", points, (0,), prompt="v13"), source=source)
+        decisions = driven(live, (0,), Sees(), AT_THE_LAG).decisions
+        every = decisions.records(0, len(decisions))
+        return [d for d in every if d.condition == points[-1].name]
+
+    @settings(max_examples=15)
+    @given(typed=conditions(), other=conditions())
+    @example(Typed("6g", {"attack": "sybil"}), Typed("6g", {"content": "plan"}))
+    def holds(typed: Typed, other: Typed) -> None:
+        try:
+            one, beside = named_point(str(typed)), named_point(str(other))
+            if one.name != beside.name:
+                assert of_agents(beside, one) == of_agents(one)
+        except UserError:
+            return
 
     holds()
 
