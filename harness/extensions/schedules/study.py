@@ -149,8 +149,9 @@ def candidates(choices: Choices, point: OperatingPoint, schedule: str) -> list[C
     usual = point.changed(schedule=schedule, threshold=None)
     if schedule != PAPER and SCHEDULES[schedule].threshold is None:
         return [Candidate(schedule, None, m) for m in most]
-    best = [np.fmax.reduce(worth, axis=-1) for worth in choices.worths(usual)]
-    tenths = np.nanquantile(np.concatenate(best), SHARES).tolist()
+    best = np.concatenate([np.fmax.reduce(worth, axis=-1) for worth in choices.worths(usual)])
+    best = best[~np.isnan(best)]  # where somebody may be asked
+    tenths = np.quantile(best, SHARES).tolist() if len(best) else []
     tried = {0.0, usual.ask.above, *(float(f"{value:.3g}") for value in tenths if value > 0)}
     return [Candidate(schedule, threshold, m) for threshold in sorted(tried) for m in most]
 

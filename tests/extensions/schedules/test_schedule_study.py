@@ -37,6 +37,7 @@ from harness.extensions.schedules.study import (
     Compared,
     Play,
     _area,
+    candidates,
     compare,
     in_order,
 )
@@ -105,6 +106,17 @@ def test_of_nobody_to_ask_the_oracle_is_the_ego_alone(stored: ReplayedRun):
     success, costs = every.oracle()
     assert np.array_equal(success, alone.ends["success_rate"])
     assert not costs[..., 0].any()
+
+
+@pytest.mark.parametrize("schedule", ["coverage", "deadline"])
+def test_where_nobody_may_be_asked_only_the_usual_threshold_is_tried(
+    stored: ReplayedRun, schedule: str
+):
+    text = "6g:radius_m=0.001,max_helpers=1"
+    point = named_point(text)
+    tried = candidates(made(stored, text), point, schedule)
+    usual = point.changed(schedule=schedule, threshold=None).ask.above
+    assert {candidate.threshold for candidate in tried} == {0.0, usual}
 
 
 @pytest.mark.parametrize(
