@@ -32,6 +32,10 @@ def lost(
     return change
 
 
+def test_two_episodes_that_agree_find_no_difference() -> None:
+    assert np.isnan(Spread(np.ones(1), np.zeros((1, 1))).difference(2, 0.8)).all()
+
+
 def test_as_many_layouts_as_planned_find_the_difference_as_often_as_planned() -> None:
     rng, gained, lost_share = np.random.default_rng(0), 0.16, 0.06
     spread = Spread(np.ones(1), np.array([gained + lost_share - (gained - lost_share) ** 2]))

@@ -83,7 +83,7 @@ class Spread:
         mixed = (of_part * varies + more * of_all) / (of_part + more)
         differing = of_part * np.minimum(varies, 1.0)  # episodes, if each that differs does so by 1
         many = differing.sum(axis=-1)
-        usual = np.sum(differing * weights**2, axis=-1) / many
+        usual = np.sum(differing * weights**2, axis=-1) / np.where(many > 0, many, 1.0)
         added = 2 * (usual + (weights.max(axis=-1) ** 2 - usual) * np.exp(-many / FEW))
         assumed = np.sum(weights**2 * of_part * mixed, axis=-1) + added
         beyond = normal_quantile(0.5 + LEVEL / 2) * np.sqrt(assumed)
