@@ -76,7 +76,8 @@ class Rule(Protocol):
     actions, whatever the rule returns. The attribute `needs` names optional fields of `Messages`: a
     rule that reads the helpers' claimed places has `("claims",)`. With `("plans",)` it reads what
     each vehicle that decides plans to do itself, and the ego's own intent is then its plan; no
-    other rule sees plans.
+    other rule sees plans. A rule that remembers helpers has `("numbers",)`: where one leaves, the
+    places of others move, and their numbers do not.
     """
 
     def start(self, batch: tuple[int, ...], helpers: int, actions: int) -> Floats:
