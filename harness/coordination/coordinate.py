@@ -183,7 +183,7 @@ def fuse(
             intents.numbers,
         )
         name = point.fusion.consensus
-        fused, weights, state, rule_trust = _by_rule(name, messages, fusion)
+        fused, weights, state, rule_trust = _by_rule(name, messages, fusion.state, fusion.first)
         trust = trust if rule_trust is None else np.where(heard.on_time, rule_trust, np.nan)
     fused = np.where(heard_any[..., None], fused, heard.own)
     for part in point.more:
@@ -202,15 +202,19 @@ def fuse(
     )
 
 
-def _by_rule(name: str, messages: Messages, fusion: FusionInputs) -> Fused:
-    """Let a rule fuse, from the memory that it begins with at the episodes' first decisions.
+def _by_rule(
+    name: str, messages: Messages, state: Floats | None, first: Bools | None = None
+) -> Fused:
+    """Let a rule fuse, from the memory that it begins with at the `first` decisions of episodes.
+
+    All are such if `state` is None.
 
     A package's rule cannot write to what it gets, nor later to what it returns. Raises UserError if
     it fails, or if what it returns where somebody was heard is no distribution.
     """
     *batch, vehicles, actions = messages.intents.shape
     with worded(f"rule {name}", built_in=name in RULES.built_in):
-        rule, memory, first = RULES[name], fusion.state, fusion.first
+        rule, memory = RULES[name], state
         if memory is None:
             memory = rule.start(tuple(batch), vehicles - 1, actions)
         elif first is not None and first.any():
