@@ -124,15 +124,21 @@ def played(typed: Typed, dataset: Dataset) -> Spec | None:
     spec, said = opened(typed, dataset)
     if spec:
         return spec
-    for setting in typed.settings:
-        fewer = typed.without(setting)
-        other, line = opened(fewer, dataset)
-        if other is None:
-            typed, said = fewer, line
+    while smaller := next(refused_without(typed, dataset), None):
+        typed, said = smaller
     assert "\n" not in said
     line = said.replace(repr(str(typed)), "")
     assert all(setting in line for setting in typed.settings), said
     return None
+
+
+def refused_without(typed: Typed, dataset: Dataset) -> Iterator[tuple[Typed, str]]:
+    """Yield what is refused of a condition with a setting less, and the line that refuses it."""
+    for setting in typed.settings:
+        fewer = typed.without(setting)
+        spec, line = opened(fewer, dataset)
+        if spec is None:
+            yield fewer, line
 
 
 def opened(typed: Typed, dataset: Dataset) -> tuple[Spec | None, str]:
