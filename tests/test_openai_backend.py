@@ -331,6 +331,9 @@ def one(message: Any) -> bytes:
     return json.dumps({"choices": [{"message": message}]}).encode()
 
 
+NULL = "the answer's content is no text but null"
+
+
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
@@ -355,7 +358,8 @@ def one(message: Any) -> bytes:
         (b'{"choices":[{"text":"hello"}]}', "the answer is no chat completion"),
         (b'{"usage":[1],' + one({"content": "a"})[1:], "the answer is no chat completion"),
         (one({"role": "assistant"}), "the answer is no chat completion"),
-        (one({"content": None}), "the answer's content is no text but null"),
+        (one({"content": None}), NULL),
+        (one({"content": None, "tool_calls": [{}]}), f"{NULL}, and it calls a tool"),
         (one({"content": 3}), "the answer's content is no text but int"),
         (one({"content": "x" * (4 * 2**20)}), "the answer is longer than 4194304 bytes"),
     ],

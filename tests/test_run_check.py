@@ -347,6 +347,14 @@ OF_THE_RUN = {
             "of version 01, and",
     ),
     "rules of nobody": (newer, "run.json has figures of version 99, and this harness has"),
+    "a parser of nobody": (
+        lambda run: configure(run, versions={"parser": "2x"}),
+        "run.json has parser of version 2x, and this harness has",
+    ),
+    "decisions of nobody": (
+        lambda run: configure(run, versions={"decisions": ""}),
+        "run.json has decisions of version , and this harness has",
+    ),
     "a figure that is left out": (without("off_lag_rate"), "summary.csv lacks off_lag_rate in 6g"),
     "n": (score("success_rate", "n", 20000), "success_rate, n, 20000 in 6g"),
     "a radio's name": (renamed, "run.json has loss 0.0 in v2x, whose name says otherwise"),

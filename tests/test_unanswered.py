@@ -160,6 +160,9 @@ def test_a_server_that_refuses_everything_is_asked_little_and_its_words_stand_fi
     code, _, err = harness("run", "export", "run", "--csv")
     assert code == 2
     assert f"run is no finished run, since its model could not be asked: HTTP 404: {WORDS}" in err
+    code, _, err = harness("report", str(tmp_path))
+    assert code == 2
+    assert f"since the model of a run in it could not be asked: HTTP 404: {WORDS}" in err
 
     play.again()
     code, _, err = ask("eval", *EVAL, "--ask", "all", "--out", "run")

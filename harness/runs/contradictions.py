@@ -13,7 +13,7 @@ from harness.coordination.named_points import misnamed
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
 from harness.core.formats import SUITE
-from harness.core.versions import FIGURES
+from harness.core.versions import DECISIONS, FIGURES, PARSER
 from harness.dataset.suites import PREFIX, named
 from harness.runs import digests, pinned, sources
 from harness.runs.difficulty import adjusted_scores
@@ -81,11 +81,13 @@ def contradictions(run: Run) -> Iterator[str]:
     computed again by the rules of the version that the run states (`versions.FIGURES`); a run of an
     earlier version may lack figures that only later ones have.
     """
-    version = run.manifest.versions.get("figures", "1")
-    if version not in map(str, range(1, FIGURES + 1)):
-        yield (
-            f"run.json has figures of version {printable(version)}, and this harness has {FIGURES}"
-        )
+    for name, newest in (("figures", FIGURES), ("parser", PARSER), ("decisions", DECISIONS)):
+        version = run.manifest.versions.get(name, "1")
+        if version not in map(str, range(1, newest + 1)):
+            yield (
+                f"run.json has {name} of version {printable(version)}, and this harness has "
+                f"{newest}"
+            )
     yield from _of_conditions(run)
     yield from _of_episodes(run)
     answers, reached = list(run.answers), run.decisions.scenes

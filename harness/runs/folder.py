@@ -353,7 +353,8 @@ def _other_than_run(path: Path) -> str:
     if (path / SUITE).is_file():
         return "a suite; give the folder of one of its runs"
     if reason := work.unanswered(path):
-        return f"no finished run, since its model could not be asked: {reason}"
+        whose = "its model" if (path / WORK).is_dir() else "the model of a run in it"
+        return f"no finished run, since {whose} could not be asked: {reason}"
     with suppress(OSError, ValueError, RecursionError):
         start = msgspec.json.decode(text_of(path / WORK / CONFIG, "record"), type=work.WorkStart)
         if start.shard:

@@ -125,7 +125,8 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
         if "content" not in message:
             return failed(request, "the answer is no chat completion")
         named = "null" if content is None else type(content).__name__
-        return failed(request, f"the answer's content is no text but {named}")
+        calls = ", and it calls a tool" if message.get("tool_calls") else ""
+        return failed(request, f"the answer's content is no text but {named}{calls}")
     # An answer that a server's content filter cut off counts as cut off.
     finish_reason: FinishReason = "length" if end in ("cut", "filtered") else "stop"
     content = content or ""
