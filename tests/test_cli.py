@@ -122,6 +122,7 @@ def one_line(said: Said) -> str:
         (["evaluate"], "No such command 'evaluate'"),
         (["--verbose"], "No such option: --verbose"),
         (["prompt", "shwo"], "No such command 'shwo'"),
+        (["run", "reports/mine"], "; known: ls, check, merge, export"),
         (["dataset", "show", "small"], "Missing argument 'scene'"),
         (["prompt", "show", "v99", "--scene", "00000-0"], "unknown prompt 'v99'"),
         (["prompt", "show", "v2", "--scene", "99999-9"], "unknown scene '99999-9'"),

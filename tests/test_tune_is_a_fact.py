@@ -15,7 +15,7 @@ from relabelling import FEW, SEED, relabel
 
 from harness.cli import dataset as checking
 from harness.core.errors import UserError
-from harness.dataset import rebuilt
+from harness.dataset import rebuilt, verify
 from harness.dataset.build import build
 from harness.dataset.freeze import freeze
 from harness.dataset.load import find, load
@@ -58,6 +58,15 @@ def test_a_check_rebuilds_a_few(
     assert code == 1
     assert "is not what layout seed" in out
     assert harness("dataset", "check", small_path)[0] == 0
+
+
+def test_a_check_prints_some_lines_and_how_many_more(
+    small_path: Path, harness: Harness, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verify, "check", lambda path: [f"problem {n}" for n in range(70)])
+    code, out, _ = harness("dataset", "check", small_path)
+    assert code == 1
+    assert out.splitlines()[-2:] == ["problem 49", "(20 more problems: --json)"]
 
 
 @pytest.mark.exhaustive

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from harness.world.scenario import Scenario
 
 
+MOST_PROBLEMS = 50  # lines of a check that are printed
 Dataset = Annotated[
     str, typer.Argument(help="Folder of a dataset, or the name of a shipped one.", metavar="DIR")
 ]
@@ -117,7 +118,9 @@ def check(dataset: Dataset, as_json: options.Json = False) -> None:
         }
         echo_json(result)
     elif problems:
-        typer.echo("\n".join(problems))
+        typer.echo("\n".join(problems[:MOST_PROBLEMS]))
+        if len(problems) > MOST_PROBLEMS:
+            typer.echo(f"({len(problems) - MOST_PROBLEMS} more problems: --json)")
     else:
         typer.echo(
             f"{printable(dataset)} is sound: {dataset_size(manifest.episodes, manifest.nodes)}\n"

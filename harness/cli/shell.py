@@ -185,14 +185,12 @@ class Group(TyperGroup):
                 f"{self.path} {name}".strip() if name in self.commands else last[name]
                 for name in near
             )
-            ctx.fail(
-                f"No such command {args[0]!r}"
-                + (
-                    f" (did you mean {', '.join(f'`harness {words}`' for words in meant)}?)"
-                    if meant
-                    else ""
-                )
-            )
+            line = f"No such command {args[0]!r}"
+            if meant:
+                line += f" (did you mean {', '.join(f'`harness {words}`' for words in meant)}?)"
+            if self.path and not self.commands.keys() & {*near}:
+                line += f"; known: {', '.join(self.commands)}"
+            ctx.fail(line)
         return super().resolve_command(ctx, args)
 
     def _now_a_command(self, ctx: Any, args: list[str]) -> tuple[str, str]:
