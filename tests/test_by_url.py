@@ -205,7 +205,13 @@ def test_an_address_with_a_secret_is_not_shown_with_a_scheme(typed: str) -> None
     assert "hunter22" not in str(raised.value)
     with pytest.raises(UserError) as refused:
         cards.resolve(typed)
-    assert "give http://" not in str(refused.value)
+    assert "hunter22" not in str(refused.value).partition("give ")[2]
+
+
+def test_a_model_behind_an_address_without_a_scheme_is_told_how_to_be_named() -> None:
+    for typed in ("gpu-1:8000#qwen", "gpu-1:8000/v1#qwen"):
+        with pytest.raises(UserError, match=r"give http://gpu-1:8000/v1#NAME$"):
+            cards.resolve(typed)
 
 
 def test_a_name_that_is_no_address_is_told_the_models(

@@ -364,7 +364,10 @@ def test_an_adapter_changes_the_weights_on_every_engine_that_can_take_one(shelf:
             ["[engines.llama-cpp]", "dtype", "transformers"],
         ),
         (('file = "b.gguf"', "licence = 'MIT'"), ["[engines.llama-cpp]", "licence"]),
-        (('weights = "a/b-GGUF"', ""), ["[engines.llama-cpp]", "weights", "goes with"]),
+        (
+            ('weights = "a/b-GGUF"', ""),
+            ["[engines.llama-cpp]", "weights is missing; engine = llama-cpp needs it"],
+        ),
         (
             ('[engines.llama-cpp]\nweights = "a/b-GGUF"', "[engines]\nllama-cpp = 3"),
             ["= '3'", "a table"],

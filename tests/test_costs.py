@@ -11,6 +11,7 @@ from misbehaving import Server
 from priced import CARD, EACH, cost_of, priced, typed_eval
 
 from harness.backends import cards
+from harness.backends.base import Completion
 from harness.core.errors import UserError
 from harness.evaluate import costs
 
@@ -40,6 +41,11 @@ def test_a_run_says_while_it_goes_what_it_has_spent(
     for tokens, cost in spent:
         of_cost, of_tokens = (float(text.replace("k", "e3")) for text in (cost, tokens))
         assert of_cost / of_tokens == pytest.approx(EACH / 32, 0.01)
+
+
+def test_a_prompt_of_no_tokens_was_not_counted() -> None:
+    some, none = (Completion("q", "text", n, 5, "stop", None, 1) for n in (10, 0))
+    assert costs.Asked.of("m", [some, none]) == costs.Asked("m", 2, 1, 10, 5)
 
 
 def test_what_is_spent_is_read_on_from_where_it_was_read_before(tmp_path: Path) -> None:

@@ -295,6 +295,8 @@ def _card(table: dict[str, Any], where: str, name: str) -> Card:
         lacking = key in engine.required_keys and key not in table
         if lacking or (key in table and key not in engine.allowed_keys):
             shown_key = f"[{key}]" if key in ("server", "failures", "vision", "price") else key
+            if lacking:
+                raise UserError(f"{where}: {shown_key} is missing; engine = {card.engine} needs it")
             takers = " or ".join(_engines_with(key))
             raise UserError(f"{where}: {shown_key} goes with engine = {takers}, and only with it")
     if "projector" in engine.allowed_keys and bool(card.vision) != bool(card.projector):

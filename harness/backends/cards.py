@@ -229,10 +229,11 @@ def _local_card(text: str, engine: str | None) -> Card | None:
         return _gguf_card(text, path, engine)
     if _HUB_ID.fullmatch(text) and not text.endswith(".gguf"):
         return _new_card(text, "transformers", text, "Hub model without a card")
-    if re.search(r":\d|//", text) and (url := meant(text)):
+    address, mark, _ = text.partition("#")
+    if re.search(r":\d|//", address) and (url := meant(address)):
         raise UserError(
             f"model {printable(text)!r} is no path; the URL of a server begins with http://: give "
-            f"{url}"
+            f"{url}{'#NAME' if mark else ''}"
         )
     if "/" in text:
         raise UserError(

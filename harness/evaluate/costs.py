@@ -47,7 +47,7 @@ class Asked(msgspec.Struct, frozen=True):
         counted = [
             (each.prompt_tokens, each.completion_tokens)
             for each in completions
-            if each.prompt_tokens is not None and each.completion_tokens is not None
+            if each.prompt_tokens and each.completion_tokens is not None  # no prompt has 0
         ]
         read, written = (sum(n) for n in zip(*counted, strict=True)) if counted else (0, 0)
         return cls(model, len(completions), len(completions) - len(counted), read, written)

@@ -106,7 +106,7 @@ def _chosen(url: str, reply: Reply, name: str) -> _Listed:
     if not listed and not name:
         raise UserError(
             f"{address}/models lists no model "
-            f"({reply.fault or 'the list is empty or none of OpenAI'}); give "
+            f"({reply.fault or 'the list is empty, none of OpenAI, or of unusable names'}); give "
             f"the base URL up to and with /v1, or the model's name as well: --model {address}#NAME"
         )
     alike = [
