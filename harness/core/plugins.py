@@ -163,6 +163,14 @@ def say_once(line: str) -> None:
 def texts(answer: Any, what: str = "its answer") -> list[str]:
     """Return texts that another package gave, as plain `str` without the code of a subclass.
 
+    Raises what `texts_as_given` raises.
+    """
+    return ["".join((text,)) for text in texts_as_given(answer, what)]
+
+
+def texts_as_given(answer: Any, what: str = "its answer") -> tuple[str, ...]:
+    """Return texts that another package gave, with the classes that it gave them, such as Markup.
+
     Raises TypeError or ValueError, which begins with `what`, if `answer` is anything but an
     iterable of texts in Unicode, or has more than `MOST_TEXTS` and no length.
     """
@@ -172,12 +180,11 @@ def texts(answer: Any, what: str = "its answer") -> list[str]:
         raise TypeError(f"{what} holds what is no text")
     if most and len(each) == most:
         raise ValueError(f"{what} holds more than {MOST_TEXTS} texts")
-    plain = ["".join((text,)) for text in each]
     try:
-        "".join(plain).encode()
+        "".join(each).encode()
     except UnicodeEncodeError as error:
         raise ValueError(f"{what} holds half a character, {error.object[error.start]!a}") from None
-    return plain
+    return each
 
 
 def line_or_none(answer: Any, what: str) -> str | None:

@@ -9,12 +9,11 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import islice
 from typing import Any, Protocol, runtime_checkable
 
 from markupsafe import Markup, escape
 
-from harness.core.plugins import MOST_TEXTS, Failed, Plugins, texts
+from harness.core.plugins import Failed, Plugins, texts_as_given
 from harness.report.apart import apart
 from harness.report.runs import Runs
 from harness.report.templating import visible
@@ -65,9 +64,7 @@ def sentences(runs: Runs) -> list[Markup]:
 
     def escaped(name: str, remarks: Remarks) -> list[Markup]:
         written = remarks.sentences(apart(runs, REMARKS.is_ours(name)))
-        texts_of_extension = list(islice(written, MOST_TEXTS + 1))
-        texts(iter(texts_of_extension))  # raises what stands for a failure if one is no text
-        return [escape(sentence) for sentence in texts_of_extension]
+        return [escape(sentence) for sentence in texts_as_given(written)]
 
     sentences: list[Markup] = []
     for name in REMARKS:
