@@ -79,8 +79,7 @@ class Scene:
     @classmethod
     def of(cls, record: Record, scenario: Scenario) -> "Scene":
         """Return a scene of a scenario's own ego, on its layout's road, by its record."""
-        own_road = scenario.has_own_world
-        return cls(record, seat=scenario.at(record.episode_seed) if own_road else None)
+        return cls(record, seat=own_road(scenario, record.episode_seed))
 
     @property
     def id(self) -> str:
@@ -125,6 +124,11 @@ class Scene:
     def changed(self, **fields: Any) -> "Scene":
         record = structs.replace(self.record, **fields)
         return replace(self, record=record, notes={})
+
+
+def own_road(scenario: Scenario, seed: int) -> Scenario | None:
+    """Return a scenario as the layout of a seed has it; None if its name alone says the road."""
+    return scenario.at(seed) if scenario.has_own_world else None
 
 
 def by_seat(scenes: Iterable[Scene], scenario: Scenario) -> Mapping[Scenario, list[int]]:
@@ -291,7 +295,7 @@ class Dataset:
         if missing:
             with opened(self.path) as file:
                 for (number, step), places in missing.items():
-                    seat = self._seat(number)
+                    seat = own_road(self.scenario, self.manifest.seed + number)
                     for record in self._records(file, self.trees.read(number), step, places):
                         before = partial(self._before, record.scene)
                         self._scenes[record.scene] = Scene(record, seat=seat, before=before)
@@ -309,14 +313,6 @@ class Dataset:
             if any(edge.to == place for edge in point.edges):
                 return self.scenes([point.scene])[0]
         return None
-
-    def _seat(self, number: int) -> Scenario | None:
-        """Return the scenario as an episode's layout has it.
-
-        None of one whose name alone says its road, and that of all layouts.
-        """
-        scenario = self.scenario
-        return scenario.at(self.manifest.seed + number) if scenario.has_own_world else None
 
     def __contains__(self, name: str) -> bool:
         try:
