@@ -206,6 +206,7 @@ def test_an_address_with_a_secret_is_not_shown_with_a_scheme(typed: str) -> None
     with pytest.raises(UserError) as refused:
         cards.resolve(typed)
     assert "hunter22" not in str(refused.value).partition("give ")[2]
+    assert ("give http://" in str(refused.value)) == ("#" in typed)  # of a name's place alone
 
 
 def test_a_model_behind_an_address_without_a_scheme_is_told_how_to_be_named() -> None:
