@@ -14,7 +14,6 @@ from harness.core.errors import UserError
 from harness.dataset.load import Dataset, Scene, argument
 from harness.dataset.schema import Edge
 from harness.dataset.select import NONE, Choice
-from harness.evaluate.draws import channel_draws
 from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.radio.channel import Draws
@@ -184,8 +183,7 @@ class FrozenWorld(SceneWorld):
         places = np.unique(np.concatenate([walks.at.ravel() for walks in self._walks.values()]))
         self._shown, self._luck = places[places >= 0], None
         self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._shown.tolist()])
-        if self.scenes:
-            self._numbers = self._helpers.numbers(self.scenes)
+        self._numbers = self._helpers.numbers(self.scenes)
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
@@ -214,10 +212,10 @@ class FrozenWorld(SceneWorld):
             forest, decisions = self._forest, self.scenario.parameters.decisions
             latest = np.max([walks.at for walks in self._walks.values()], axis=0)
             seed_index, tree = np.nonzero(latest >= 0)
-            at, numbers = latest[seed_index, tree], self._numbers
-            at_first = numbers.at_first[np.searchsorted(self._shown, at)]
+            at = latest[seed_index, tree]
             keys = self._seeds[seed_index], forest.seeds[tree], forest.step[at], decisions
-            self._luck = latest >= 0, channel_draws(*keys, numbers.most, at_first)
+            draws = self._numbers.by_number(np.searchsorted(self._shown, at), *keys)
+            self._luck = latest >= 0, draws
         return self._luck
 
     def leave_out(self, point: OperatingPoint, at: Bools) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 
 from harness.core.arrays import Ints
 from harness.dataset.load import Scene
+from harness.evaluate.draws import channel_draws
 from harness.radio.channel import Draws
 
 
@@ -23,6 +24,20 @@ class HelperNumbers:
     # places
     numbers: Ints | None
     most: int  # how many numbers there are
+
+    def by_number(self, at: Ints, seed: Ints, layout_seed: Ints, step: Ints, steps: int) -> Draws:
+        """Return the channel's draws for all numbers, of decisions in the scenes of indices `at`.
+
+        The other arguments are those of `channel_draws`, for the same decisions.
+        """
+        return channel_draws(seed, layout_seed, step, steps, self.most, self.at_first[at])
+
+    def draws(self, at: Ints, seed: Ints, layout_seed: Ints, step: Ints, steps: int) -> Draws:
+        """Return the channel's draws for the helpers, of decisions in the scenes of indices `at`.
+
+        The other arguments are those of `channel_draws`, for the same decisions.
+        """
+        return self.of(self.by_number(at, seed, layout_seed, step, steps), at)
 
     def of(self, draws: Draws, at: Ints) -> Draws:
         """Return the draws of the helpers in scenes, given those of all numbers.
@@ -47,7 +62,8 @@ class Helpers:
         present = [scene.viewers[1:] for scene in scenes]
         keys = [(scene.record.episode_seed, scene.agent) for scene in scenes]
         first = [self._first.setdefault(*each) for each in zip(keys, present, strict=True)]
-        width, at_first = max(map(len, present)), np.array([len(ids) for ids in first])
+        width = max(map(len, present), default=0)
+        at_first = np.array([len(ids) for ids in first], dtype=int)
         if present == first and (at_first == width).all():
             return HelperNumbers(at_first, None, width)
         each = zip(present, first, strict=True)

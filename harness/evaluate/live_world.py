@@ -26,7 +26,7 @@ from harness.dataset.load import Earlier, Scene
 from harness.dataset.select import Choice
 from harness.evaluate import branches
 from harness.evaluate.branches import Course, Decision, Trajectory
-from harness.evaluate.draws import OF_ANOTHER_AGENT, channel_draws
+from harness.evaluate.draws import OF_ANOTHER_AGENT
 from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.walk import Decided, Due, SceneWorld
 from harness.runs import metric
@@ -185,10 +185,8 @@ class LiveWorld(SceneWorld):
             ]
         )
         episode = number[at]
-        step, at_first = np.full(len(at), self._step), self._numbers.at_first[at]
-        keys = seed, self._first_seed + episode, step, self._p.decisions
-        draws = channel_draws(*keys, self._numbers.most, at_first)
-        draws = self._numbers.of(draws, at)
+        keys = seed, self._first_seed + episode, np.full(len(at), self._step), self._p.decisions
+        draws = self._numbers.draws(at, *keys)
         senders = self._senders(places) if point.needs("plans") else None
         return Due(at, episode, seed, draws, senders)
 

@@ -339,14 +339,12 @@ def _steps(
         sent: dict[OperatingPoint, Exchange] = {}
         fusions: dict[OperatingPoint, FusionInputs] = {}
         for point, due_here in due.items():
-            intents_here = _alone(point, heard(point, answers, due_here, streamed))
+            intents_here = heard(point, answers, due_here, streamed)
             speaker, draws = speakers[point], due_here.draws
             broadcasts[point] = _broadcast(point, speaker, intents_here, due_here)
             sent[point] = exchange(point, broadcasts[point].intents, broadcasts[point].draws)
             ties_here = tie_draws(draws, ties)
-            memory = memories[point]
-            state = memory.recall(due_here)
-            first = None if state is None else memory.first(due_here)
+            state, first = memories[point].recall(due_here)
             fusions[point] = FusionInputs(None, state, ties_here, first)
         for point, due_here in due.items():
             call_of = partial(ask.call_of_agents, decision_points, due_here.at)
@@ -474,6 +472,7 @@ def _broadcast(point: OperatingPoint, speaker: Speaker, intents: Intents, due: D
     then ask no further questions.
     """
     draws = due.draws
+    intents = _alone(point, intents)
     if point.needs("numbers"):
         intents = replace(intents, numbers=draws.numbers)
     if point.stream is None or not point.rewrites.changes.of_attackers or draws.trips is None:
@@ -587,9 +586,6 @@ def _sources(point: OperatingPoint, due: Due) -> Ints:
     return np.arange(len(due.at))
 
 
-FIRST = np.zeros(0)  # the memory before an episode's first decision
-
-
 class Memory:
     """Keep what a consensus rule remembers from one decision of an episode to the next.
 
@@ -601,30 +597,27 @@ class Memory:
     def __init__(self) -> None:
         self._state: dict[tuple[int, int], Floats] = {}
 
-    def recall(self, due: Due) -> Floats | None:
+    def recall(self, due: Due) -> tuple[Floats, Bools] | tuple[None, None]:
         """Return what the rule that fuses messages remembers for n decisions, `(n, K)`.
 
-        It is K numbers for each, 0 at the first of an episode; None if all are such. `due` has the
-        decisions, each with its episode and seed. Raises UserError if K differs between episodes,
-        as with their helpers.
+        It is K numbers for each, 0 at the first of an episode, and a mask of those that are first,
+        `(n,)`; None and None if all are. `due` has the decisions, each with its episode and seed.
+        Raises UserError if K differs between episodes, as with their helpers.
         """
         if not self._state:
-            return None
-        states = [self._state.get(place, FIRST) for place in due.episodes]
-        lengths = {len(state) for state in states} - {0}
+            return None, None
+        states = [self._state.get(place) for place in due.episodes]
+        lengths = {len(state) for state in states if state is not None}
         if not lengths:
-            return None
+            return None, None
         if len(lengths) > 1:
             raise UserError(
                 "a consensus rule with memory: helpers come or go during an episode here, so that "
                 "it remembers more in some episodes than in others; take another rule"
             )
-        [length] = lengths
-        return np.array([state if len(state) else np.zeros(length) for state in states])
-
-    def first(self, due: Due) -> Bools:
-        """Return which of n decisions are the first of their episodes, `(n,)`."""
-        return np.array([place not in self._state for place in due.episodes], dtype=bool)
+        nothing = np.zeros(lengths.pop())
+        first = np.array([state is None for state in states], dtype=bool)
+        return np.array([nothing if state is None else state for state in states]), first
 
     def keep(self, due: Due, state: Floats) -> None:
         """Store what the rule that fuses messages remembers after n decisions; nothing if K is 0.

@@ -57,7 +57,7 @@ class Trips:
         `helpers` is H. The first is for the request's wait for a free medium, then follow a pair
         (request, reply) for each helper.
         """
-        pairs_draws, place = self._once_a_pair(_packets, self.steps, self.most(helpers))
+        pairs_draws, place = self._once_a_pair(_packets, self.steps, self._most(helpers))
         drawn = pairs_draws[place, self.step]
         if self.helpers is None:
             return drawn
@@ -73,7 +73,7 @@ class Trips:
         moved `decorrelation_m` (root of the sum of squares).
         """
         helpers = xy_m.shape[-2] - 1
-        waves, place = self._once_a_pair(_waves, self.most(helpers))
+        waves, place = self._once_a_pair(_waves, self._most(helpers))
         ego = np.broadcast_to(xy_m[..., :1, :], xy_m[..., 1:, :].shape)
         ends = (
             np.concatenate([ego, xy_m[..., 1:, :]], axis=-1).reshape(place.size, helpers, 4, 1)
@@ -93,7 +93,7 @@ class Trips:
             total[block] = np.cos(angle).sum(axis=-1)
         return total.reshape(*xy_m.shape[:-2], helpers) * math.sqrt(2 / WAVES)
 
-    def most(self, helpers: int) -> int:
+    def _most(self, helpers: int) -> int:
         """Return for how many helpers to draw, so that each of `helpers` has its number's draws."""
         return helpers if self.helpers is None else int(self.helpers.max(initial=-1)) + 1
 

@@ -23,7 +23,7 @@ from harness.coordination.scheduling import chosen
 from harness.core.arrays import Bools, Floats, Ints
 from harness.core.errors import UserError, printable
 from harness.dataset.forest import Forest
-from harness.evaluate.draws import channel_draws, tie_draws
+from harness.evaluate.draws import tie_draws
 from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.outlook import outlook
 from harness.evaluate.walk import as_sent
@@ -281,10 +281,8 @@ def _level(
         intents = replace(intents, site=site(places, point.antennas, zones_m, names))
     seed, node = (index.ravel() for index in np.indices(shape))
     steps, width = scenario.parameters.decisions, intents.range_m.shape[1]
-    numbers = numbering.numbers(scenes)
     keys = seeds[seed], forest.seeds[forest.tree[at]][node], forest.step[at][node], steps
-    draws = channel_draws(*keys, numbers.most, numbers.at_first[node])
-    draws = numbers.of(draws, node)
+    draws = numbering.numbers(scenes).draws(node, *keys)
     intents = as_sent(point, point.prepared(intents.take(node)))
     ties = tie_draws(draws, stored.spec.ties)
     joules = stored.joules(scenes, point)[node]

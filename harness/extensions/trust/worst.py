@@ -29,7 +29,7 @@ from harness.coordination.rules import RULES
 from harness.coordination.trust import trusting_only
 from harness.core.arrays import Bools, Floats, Ints, any_of, taken
 from harness.dataset.load import Dataset, Scene
-from harness.evaluate.draws import channel_draws, tie_draws
+from harness.evaluate.draws import tie_draws
 from harness.evaluate.fusion import codes_of
 from harness.evaluate.helper_numbers import Helpers
 from harness.evaluate.walk import Ask, Decided, Due, SceneWorld
@@ -134,17 +134,15 @@ class Courses(SceneWorld):
         places = [front.at for front in self._fronts.values()]
         self._shown = np.unique(np.concatenate(places))
         self.scenes = self._dataset.scenes([self._forest.ids[n] for n in self._shown.tolist()])
-        if self.scenes:
-            self._numbers = self._helpers.numbers(self.scenes)
+        self._numbers = self._helpers.numbers(self.scenes)
         return self.scenes
 
     def due(self, point: OperatingPoint) -> Due:
         front, forest = self._fronts[point], self._forest
         seed, decisions = self._seeds[front.seed], self.scenario.parameters.decisions
-        at, numbers = np.searchsorted(self._shown, front.at), self._numbers
+        at = np.searchsorted(self._shown, front.at)
         keys = seed, forest.seeds[front.tree], forest.step[front.at], decisions
-        draws = channel_draws(*keys, numbers.most, numbers.at_first[at])
-        return Due(at, forest.episodes[front.tree], seed, numbers.of(draws, at))
+        return Due(at, forest.episodes[front.tree], seed, self._numbers.draws(at, *keys))
 
     def plans(self) -> Plans | None:
         return None

@@ -213,7 +213,8 @@ def messages(
 def _messages(
     stored: ReplayedRun, part: Decided[Scene], memory: Memory, drawn: Mapping[str, int]
 ) -> Iterator[LeftOut]:
-    point, due, points, state = part.point, part.due, part.decision_points, memory.recall(part.due)
+    point, due, points = part.point, part.due, part.decision_points
+    state, _ = memory.recall(due)
     chosen = [
         drawn.get(points[at].id) == seed for at, seed in zip(due.at.tolist(), due.seed, strict=True)
     ]
