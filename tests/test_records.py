@@ -227,8 +227,8 @@ BEGUN = (
 )
 def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: Typed) -> None:
     """The part that it had has no seal, and is driven again. Its bare name has come to mean other scenes, and its
-    parser read answers otherwise, so that it goes on only where it says that it has the present
-    one.
+    parser read answers otherwise, and episodes had other luck where helpers leave, so that it goes
+    on only where it says that it has the present ones.
     """
     begun = kept(f"{commit}/begun")
     [part] = begun.glob(".work/episodes-*/answers.jsonl")
@@ -239,10 +239,7 @@ def test_a_begun_run_resumes(commit: str, kept: Callable[[str], Path], harness: 
     assert "with --scenario occluded-intersection:limits=2" in error
     code, _, error = harness(*typed, "--scenario", NAME)
     assert (code, error.count("\n")) == (2, 1)
-    assert (
-        "was begun with another version of parser; repeat its settings (version of parser 1)"
-        in error
-    )
+    assert "repeat its settings (version of parser 1, version of decisions 1)" in error
     config = begun / ".work/config.json"
     config.write_text(json.dumps(json.loads(config.read_text()) | {"versions": versions()}))
     code, _, error = harness(*typed, "--scenario", NAME)

@@ -18,6 +18,7 @@ from harness.coordination.named_points import POINTS
 from harness.core import extras, resources
 from harness.core.errors import UserError
 from harness.core.extensions import extensions
+from harness.core.versions import DECISIONS
 from harness.runs.contradictions import refuse
 from harness.runs.digests import LABELS, OF_ALL, digests_of
 from harness.runs.folder import read
@@ -804,7 +805,7 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
 ) -> None:
     """A figure of a package, and younger figures that a run by older rules does not have."""
     run, stated = longer, json.loads((longer / "run.json").read_text())
-    configure(run, versions={**stated["versions"], "figures": "1"})
+    configure(run, versions={**stated["versions"], "figures": "1", "decisions": "1"})
     without("optimal_")(run)
     added("comfort", "episodes")(run)
     edited("answer_times", to={"ego": {"n": 9, "median_s": 1e-4, "p5_s": 1e-4, "p95_s": 1e-4}})(run)
@@ -813,6 +814,8 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
         "Not held, since its figures are by the rules of version 1: run.json has another "
         "answer_times than its answers took.",
         "comfort: as summary.csv states, and not checked, since",
+        "Its answers are decided by the rules of version 1, as run.json states, and here by those of "
+        f"version {DECISIONS}.",
         "Its figures are made by the rules of version 1, as run.json states. It lacks "
         "optimal_action_rate, optimal_brier and optimal_nll_nats, and whether they were left out "
         "cannot be checked.",

@@ -227,6 +227,11 @@ def unchecked(run: Run) -> Iterator[str]:
         what = "a package's metrics, or an earlier harness's"
         yield f"{_listed(names)}: as summary.csv states, and not checked, since they are {what}."
     yield from digests.unheld(run)
+    if (decided_by := run.manifest.versions.get("decisions", "1")) != str(DECISIONS):
+        yield (
+            f"Its answers are decided by the rules of version {printable(decided_by)}, as run.json "
+            f"states, and here by those of version {DECISIONS}."
+        )
     version = printable(run.manifest.versions.get("figures", "1"))
     for sentence in () if current(run) else by_later_rules(run, list(run.answers)):
         yield f"Not held, since its figures are by the rules of version {version}: {sentence}."

@@ -170,6 +170,22 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
     """Every operating point, rule, content, attack and schedule that needs no words,
     by the proxy.
     """
+    held("decisions", versions.DECISIONS, decided(shipped, tmp_path))
+
+
+@pytest.mark.slow
+def test_answers_are_decided_so_where_helpers_leave(tmp_path: Path) -> None:
+    """Attackers stand before `linear`: `trust` refuses several voices of one helper there."""
+    crossing = load(find("sumo-crossing-v1")).of_episodes(frozenset({0, 3, 9, 12, 14}))
+    result = decided(crossing, tmp_path, attacked="linear")
+    held("decisions where helpers leave", versions.DECISIONS, result)
+
+
+def decided(dataset: Dataset, folder_of_run: Path, attacked: str = "trust") -> dict[str, str]:
+    """Return a digest of what the proxy's answers are decided to, by condition.
+
+    `attacked` is the rule that gets the messages of attackers.
+    """
     attacks = pytest.importorskip("harness.extensions.trust.attacks").ATTACKS
     changes = [
         *(f"consensus={rule}" for rule in RULES.built_in if INTENTS in reads(rule)),
@@ -179,26 +195,23 @@ def test_answers_are_decided_as_their_version_did(shipped: Dataset, tmp_path: Pa
             if name != INTENT
             and not (content.of_agents or (content.call and content.call.in_words))
         ),
-        *(
-            f"{'content=objects' if attack.in_objects else 'consensus=trust'},attack={name}:share=2/3"
-            for name, attack in attacks.items()
-            if name in attacks.built_in and name != "injection"
-        ),
         *(f"schedule={schedule}" for schedule in SCHEDULES if SCHEDULES.is_ours(schedule)),
     ]
+    for name in sorted(set(attacks.built_in) - {"injection"}):
+        target = "content=objects" if attacks[name].in_objects else f"consensus={attacked}"
+        changes.append(f"{target},attack={name}:share=2/3")
     points = (*POINTS.values(), *(named_point(f"6g:{change}") for change in changes))
-    done = run(spec_of(shipped, "proxy", points=points, seeds=(0, 1)), tmp_path / "run")
-    decisions = folder.read(done.out).decisions
+    spec = spec_of(dataset, "proxy", "v4", points=points, seeds=(0, 1))
+    decisions = folder.read(run(spec, folder_of_run / "run").out).decisions
     condition = np.array(decisions.labels("condition"))
     rows = np.column_stack([
         decisions.codes("action", decisions.actions), decisions.of_actions("fused").round(4),
         decisions["latency_ms"].round(1), decisions["messages"],
     ])  # fmt: skip
     known = np.nan_to_num(rows + 0.0, nan=-1)  # and no zero has a sign
-    result = {
+    return {
         point.name: sha256_bytes(known[condition == point.name].tobytes())[:16] for point in points
     }
-    held("decisions", versions.DECISIONS, result)
 
 
 def test_completions_are_parsed_as_their_version_did() -> None:
