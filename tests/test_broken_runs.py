@@ -1,6 +1,7 @@
 """A run that is broken, or of another version, is one line that names the file and what to do."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from copy import deepcopy
@@ -82,6 +83,12 @@ def put(name: str, values: Any) -> Callable[[pa.Table], pa.Table]:
     return lambda t: t.set_column(t.schema.get_field_index(name), name, pa.array(values))
 
 
+def scene_of_another_row(table: pa.Table) -> pa.Table:
+    """A table whose first row has the scene of its last."""
+    scenes = table["scene"].to_pylist()
+    return put("scene", [scenes[-1], *scenes[1:]])(table)
+
+
 N = 32  # decisions of the made-up run
 
 
@@ -100,7 +107,10 @@ N = 32  # decisions of the made-up run
         (put("step", [None] * N), "step is unknown"),
         (put("latency_ms", ["soon"] * N), "is broken"),
         (put("latency_ms", [[1.0]] * N), "is broken"),
-        (put("latency_ms", [float("inf")] * N), "latency_ms is infinite"),
+        (put("latency_ms", [float("inf")] * N), "latency_ms is too large"),
+        (put("messages", [2**53 + 1] * N), "messages is too large"),
+        (put("requests", [-(2**63)] * N), "requests is too large"),
+        (scene_of_another_row, "the decisions of one decision point do not stand together"),
         (lambda t: t.slice(1), "not every decision of episodes.csv is there"),
         (lambda t: pa.concat_tables([t, t.slice(0, 1)]), "a decision is there twice"),
         (lambda t: pa.concat_tables([t.slice(1), t.slice(5, 1)]), "a decision is there twice"),
@@ -140,6 +150,8 @@ def test_a_wrong_answer_says_what_is_wrong(old: bytes, new: bytes, said: str, ru
         (lambda text: text.replace(",True,", ",,"), "success is unknown in some rows"),
         (lambda text: text.replace("6g", "7g"), "not every episode is there once"),
         (lambda text: text.replace("failure", "fail"), "it lacks failure"),
+        (lambda text: re.sub(r"\d\.\d", "1e308", text, count=1), "is too large"),
+        (lambda text: re.sub(r"\d\.\d", "-inf", text, count=1), "is too large"),
     ],
 )
 def test_wrong_episodes_say_what_is_wrong(

@@ -132,6 +132,13 @@ IN_TABLES = {
     "success of episodes": (
         lambda run: damage(run, episode=won), "episodes.csv has another success in ",
     ),
+    "a model's name": (
+        table("summary.csv", "proxy,", "gpt,"), "summary.csv has model 'gpt', and run.json 'proxy'",
+    ),
+    "a model for helpers": (
+        table("episodes.csv", ",,6g,", ",gpt,6g,"),
+            "episodes.csv has helpers 'gpt', and run.json ''",
+    ),
     "delays of answers": (
         lambda run: damage(run, answer=hurried), "answers.jsonl has a delay of -0.1 s in 0000",
     ),
@@ -506,6 +513,10 @@ def failed(answer: Row) -> None:
     ("changed", "said"),
     [
         (failed, "another verdict in 1 answer than its texts say"),
+        (
+            lambda answer: answer.update(detail="read as it was asked for"),
+            "another detail in 1 answer than its texts say",
+        ),
         (counted, "another prompt_tokens in 1 answer than the rule here"),
         (
             lambda answer: answer.update(repairs=("fence",)),
@@ -769,8 +780,8 @@ def test_a_driven_run_that_cannot_be_driven_again_says_so(
 def test_what_is_no_number_or_none_of_its_scenes_is_a_line_and_no_traceback(
     run: Path, harness: Harness
 ) -> None:
-    score("success_rate", "value", 1e308)(run)
     damage(run, answer=lambda row: row.update(scene="x") if row["viewer"] == "v2" else None)
+    score("success_rate", "value", 1e308)(run)
     code, out, _ = harness("run", "check", run)
     assert code in (1, 2)
     assert "Traceback" not in out

@@ -10,6 +10,7 @@ from typing import Any
 from msgspec import UNSET, structs, to_builtins
 from msgspec.structs import astuple
 
+from harness import __version__
 from harness.backends.base import Backend, Completion, Request
 from harness.backends.card import Card
 from harness.backends.registry import open_backend
@@ -354,7 +355,9 @@ def _of_answers(run: Run, ours: Run) -> Iterator[str]:
     answer_pairs = [
         (each, here.get((each.scene, each.viewer, each.heard, each.role))) for each in run.answers
     ]
-    for name in OF_TEXTS:
+    # Words may be others in another version, and its parser the same.
+    is_worded_here = run.manifest.versions.get("harness") == __version__
+    for name in (*OF_TEXTS, *(["detail"] if is_worded_here else [])):
         wrong = sum(b is not None and not same(name, a, b) for a, b in answer_pairs)
         if wrong:
             yield (

@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import asdict
 
 from harness.coordination.named_points import misnamed
 from harness.core.errors import UserError, printable
@@ -17,12 +18,12 @@ from harness.core.versions import DECISIONS, FIGURES, PARSER
 from harness.dataset.suites import PREFIX, named
 from harness.runs import digests, pinned, sources
 from harness.runs.difficulty import adjusted_scores
-from harness.runs.folder import Run, read
+from harness.runs.folder import Run, read, texts_of, whole
 from harness.runs.headline import BALANCED, PAIRED
 from harness.runs.manifest_contradictions import by_later_rules, of_manifest
 from harness.runs.metric_names import BASELINE, GAINS
 from harness.runs.metrics import METRICS
-from harness.runs.records import Episode, FrozenScenes, Score
+from harness.runs.records import Episode, FrozenScenes, Score, Variant
 from harness.runs.reliability import SAME
 from harness.runs.suite import SUMMARY, SuiteRun
 from harness.runs.summary import Figures, counted
@@ -88,6 +89,8 @@ def contradictions(run: Run) -> Iterator[str]:
                 f"run.json has {name} of version {printable(version)}, and this harness has "
                 f"{newest}"
             )
+    for table in ("episodes.csv", SUMMARY):
+        yield from _of_variant(run.path / table, run.manifest.variant, "run.json")
     yield from _of_conditions(run)
     yield from _of_episodes(run)
     answers, reached = list(run.answers), run.decisions.scenes
@@ -119,6 +122,7 @@ def of_suite(suite: SuiteRun) -> Iterator[str]:
     if any(scenes.count(each) > 1 for each in scenes):
         yield f"{SUITE} has two families of the same scenes"
     yield from _of_families(suite)
+    yield from _of_variant(suite.path / SUMMARY, suite.variant, "its runs")
     older = _older(suite)
     columns = ("value",) if older else _COLUMNS
     stated_scores = {
@@ -145,6 +149,15 @@ def unchecked_of_suite(suite: SuiteRun) -> Iterator[str]:
             f"Its means are held by value alone, not their intervals and n: run.json of "
             f"{printable(older.path.name)} states figures by the rules of version {version}."
         )
+
+
+def _of_variant(table: Path, variant: Variant, whose: str) -> Iterator[str]:
+    """Yield whether rows of a CSV file are of another model, prompt or answer mode than `whose`."""
+    names = asdict(variant)
+    for column, texts in whole(table, lambda file: texts_of(file, names)).items():
+        name = names[column]
+        for text in sorted(texts - {name}):
+            yield f"{table.name} has {column} {printable(text)!r}, and {whose} {printable(name)!r}"
 
 
 def _older(suite: SuiteRun) -> Run | None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 LABEL = pa.dictionary(pa.int32(), pa.string())
 WHOLE, FLAG, NUMBER = pa.int64(), pa.bool_(), pa.float64()
+MOST = 2**53  # of a number in a table; up to here a float has every whole number
 # Unknown is null in the file and NaN in arrays. A column without a comment means what the field of
 # `records.Decision` does. What times answers may add some (`timers.added_columns`).
 COLUMNS = {
@@ -364,15 +365,11 @@ class Decisions:
         fused = tuple(row[f"fused_{action}"] for action in self.actions)
         return Decision(**{**plain, "fused": fused, "messages": tuple(messages)})
 
-    def infinite(self) -> str | None:
-        """Return the name of a column with an infinite number, which no run has, or None."""
-        for column in self.rows.schema:
-            if (
-                column.type == NUMBER
-                and np.isinf(_values(self.rows[column.name], np.nan, np.float64)).any()
-            ):
-                return str(column.name)
-        return None
+    def refuse_impossible(self) -> None:
+        """Raise ValueError if a number is one that no run has, as `refuse_impossible` says."""
+        for piece in self.pieces():
+            for name in piece.rows.schema.names:
+                refuse_impossible(name, piece.rows[name])
 
     def take(self, which: Any) -> "Decisions":
         places = of_buffer(np.asarray(which, dtype=np.int64), None, WHOLE)
@@ -501,6 +498,17 @@ class DecisionFiles:
             decisions = (Decisions.read(file, self.actions) for file in self.files)
             pieces = chain.from_iterable(each.pieces() for each in decisions)
             _write(part, pieces, schema(self.actions, helpers), unknown)
+
+
+def refuse_impossible(name: str, column: pa.Array | pa.ChunkedArray) -> None:
+    """Raise ValueError if a column of a table has a number that no run has: one beyond `MOST`.
+
+    `name` is the column's; it may be of texts or flags, which have none.
+    """
+    if column.type in (WHOLE, NUMBER):
+        numbers = _values(column, 0, np.int64 if column.type == WHOLE else np.float64)
+        if ((numbers > MOST) | (numbers < -MOST)).any():
+            raise ValueError(f"{name} is too large; allowed: up to {MOST}")
 
 
 def _optional() -> list[str]:

@@ -31,7 +31,7 @@ from harness.core.statistics import cluster_numbers
 from harness.runs import formats
 from harness.runs.answerers import REPLAY
 from harness.runs.answers import Answered, Answers
-from harness.runs.decisions import Decisions, arrow_file
+from harness.runs.decisions import Decisions, arrow_file, refuse_impossible
 from harness.runs.difficulty import FILE as DIFFICULTY
 from harness.runs.difficulty import Layout
 from harness.runs.grid import Grid
@@ -53,6 +53,7 @@ Record = TypeVar("Record", bound=Struct)
 _BROKEN = (*BROKEN, NotImplementedError, csv.Error)
 OF_LAYOUT = ("layout_seed", "danger", "cluster")  # columns that are the same in all rows of one
 BLOCK = 1 << 22  # bytes of a table's file that are read at a time
+PARSED = pacsv.ParseOptions(newlines_in_values=True)
 _KINDS = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
@@ -285,8 +286,7 @@ class Run:
     def _decisions(self, file: Path) -> Decisions:
         decisions = Decisions.read(file, self.actions, most_rows(self.episodes))
         decisions.codes("action", self.actions)
-        if infinite := decisions.infinite():
-            raise ValueError(f"{infinite} is infinite")
+        decisions.refuse_impossible()
         places = self.grid.places(decisions)
         steps, step = np.unique(decisions.whole("step"), return_inverse=True)
         agents = decisions.names("agent")
@@ -297,6 +297,7 @@ class Run:
         counts = np.bincount(places, minlength=len(self.episodes))
         if (counts != [episode.decisions for episode in self.episodes]).any():
             raise ValueError("not every decision of episodes.csv is there")
+        _ = decisions.scenes  # which raises if those of one do not stand together
         return decisions
 
     def read_file(self, name: str, reader: Callable[[Path], T]) -> T:
@@ -397,9 +398,8 @@ def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
     """
     hints = dict(zip(kind.__struct_encode_fields__, get_type_hints(kind).values(), strict=True))
     optional = {name for name, hint in hints.items() if type(None) in get_args(hint)}
-    parsed = pacsv.ParseOptions(newlines_in_values=True)
     with arrow_file(file) as lines:
-        there = pacsv.open_csv(lines, parse_options=parsed).schema.names
+        there = pacsv.open_csv(lines, parse_options=PARSED).schema.names
         lines.seek(0)
         if lacking := hints.keys() - {*there, *formats.EPISODE}:
             raise ValueError(f"it lacks {', '.join(sorted(lacking))}")
@@ -407,7 +407,7 @@ def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
         batches = pacsv.open_csv(
             lines,
             read_options=pacsv.ReadOptions(block_size=BLOCK),
-            parse_options=parsed,
+            parse_options=PARSED,
             convert_options=pacsv.ConvertOptions(
                 column_types={
                     name: _KINDS[(*get_args(hint), hint)[0]] for name, hint in hints.items()
@@ -422,12 +422,30 @@ def records_of(file: Path, kind: type[Record]) -> tuple[Record, ...]:
         for batch in batches:
             columns = {}
             for field, name in zip(kind.__struct_fields__, hints, strict=True):
+                refuse_impossible(name, batch[name])
                 if batch[name].null_count and name not in optional:
                     raise ValueError(f"{name} is unknown in some rows")
                 columns[field] = _cells(batch[name], name in optional)
             rows = zip(*columns.values(), strict=True)
             records += [kind(**dict(zip(columns, row, strict=True))) for row in rows]
     return tuple(records)
+
+
+def texts_of(file: Path, names: Collection[str]) -> dict[str, set[str]]:
+    """Return the different texts in columns of a CSV file, by the columns' names.
+
+    Of `names` those are left out that it lacks. An empty cell is an empty text.
+    """
+    with arrow_file(file) as lines:
+        there = pacsv.open_csv(lines, parse_options=PARSED).schema.names
+        lines.seek(0)
+        texts: dict[str, set[str]] = {name: set() for name in names if name in there}
+        kinds = dict.fromkeys(texts, pa.string())
+        only = pacsv.ConvertOptions(column_types=kinds, include_columns=list(texts))
+        for batch in pacsv.open_csv(lines, parse_options=PARSED, convert_options=only):
+            for name, values in texts.items():
+                values.update(batch[name].unique().to_pylist())
+    return texts
 
 
 def _cells(column: pa.Array, is_optional: bool) -> list[Any]:
