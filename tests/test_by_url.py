@@ -22,7 +22,7 @@ from harness.backends.openai import http
 from harness.backends.servers import Kind, Server
 from harness.core import resources
 from harness.core.errors import Unanswered, UserError
-from harness.evaluate.asking import WITH_EXAMPLES
+from harness.evaluate.asking import WITH_EXAMPLES, _say_unread
 from harness.prompts import versions as prompts
 from harness.world import scenarios
 
@@ -354,6 +354,9 @@ def test_a_model_whose_first_answers_cannot_be_read_is_told_at_once_and_goes_on(
         f"read; try another: `{command}`; `harness prompt list` shows all\n"
         if tries else ""
     )  # fmt: skip
+    _say_unread.cache_clear()
+    code, _, said = harness("run", "check", "run")
+    assert (code, said) == (0, "")  # its model is asked nothing
 
 
 def test_the_prompt_that_is_to_be_tried_is_there_for_every_scenario() -> None:

@@ -362,6 +362,11 @@ def window(backend: Backend) -> int:
     return getattr(backend, "window", 0)
 
 
+def is_record(backend: Backend) -> bool:
+    """Return whether a backend only gives answers of a finished run, and asks no model."""
+    return getattr(backend, "is_record", False)
+
+
 def forget(backend: Backend) -> None:
     """Let a backend drop what its engine keeps of earlier prompts, as if it was just opened.
 

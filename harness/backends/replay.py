@@ -237,6 +237,8 @@ class Kept(Replay):
     only rules in place of models declare delays, and these are asked again.
     """
 
+    is_record = True
+
     def _completion(self, request: Request, answer: Answer) -> Completion:
         replayed = self._run.agent(answer)["model"]["engine"] == "replay"
         taken = answer if replayed else structs.replace(answer, slow_s=0.0)

@@ -4,7 +4,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
+from harness.backends.base import (
+    Backend,
+    Completion,
+    Request,
+    Served,
+    forget,
+    is_record,
+    served,
+    window,
+)
 from harness.backends.cache import cached
 from harness.backends.card import Card
 
@@ -21,6 +30,7 @@ class Swarm:
         self._backends = backends
         windows = [window(backend) for backend in backends]
         self.window = sum(windows) if all(windows) else 0
+        self.is_record = all(map(is_record, backends))
 
     def complete(self, requests: Sequence[Request]) -> list[Completion]:
         completions: dict[int, Completion] = {}

@@ -17,7 +17,16 @@ import numpy as np
 from msgspec import UNSET
 
 from harness.backends import cards
-from harness.backends.base import Backend, Completion, Request, Served, forget, served, window
+from harness.backends.base import (
+    Backend,
+    Completion,
+    Request,
+    Served,
+    forget,
+    is_record,
+    served,
+    window,
+)
 from harness.backends.card import Card
 from harness.backends.token_counts import least_tokens
 from harness.coordination.coordinate import FusionCall
@@ -185,6 +194,8 @@ class Asker:
         # all, and all but the last are equally long. So what a resumed run lacks falls into the
         # same chunks.
         backend, batch = self._backend(), first_at_once(self.spec.settings.batch_size)
+        if is_record(backend):  # no other prompt would help what was answered long ago
+            self._unread = None
         size = batch * math.ceil((OF_RULES_ALONE if self._of_rules else CHUNK) / batch)
         chunks = [missing[start : start + size] for start in range(0, len(missing), size)]
         if window(backend) and len(chunks) > 1 and len(chunks[-1]) < batch:
