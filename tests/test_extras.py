@@ -95,6 +95,7 @@ NEEDS = {
     "dataset scenario drive occluded-intersection": ("highway-env", "sim"),
     "dataset build occluded-intersection --episodes 1 --out built": ("highway-env", "sim"),
     "dataset show occluded-intersection-v2 00000-0 --out scene.svg": ("matplotlib", "report"),
+    "eval --model uniform --dataset suite:v2v-safety-2 --limit 1": ("highway-env", "sim"),
     "eval --model swarm-tiny": ("llama-cpp-python", "llama-cpp"),
 }
 

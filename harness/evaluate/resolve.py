@@ -71,7 +71,10 @@ def frozen(settings: Settings, dataset: str) -> FrozenSource:
     choice = selection.choice(whole.episodes, whole) if selection else None
     numbers = choice.numbers if choice else whole.episodes
     part = whole.of_episodes(frozenset(numbers[: world.limit]))
-    return FrozenSource(part, world.limit, choice)
+    source = FrozenSource(part, world.limit, choice)
+    if not source.scenario.has_own_world:
+        source.scenario.road()  # which is on the page, and needs the simulator for some scenarios
+    return source
 
 
 def driven(settings: Settings, scenario: str | None = None) -> "LiveSource":
