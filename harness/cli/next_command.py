@@ -2,7 +2,7 @@
 
 import os
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,10 +101,11 @@ def _is_reference(run: "Run") -> bool:
     return capabilities(str(run.manifest.model["engine"])).reference
 
 
-def after_suite(run: "SuiteRun") -> None:
+def after_suite(run: "SuiteRun", edition: Sequence[object] = ()) -> None:
     """Print what to type next, given a suite's run: a rule beside which its figures can be read.
 
-    A suite is several datasets; its run has one on each of them.
+    A suite is several datasets; its run has one on each of them. `edition` has the words that
+    evaluate a model on these, if `harness eval` does not know them by the suite's name.
     """
     from harness.runs.settings import Settings, parse_seeds
 
@@ -112,6 +113,9 @@ def after_suite(run: "SuiteRun") -> None:
     limit = getattr(settings.world, "limit", None)
     few = ("--limit", limit) if limit is not None else ()
     model = DRIVER if settings.model == RULE else RULE
+    if edition:
+        echo_next(*edition, "--model", model, *few)
+        return
     dataset = ("--dataset", f"suite:{run.name}")
     is_usual = parse_seeds(settings.seeds) == parse_seeds(Settings().seeds)
     draws = () if is_usual else ("--seeds", settings.seeds)

@@ -64,6 +64,7 @@ def evaluate(
     quiet: bool,
     as_json: bool,
     verbose: bool = False,
+    edition: Sequence[object] = (),
 ) -> Path:
     """Evaluate on every dataset of a suite with one backend; write and print the means.
 
@@ -79,6 +80,7 @@ def evaluate(
         quiet: whether to show no progress.
         as_json: whether to print JSON instead of tables.
         verbose: whether to print all tables, and not only what the suite comes to.
+        edition: words of the command that evaluates another model so, if it is not `harness eval`.
     """
     from harness.backends.registry import open_backend
     from harness.evaluate.run import finished_run
@@ -108,7 +110,7 @@ def evaluate(
     elif not quiet:
         (_show if verbose else _show_briefly)(done, lines)
         typer.echo(f"wrote {printable(page)}")
-        after_suite(done)
+        after_suite(done, edition)
     return folder
 
 

@@ -116,7 +116,10 @@ def run(
         for spec, dataset in zip(specs, frozen, strict=True):
             show_counted(spec, count(spec, dataset, None))
         return
-    folder = suite.evaluate(datasets, specs, frozen, out, evaluated, quiet, as_json=False)
+    again = ("benchmark", "run", of.name)
+    folder = suite.evaluate(
+        datasets, specs, frozen, out, evaluated, quiet, as_json=False, edition=again
+    )
     if limit is None:
         pack([folder], edition, made_by, None, quiet)
     elif not quiet:

@@ -788,7 +788,10 @@ def test_a_try_of_some_layouts_is_counted_first_and_is_no_entry(project: Harness
         "benchmark", "run", "mine-1", "--model", "proxy", "--limit", "1", "--out", "try"
     )
     assert code == 0
-    assert out.endswith("a try of 1 layout of each dataset is no entry: nothing was packed\n")
+    assert out.endswith(
+        "next: harness benchmark run mine-1 --model local-view --limit 1\n"
+        "a try of 1 layout of each dataset is no entry: nothing was packed\n"
+    )
     assert not Path("try.zip").exists()
     code, _, err = project("benchmark", "pack", "try", "--edition", "mine-1")
     assert (code, err.count("\n")) == (2, 1)
