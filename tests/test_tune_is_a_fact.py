@@ -158,9 +158,10 @@ def test_typing_a_command_again_draws_no_other_layouts(
     [
         "model calibrate {run} --dataset {data} --out calibrations/mine.toml",
         "study schedule compare {other} --tune {run} --out schedules",
+        "dataset export {data} --out calibrations",
     ],
 )
-def test_nothing_fits_or_learns_there(
+def test_nothing_fits_or_learns_there_or_is_published_to_learn_from(
     typed: str, relabelled: Path, run_of_it: Path, proxy_run: Path, harness: Harness, tmp_path: Path
 ) -> None:
     run, other = (

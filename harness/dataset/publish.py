@@ -16,6 +16,7 @@ from harness.core.figures import number_or_none
 from harness.core.files import making, refuse_taken, sha256_file, write_whole
 from harness.core.progress import Progress
 from harness.core.statistics import rate_interval
+from harness.dataset import rebuilt
 from harness.dataset.card import CROISSANT, README, Table, croissant, path_of, readme
 from harness.dataset.columns import SCHEMA
 from harness.dataset.load import Dataset, Scene, load
@@ -53,7 +54,8 @@ def publish(
         suite: the name of all datasets together; that of the first one if None.
 
     Raises UserError if the folder exists, a name is not allowed, two datasets have one name, or one
-    is damaged, and OSError if the folder cannot be written.
+    is damaged, or to be learnt from and not what its seeds give, and OSError if the folder cannot
+    be written.
     """
     refuse_taken("--out", out)
     manifests = [read_manifest(folder)[0] for folder in folders]
@@ -81,6 +83,8 @@ def _table(
     data: Dataset, folder: Path, ask: Callable[[Scenario], tuple[str, Chat]], progress: Progress
 ) -> Table:
     """Write the table of a dataset to a folder; return what the card says of it."""
+    if data.manifest.purpose != "report":
+        rebuilt.refuse(data)  # others learn from it
     scenario, file, count = data.scenario, folder / path_of(data.name), 0
     prompt, chat = ask(scenario)
     with pq.ParquetWriter(file, SCHEMA, compression="zstd") as writer:
