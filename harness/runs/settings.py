@@ -10,6 +10,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from inspect import isfunction
 from pathlib import Path
 from types import UnionType
@@ -21,7 +22,7 @@ from harness.core import extensions
 from harness.core.at_once import AtOnce, at_once_of
 from harness.core.config import convert, toml
 from harness.core.errors import UserError, in_range, printable, sayable, unknown
-from harness.core.extensions import Setting
+from harness.core.extensions import Setting, setting_of_run, tables_of_settings
 from harness.core.plugins import say_once
 from harness.core.resources import DATASET, card_to_copy, names
 from harness.core.seeds import LAST_SEED
@@ -694,9 +695,11 @@ def check_extensions(settings: Settings, where: str) -> None:
     names = {each.name for each in options(type(settings.world)) if each.is_added}
     for name, value in settings.extensions.items():
         if name not in known_settings:
+            nearest = get_close_matches(name, names, n=1)
+            suggestion = f"; did you mean {nearest[0]!r}?" if nearest else ""
             raise UserError(
                 f"{where}: {printable(name)} is a setting of an extension that is not installed; "
-                "install that, or leave the setting out"
+                f"install that, or leave the setting out{suggestion}"
             )
         if name not in names:
             command = f"harness {COMMANDS[kind_of(settings)]}"
@@ -712,29 +715,39 @@ def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str
     """Return the tables of a file, with the kind of episodes that its command has,
     if it states none.
 
-    Raises UserError if an option stands outside of its table, or if a table of extensions' options
-    alone holds another.
+    Raises UserError if an option stands outside of its table, or if a key is unknown.
     """
     kind = str(world.__struct_config__.tag)
-    of_extensions: dict[str, list[str]] = {}
+    keys_by_table = {"": {*Settings.__struct_fields__}, "world": {"kind"}}
     for each in options(world):
         table, *inner = each.path
         for key in {each.name, each.flag.removeprefix("--")} & tables.keys() if inner else ():
             raise UserError(
                 f"{where}: {key} stands in a table; write {inner[0]} below a line [{table}] instead"
             )
-        if inner and table not in Settings.__struct_fields__:
-            of_extensions.setdefault(table, []).append(inner[0])
-    for table, keys in of_extensions.items():
-        options_there = tables.get(table, {})
-        if not isinstance(options_there, dict):
-            value = printable(repr(options_there))
-            raise UserError(f"{where}: {table} = {value}; allowed: a table")
-        for key in options_there:
-            if key not in keys:
-                raise unknown(f"key in {where} [{table}]", key, keys)
+        keys_by_table[""].add(table)
+        if inner and table != EXTENSIONS:  # whose keys `check_extensions` looks at
+            keys_by_table.setdefault(table, set()).add(inner[0])
     section = tables.get("world", {})
-    return {**tables, "world": {"kind": kind, **section}} if isinstance(section, dict) else tables
+    if not isinstance(section, dict):
+        return tables
+    if section.get("kind", kind) == kind:
+        for table, keys in keys_by_table.items():
+            _refuse_unknown(tables, table, keys, where)
+    return {**tables, "world": {"kind": kind, **section}}
+
+
+def _refuse_unknown(tables: dict[str, Any], table: str, keys: set[str], where: str) -> None:
+    """Raise UserError for a key in a table of a file that is none of `keys`, nor an extension's."""
+    place = f" [{table}]" if table else ""
+    section = tables.get(table, {}) if table else tables
+    if not isinstance(section, dict):
+        value = printable(repr(section))
+        raise UserError(f"{where}: {table} = {value}; allowed: a table")
+    for key in section:
+        is_added = any(map(setting_of_run, (key, f"{table}.{key}")))
+        if key not in keys and not is_added and (table or key not in tables_of_settings()):
+            raise unknown(f"key in {where}{place}", key, keys)
 
 
 def _as_driven(settings: Settings, run: Path) -> Settings:

@@ -320,6 +320,22 @@ def test_a_file_sets_what_an_installed_extension_has_and_to_its_kind(
         assert said in err
 
 
+@pytest.mark.parametrize("name", sorted(known.beside()))
+def test_a_key_that_is_mistyped_is_told_those_of_extensions(
+    name: str, harness: Typed, tmp_path: Path
+) -> None:
+    table, _, key = known.beside()[name].path(name).rpartition(".")
+    wrong = key.replace("_", "-") + "s"
+    text = f"[{table}]\n{wrong} = 1" if table else f"{wrong} = 1"
+    (tmp_path / "typed.toml").write_text(text)
+    code, _, error = harness("eval", tmp_path / "typed.toml", "--dry-run")
+    assert (code, error.count("\n")) == (2, 1)
+    assert key in error.partition("known: ")[2].strip().split(", ")
+    by_name = f"[extensions]\n{name}s = 1"
+    (tmp_path / "typed.toml").write_text(by_name)
+    assert f"did you mean {name!r}?" in harness("eval", tmp_path / "typed.toml", "--dry-run")[2]
+
+
 def test_another_package_takes_no_name_of_what_ships(installed: Installed, harness: Typed) -> None:
     name = next(iter(ENTRIES[known.GROUP]))
     installed(**{name: f'Extension(name="{name}")'})
