@@ -593,6 +593,20 @@ def test_a_driven_run_has_its_tables_held_against_each_other_and_the_simulator(
     assert harness("run", "check", drive)[0] == 1
 
 
+@pytest.mark.slow
+def test_the_settings_of_a_driven_run_name_what_was_driven(drive: Path, harness: Harness) -> None:
+    settings = json.loads((drive / "run.json").read_text())["settings"]
+    name = settings["world"]["scenario"]
+    other = name.replace("limits=1", "limits=2")
+    assert other != name
+    configure(drive, settings={**settings, "world": {**settings["world"], "scenario": other}})
+    said = f"run.json has settings of scenario {other}, and it was driven in {name}"
+    assert harness("report", drive)[0] == 2
+    code, out, _ = harness("run", "check", drive)
+    assert code == 1
+    assert said in " ".join(out.split())
+
+
 @pytest.mark.exhaustive
 def test_ends_of_driven_episodes_that_follow_from_no_action_are_found(
     drive: Path, harness: Harness

@@ -1,13 +1,15 @@
 """Hold what `run.json` states against a run's answers, and against its own settings."""
 
 from collections.abc import Iterator, Mapping, Sequence, Set
+from contextlib import suppress
 from typing import Any
 
-from harness.core.errors import printable
+from harness.core.errors import UserError, printable
 from harness.runs.answer_counts import counts
 from harness.runs.answer_times import times
 from harness.runs.folder import Run
-from harness.runs.records import Answer
+from harness.runs.records import Answer, ClosedLoop
+from harness.world import scenarios
 
 
 def of_manifest(run: Run, answers: Sequence[Answer]) -> Iterator[str]:
@@ -28,17 +30,32 @@ def of_manifest(run: Run, answers: Sequence[Answer]) -> Iterator[str]:
 def by_later_rules(run: Run, answers: Sequence[Answer]) -> Iterator[str]:
     """Yield what a run's `run.json` states otherwise than the rules of today for figures make.
 
-    These are times of answers, records that it lacks, and looks at what it had so far. A run by
-    earlier rules may state them so. `answers` are the run's.
+    These are times of answers, records that it lacks, the scenario that its settings name, and
+    looks at what it had so far. A run by earlier rules may state them so. `answers` are the run's.
     """
     if run.manifest.answer_times != times(answers, run.grid.episodes, run.clusters):
         yield "run.json has another answer_times than its answers took"
     for what, recorded, named in _records(run):
         for name in sorted(named - recorded.keys()):
             yield f"run.json lacks {what} {printable(name)}, which a condition names"
+    yield from _of_scenario(run)
     record = run.manifest.world.interim_looks
     if record is not None and (rule := run.manifest.stopping_rule):
         yield from rule.contradictions(record, run.grid, run.episodes)
+
+
+def _of_scenario(run: Run) -> Iterator[str]:
+    """Yield whether a driven run's settings name another scenario than was driven."""
+    text = getattr(run.manifest.settings.world, "scenario", None)
+    if not isinstance(run.manifest.world, ClosedLoop) or text is None:
+        return
+    with suppress(UserError):  # whoever drives again says what is not here
+        named, driven = scenarios.get(text), run.manifest.scenario
+        if (named.name, named.parameters) != (driven.name, driven.parameters):
+            yield (
+                f"run.json has settings of scenario {printable(text, 200)}, and it was driven in "
+                f"{printable(scenarios.argument(driven), 200)}"
+            )
 
 
 def _of_cost(run: Run) -> Iterator[str]:
