@@ -363,7 +363,7 @@ def window(backend: Backend) -> int:
 
 
 def is_record(backend: Backend) -> bool:
-    """Return whether a backend only gives answers of a finished run, and asks no model."""
+    """Return whether a backend holds a finished run's answers, and asks no model for others."""
     return getattr(backend, "is_record", False)
 
 

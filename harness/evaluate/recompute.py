@@ -62,6 +62,8 @@ class Held:
     run's.
     """
 
+    is_record = True
+
     def __init__(self, rule: Backend, kept: Kept) -> None:
         self._rule, self._kept, self.wrong = rule, kept, 0
 
