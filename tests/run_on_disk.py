@@ -2,7 +2,9 @@
 All are written by the harness's one writer.
 """
 
+import csv
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import pyarrow as pa
 
 from harness.coordination.named_points import POINTS
 from harness.coordination.operating_point import OperatingPoint
+from harness.core.errors import UserError
 from harness.core.files import sha256_file
 from harness.core.statistics import cluster_numbers
 from harness.core.versions import FIGURES
@@ -149,10 +152,27 @@ def _rows(
 
 
 def configure(run: Path, **values: object) -> None:
-    """Change what run.json says, and its digests of that; it need not be possible."""
+    """Change what run.json says, its digests of that, and who answered in the run's CSV files;
+    it need not be possible.
+    """
     stated = msgspec.json.decode((run / "run.json").read_bytes())
     (run / "run.json").write_bytes(msgspec.json.encode(restated(stated, values)))
     digested(run)
+    name_answerers(run)
+
+
+def name_answerers(run: Path) -> None:
+    """State the model, prompt and answer mode of run.json in each row of a run's CSV files, if it
+    can be read.
+    """
+    with suppress(UserError):
+        names = msgspec.structs.asdict(folder.read(run).manifest.variant)
+        for name in ("episodes.csv", "summary.csv"):
+            head, *rows = csv.reader((run / name).read_text().splitlines(keepends=True))
+            for row in rows:
+                row[: len(names)] = names.values()
+            with (run / name).open("w", newline="") as file:
+                csv.writer(file, lineterminator="\n").writerows([head, *rows])
 
 
 def digested(run: Path) -> None:

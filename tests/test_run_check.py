@@ -594,17 +594,26 @@ def test_a_driven_run_has_its_tables_held_against_each_other_and_the_simulator(
 
 
 @pytest.mark.slow
-def test_the_settings_of_a_driven_run_name_what_was_driven(drive: Path, harness: Harness) -> None:
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        ("world.scenario", "occluded-intersection:limits=2"),
+        ("world.episodes", 200),
+        ("engine", "llama-cpp"),
+        ("letters", "calibrated"),
+    ],
+)
+def test_settings_of_a_driven_run_are_those_that_it_had(
+    place: str, value: object, drive: Path, harness: Harness
+) -> None:
     settings = json.loads((drive / "run.json").read_text())["settings"]
-    name = settings["world"]["scenario"]
-    other = name.replace("limits=1", "limits=2")
-    assert other != name
-    configure(drive, settings={**settings, "world": {**settings["world"], "scenario": other}})
-    said = f"run.json has settings of scenario {other}, and it was driven in {name}"
-    assert harness("report", drive)[0] == 2
+    table, _, name = place.rpartition(".")
+    changed = {**(settings[table] if table else settings), name: value}
+    configure(drive, settings={**settings, table: changed} if table else changed)
     code, out, _ = harness("run", "check", drive)
     assert code == 1
-    assert said in " ".join(out.split())
+    assert f"run.json has {name} {value} in its settings, and " in " ".join(out.split())
+    assert harness("report", drive)[0] == 2
 
 
 @pytest.mark.exhaustive
@@ -808,6 +817,7 @@ def test_what_is_no_number_or_none_of_its_scenes_is_a_line_and_no_traceback(
         ("world", "only", "0:1", "selection"),
         ("world", "until_width", 30.0, "early_stop"),
         ("", "control", ["blind"], "controls"),
+        ("", "device_profile", "agx-orin", "devices"),
     ],
 )
 def test_settings_without_what_they_come_to_are_refused(

@@ -426,11 +426,13 @@ def _table(record: Mapping[str, Any], in_file: Any) -> Any:
 def _without_record(record: Mapping[str, Any]) -> set[str]:
     """Return the settings of extensions that would have left something in a run, and have not.
 
-    They choose helpers' agents, episodes, when a run stops, or counterparts of conditions.
+    They choose helpers' agents, episodes, when a run stops, what times answers, or counterparts of
+    conditions.
     """
     from harness.coordination.counterparts import COUNTERPARTS
     from harness.dataset.select import SELECTIONS
     from harness.runs.stopping import STOPPING_RULES
+    from harness.runs.timers import TIMERS
 
     names = {*COUNTERPARTS}  # which conditions state by their names
     world = record.get("world")
@@ -441,6 +443,9 @@ def _without_record(record: Mapping[str, Any]) -> set[str]:
         names |= SELECTIONS.settings()
     if not scenes.get(LOOKS):
         names |= STOPPING_RULES.settings()
+    opened = record.get("beside")
+    if not any(map(opened.get, TIMERS.settings()) if isinstance(opened, Mapping) else ()):
+        names |= TIMERS.settings()
     return names & extensions.beside().keys()
 
 

@@ -627,7 +627,7 @@ def test_a_table_that_is_not_whole_is_refused(run, tmp_path, change, message):
         ),
         (
             set_in_first("latency_ms", math.inf),
-            "decisions.parquet is broken .latency_ms is infinite",
+            "decisions.parquet is broken .latency_ms is too large",
         ),
     ],
 )

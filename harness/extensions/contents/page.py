@@ -10,7 +10,7 @@ import numpy as np
 
 from harness.coordination.contents import INTENT
 from harness.core.errors import printable
-from harness.core.figures import interval_of
+from harness.core.figures import amount, interval_of
 from harness.core.multiplicity import LEVEL
 from harness.core.statistics import Estimate
 from harness.core.versions import versions
@@ -57,6 +57,7 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
     manifest = manifest_of([result.model for result in results], results[0].panels, seeds)
     points, by_group = points_table(results), groups_table(results)
     runs = [run for result in results for run in result.model.runs.values()]
+    count = amount(len(results[0].points), "point")
     lags_s = sorted({run.dataset.scenario.parameters.decision_lag_s for run in runs})
     return Study(
         "contents",
@@ -65,7 +66,7 @@ def contents_study(results: Sequence[Result], seeds: Sequence[int]) -> Study:
         [
             f"{'; '.join(map(_counted, results))}; channel seeds {', '.join(map(str, seeds))}. "
             "Stored answers are coordinated again with the same random draws at "
-            f"{len(results[0].points)} points with every content, so differences are paired by "
+            f"{count} with every content, so differences are paired by "
             "episode. 95 % intervals are over episodes; a mean gives each family the same weight "
             f"and is about these families alone. Clear: p at most {LEVEL:g} by Holm's method for "
             "all comparisons of a model with intents.",
@@ -119,7 +120,7 @@ def headline(result: Result) -> list[str]:
         costs.append(f"{content} {interval_of(outcome.success)} % with {cost}")
     return [
         f"{name}, {base.condition}, points of {result.words} over intents: {'; '.join(gains)}. "
-        f"Of {len(result.points)} points, "
+        f"Of {amount(len(result.points), 'point')}, "
         f"clearly better than intents: {_clear(result, True)}; clearly worse: "
         f"{_clear(result, False)}.",
         f"{name}, {result.words}, bits of an episode, and time until the ego acts: "

@@ -9,7 +9,7 @@ from html import unescape
 from pathlib import Path
 
 from httpx import Response
-from run_on_disk import digested
+from run_on_disk import digested, name_answerers
 from starlette.testclient import TestClient
 
 from harness.extensions.view.access import cookie
@@ -25,6 +25,8 @@ def configure(run: Path, **values: object) -> None:
     then = file.stat().st_mtime
     file.write_text(json.dumps({**json.loads(file.read_text()), **values}))
     digested(run)
+    if {"model", "prompt", "answer"} & values.keys():
+        name_answerers(run)
     os.utime(file, (then, then))
 
 
