@@ -4,6 +4,7 @@ a real one is in test_openai_server.py.
 
 import csv
 import json
+import math
 import re
 import socket
 import sys
@@ -437,6 +438,23 @@ def test_a_text_has_a_token_for_each_sixteen_characters_at_least(written: int, t
     usage = {"prompt_tokens": 12, "completion_tokens": tokens}
     said = read({**completion("a" * written), "usage": usage}, request())
     assert said.completion_tokens == (tokens if 16 * tokens >= written else None)
+
+
+@pytest.mark.parametrize(
+    ("made", "written"),
+    [
+        (completion("a", reasoning_content="Hm. " * 200), 800 + len("<think>\n\n</think>\n\na")),
+        (completion(None, reasoning="Hm. " * 200), 800 + len("<think>\n\n</think>\n\n")),
+        (completion("a", refusal="I will not. " * 10), 120 + len("a")),
+    ],
+)
+def test_what_a_server_took_out_of_a_text_has_tokens_too(
+    made: dict[str, Any], written: int
+) -> None:
+    for tokens in (1, math.ceil(written / 16) - 1, math.ceil(written / 16)):
+        usage = {"prompt_tokens": 12, "completion_tokens": tokens}
+        said = read({**made, "usage": usage}, request())
+        assert said.completion_tokens == (tokens if 16 * tokens >= written else None)
 
 
 # -- thoughts --------------------------------------------------------------------------------------

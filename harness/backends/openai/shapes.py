@@ -109,18 +109,19 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
         message = in_texts(choice["message"])
         content, thinks, refuses = message.get("content"), thought(message), refusal(message)
         end, usage = ending(choice.get("finish_reason")), payload.get("usage") or {}
-        written = 0 if request.bare or not isinstance(content, str) else len(content)
-        counts = usage.get("prompt_tokens"), usage.get("completion_tokens")
-        tokens = tokens_in(counts[0]), tokens_in(counts[1], written)
+        count, prompt_tokens = usage.get("completion_tokens"), tokens_in(usage.get("prompt_tokens"))
+        parts = [part for part in (content, thinks, refuses) if isinstance(part, str)]
+        written = sum(map(len, parts))
     except NoText as error:
         return failed(request, str(error))
     except (LookupError, TypeError, AttributeError):
         return failed(request, "the answer is no chat completion")
     if refuses or end == "refused" or (end == "filtered" and not content):
         words = refuses or (content if isinstance(content, str) else "")
-        return Completion(request.id, words, *tokens, "refusal", None, 1)
+        tokens = tokens_in(count, written)
+        return Completion(request.id, words, prompt_tokens, tokens, "refusal", None, 1)
     if request.bare:
-        return _read_out(choice, request, *tokens)
+        return _read_out(choice, request, prompt_tokens, tokens_in(count))
     if not isinstance(content, str) and not (content is None and thinks):
         if "content" not in message:
             return failed(request, "the answer is no chat completion")
@@ -137,7 +138,8 @@ def read(payload: Any, request: Request, kind: Kind = "generic") -> Completion:
             request, f"the server did not keep to the constraint that was sent: {fault}; {_REMEDY}"
         )
     text = _with_thought(thinks, content, finish_reason, request.thinking)
-    return Completion(request.id, text, *tokens, finish_reason, None, 1)
+    tokens = tokens_in(count, max(written, len(text)))
+    return Completion(request.id, text, prompt_tokens, tokens, finish_reason, None, 1)
 
 
 def _with_thought(
