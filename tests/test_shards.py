@@ -254,6 +254,7 @@ def test_shards_of_other_runs_are_refused(split: Path, harness: Typed, tmp_path:
     config.write_text("{")
     assert "is no shard" in refused(harness, shards)
     assert "is no shard" in refused(harness, [split / "whole"])
+    assert "is no folder; give those of all shards" in refused(harness, [split / "nowhere"])
 
 
 @pytest.mark.slow

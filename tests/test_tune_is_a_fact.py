@@ -173,6 +173,16 @@ def test_nothing_fits_or_learns_there_or_is_published_to_learn_from(
     assert not (tmp_path / "calibrations").exists()
 
 
+@pytest.mark.slow
+def test_what_is_not_rebuilt_is_said(
+    relabelled: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(rebuilt, "find_spec", lambda name: None)
+    rebuilt.refuse(load(relabelled))
+    said = "whether its layouts are those of its seeds is not checked, which needs highway-env"
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.exhaustive
 def test_scenes_that_a_command_reports_are_not_tuned_on(tmp_path: Path) -> None:
     """Whatever seeds they have: the vehicles of a first scene tell."""

@@ -146,6 +146,8 @@ def made_whole(folders: Sequence[Path], out: Path) -> Iterator[None]:
 
 def _read(folder: Path, kind: type[Start]) -> Start:
     file = folder / WORK / CONFIG
+    if not folder.is_dir():
+        raise UserError(f"{printable(folder)} is no folder; give those of all shards")
     refuse_links(folder / WORK)
     try:
         config = msgspec.json.decode(text_of(file, "record"), type=kind)

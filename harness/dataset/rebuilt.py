@@ -20,6 +20,7 @@ from msgspec.structs import replace
 
 from harness.core.errors import UserError, printable
 from harness.core.files import bytes_of, digest, sha256_bytes
+from harness.core.plugins import say_once
 from harness.core.resources import folder
 from harness.dataset.load import Dataset, load, released
 from harness.dataset.schema import Branching, Manifest, Record, Tree, scene_id
@@ -43,6 +44,11 @@ def refuse(dataset: Dataset, others: Iterable[Dataset] = ()) -> None:
     if dataset.trusted:
         return
     refuse_reported(dataset, (*others, *_reported(dataset.scenario.name)))
+    if find_spec("highway_env") is None:
+        say_once(
+            f"dataset {printable(dataset.path)}: whether its layouts are those of its seeds is not "
+            "checked, which needs highway-env"
+        )
     for difference in differences(dataset):
         raise UserError(f"dataset {printable(dataset.path)}: {difference}; build it again")
 

@@ -24,6 +24,7 @@ from harness.core.arrays import Ints
 from harness.core.config import LONGEST_S
 from harness.core.depth import shallow
 from harness.core.errors import UserError, printable, sayable
+from harness.core.figures import amount
 from harness.core.files import BROKEN, bytes_of, text_of
 from harness.core.formats import CONFIG, SUITE, WORK
 from harness.core.memory import uncollected
@@ -363,6 +364,9 @@ def _other_than_run(path: Path) -> str:
         return "no finished run, and the command that began it continues it"
     if path.is_file():
         return "a file; a run is a folder, made by `harness eval` or `harness drive`"
+    with suppress(OSError):
+        if runs := sorted(file.parent for file in path.glob("*/run.json")):
+            return f"a folder of {amount(len(runs), 'run')}; give one, such as {printable(runs[0])}"
     return (
         "no finished run: it has no run.json; "
         "give a folder made by `harness eval` or `harness drive`"

@@ -138,11 +138,11 @@ def _model(card: "Card") -> dict[str, Any]:
         "name": card.name,
         "engine": card.engine,
         "missing": lack,
-        "remedy": _remedy(card, lack),
+        "remedy": remedy(card, lack),
     }
 
 
-def _remedy(card: "Card", lack: str | None) -> str | None:
+def remedy(card: "Card", lack: str | None) -> str | None:
     """Return what to do about what is missing; what else the card needs, which was not tried."""
     if card.server:
         return f"needs a server at {printable(' or '.join(card.server.urls))} (not tried)"

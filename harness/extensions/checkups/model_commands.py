@@ -135,6 +135,7 @@ def parity(
     from harness.evaluate.frozen_world import FrozenSource
     from harness.evaluate.requests import requests
     from harness.evaluate.spec import Spec
+    from harness.extensions.checkups.doctor import remedy
     from harness.extensions.checkups.parity import PASSES, compare
     from harness.prompts import versions
 
@@ -144,8 +145,8 @@ def parity(
     for card in (reference, gguf):
         if lack := missing(card):
             raise UserError(
-                f"model {printable(card.name)!r} lacks {lack} on {card.engine}; see `harness model "
-                "check`"
+                f"model {printable(card.name)!r} lacks {lack} on {card.engine}; run "
+                f"`{remedy(card, lack)}`"
             )
     data = load.load(load.find(dataset))
     scenes = data.scenes(data.courses())
