@@ -906,6 +906,11 @@ def test_a_server_that_refuses_the_key_is_one_line_without_it(
     assert "5ecret" not in said
 
 
+def test_an_error_without_words_says_so() -> None:
+    said = ask_one(lambda asked: asked.reply(b"", 204))
+    assert said.error == "HTTP 204: an empty reply"
+
+
 def test_a_redirect_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     with serving(lambda asked: asked.reply(completion())) as other:

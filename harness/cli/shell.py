@@ -275,10 +275,18 @@ def hasten(command: Any) -> None:
 
 def _value(parameter: Any, by_typer: Callable[[Any, Any], Any], context: Any, value: Any) -> Any:
     several = parameter.multiple or parameter.nargs == -1
+    annotation = parameter.type_descriptor.annotation
+    # Python takes an empty path for the working folder.
+    values = value if isinstance(value, list | tuple) else (value,)
+    if "" in values and annotation in (Path, list[Path]):
+        name = parameter.opts[0] if parameter.param_type_name == "option" else parameter.metavar
+        raise UserError(
+            f"{name or parameter.name} '': a path is not empty; give one, or . for here"
+        )
     if value is None and not parameter.required:
         read: Any = () if several else None
     else:
-        read = plain(parameter.type_descriptor.annotation, value)
+        read = plain(annotation, value)
     if read is UNREAD or (parameter.required and read in ((), [])):
         return by_typer(context, value)
     return read if parameter.callback is None else parameter.callback(context, parameter, read)

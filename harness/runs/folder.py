@@ -354,8 +354,12 @@ def _other_than_run(path: Path) -> str:
     """Return what a path without a run's record is, and what to give instead."""
     if (path / SUITE).is_file():
         return "a suite; give the folder of one of its runs"
+    is_begun = (path / WORK).is_dir()
+    with suppress(OSError):
+        if not is_begun and (runs := sorted(file.parent for file in path.glob("*/run.json"))):
+            return f"a folder of {amount(len(runs), 'run')}; give one, such as {printable(runs[0])}"
     if reason := work.unanswered(path):
-        whose = "its model" if (path / WORK).is_dir() else "the model of a run in it"
+        whose = "its model" if is_begun else "the model of a run in it"
         return f"no finished run, since {whose} could not be asked: {reason}"
     with suppress(OSError, ValueError, RecursionError):
         start = msgspec.json.decode(text_of(path / WORK / CONFIG, "record"), type=work.WorkStart)
@@ -364,9 +368,6 @@ def _other_than_run(path: Path) -> str:
         return "no finished run, and the command that began it continues it"
     if path.is_file():
         return "a file; a run is a folder, made by `harness eval` or `harness drive`"
-    with suppress(OSError):
-        if runs := sorted(file.parent for file in path.glob("*/run.json")):
-            return f"a folder of {amount(len(runs), 'run')}; give one, such as {printable(runs[0])}"
     return (
         "no finished run: it has no run.json; "
         "give a folder made by `harness eval` or `harness drive`"

@@ -32,7 +32,9 @@ def test_what_is_read_here_is_what_typer_reads(value: str | None) -> None:
     for command, parameter in parameters(get_command(app)):
         several = parameter.multiple or parameter.nargs == -1
         given: Any = [value, "y"] if several and value is not None else value
-        read = plain(parameter.type_descriptor.annotation, given)
+        read = plain(annotation := parameter.type_descriptor.annotation, given)
+        if value == "" and annotation in (Path, list[Path]):
+            continue  # which is refused
         if read is not UNREAD:
             quick += 1
             assert parameter.process_value(typer.Context(command), given) == read
@@ -54,6 +56,26 @@ def test_a_path_that_cannot_be_read_is_left_to_typer(
     assert plain(Path, str(tmp_path)) is UNREAD
     assert plain(list[Path], [str(tmp_path)]) is UNREAD
     assert plain(Path, str(tmp_path / "absent")) == tmp_path / "absent"
+
+
+@pytest.mark.parametrize(
+    ("typed", "name"),
+    [
+        (("eval", "--model", "proxy", "--limit", "1", "--out", ""), "--out"),
+        (("run", "check", "."), "RUN..."),
+        (("run", "check", "a"), "RUN..."),
+        (("eval",), "RUN.TOML"),
+    ],
+)
+def test_an_empty_path_is_not_the_working_folder(
+    typed: tuple[str, ...], name: str, harness: Callable[..., Said]
+) -> None:
+    """As an unset variable gives it."""
+    words = typed if "" in typed else (*typed, "")
+    code, out, error = harness(*words)
+    assert (code, out) == (2, "")
+    assert error == f"harness: {name} '': a path is not empty; give one, or . for here\n"
+    assert not list(Path().iterdir())
 
 
 @pytest.mark.parametrize("args", [["run", "ls"], ["eval", "--help"], ["prompt", "list", "--help"]])

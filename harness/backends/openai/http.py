@@ -165,7 +165,8 @@ class Client:
         if 300 <= status < 400:
             return fault(f"HTTP {status}: a redirect, which is not followed")
         message = error_words(payload) if readable else bytes(data).decode("utf-8", "replace")
-        return fault(f"HTTP {status}: {self._printable_text(message)}", again=may_pass(status))
+        words = self._printable_text(message) or "an empty reply"
+        return fault(f"HTTP {status}: {words}", again=may_pass(status))
 
     def _payload(self, data: bytes) -> tuple[Any, bool]:
         """Parse JSON and remove the key from it, however it is escaped.
