@@ -168,7 +168,8 @@ def name_answerers(run: Path) -> None:
     with suppress(UserError):
         names = msgspec.structs.asdict(folder.read(run).manifest.variant)
         for name in ("episodes.csv", "summary.csv"):
-            head, *rows = csv.reader((run / name).read_text().splitlines(keepends=True))
+            with (run / name).open(newline="") as file:
+                head, *rows = csv.reader(file)
             for row in rows:
                 row[: len(names)] = names.values()
             with (run / name).open("w", newline="") as file:

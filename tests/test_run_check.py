@@ -101,7 +101,7 @@ def won(row: Row) -> None:
 
 # One of each kind; what is like them `make exhaustive` tries.
 SOME = (
-    "a figure", "success of episodes", "latency of decisions", "older rules", "a radio's name",
+    "a figure", "success of episodes", "who gave answers", "latency of decisions", "older rules", "a radio's name",
     "rules in another spelling", "a figure that is left out", "which layouts", "a dataset's name",
     "a latency's source", "settings beside it", "an answer that is missing", "errors of an engine",
     "a radio's limits", "a limit of its model", "a limit that nobody typed", "what a model sees",
@@ -141,6 +141,10 @@ IN_TABLES = {
     ),
     "delays of answers": (
         lambda run: damage(run, answer=hurried), "answers.jsonl has a delay of -0.1 s in 0000",
+    ),
+    "who gave answers": (
+        lambda run: damage(run, answer=lambda row: row.update(agent=1)),
+            "answers.jsonl has agent 1 of 0000",
     ),
     "latency of decisions": (
         lambda run: damage(run, decision=faster), "episodes.csv has another latency_ms in ",

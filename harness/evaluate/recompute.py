@@ -365,6 +365,9 @@ def _of_answers(run: Run, ours: Run) -> Iterator[str]:
             yield (
                 f"answers.jsonl has another {name} in {amount(wrong, 'answer')} than its texts say"
             )
+    stated_agents = [(a, b) for a, b in answer_pairs if b and a.agent is not UNSET]
+    if wrong := sum(a.agent != b.agent for a, b in stated_agents):
+        yield f"answers.jsonl has another agent in {amount(wrong, 'answer')} than were asked"
     of_rules = [(a, b) for a, b in answer_pairs if b and run.agent(a)["model"]["engine"] in RULES]
     if wrong := sum(not close(a.slow_s, b.slow_s) for a, b in of_rules):
         yield f"answers.jsonl has another delay in {amount(wrong, 'answer')} than the rule here"

@@ -106,6 +106,9 @@ def contradictions(run: Run) -> Iterator[str]:
     delays = filter(None, map(run.undeclared_delay, answers))
     if (delay := next(delays, None)) is not None:
         yield f"answers.jsonl has {delay}"
+    misattributed = filter(None, map(run.impossible_agent, answers))
+    if (phrase := next(misattributed, None)) is not None:
+        yield f"answers.jsonl has {phrase}, which states none or another"
     yield from _of_scores(run, _scores(run))
     yield from digests.otherwise(run)
     agents = (run.manifest.agent(0), *run.manifest.helpers)

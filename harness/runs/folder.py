@@ -45,8 +45,10 @@ from harness.runs.records import (
     FrozenScenes,
     Manifest,
     Score,
+    is_helper,
 )
 from harness.world.parameters import MOST_DECISIONS
+from harness.world.seats import agent_share
 
 T = TypeVar("T")
 Record = TypeVar("Record", bound=Struct)
@@ -210,6 +212,28 @@ class Run:
             return None
         name = printable(answer.id)
         return f"a delay of {answer.slow_s:g} s in {name}, which its model's card does not declare"
+
+    def impossible_agent(self, answer: Answer) -> str | None:
+        """Return a phrase on the agent that an answer states, if no such answer can; else None.
+
+        An answer states which agent gave it only where that does not follow from whose it is: where
+        helpers have several models, or other vehicles decide as well.
+        """
+        if answer.agent is msgspec.UNSET:
+            return None
+        agents = range(1 + len(self.manifest.helpers))
+        if len(agents) > 1 and self._several_decide:
+            is_possible = answer.agent in agents
+        else:
+            is_possible = len(agents) > 2 and is_helper(answer.role) and answer.agent in agents[1:]
+        return None if is_possible else f"agent {answer.agent} of {printable(answer.id)}"
+
+    @cached_property
+    def _several_decide(self) -> bool:
+        with suppress(UserError):  # a scenario that is not here
+            frozen = isinstance(self.manifest.world, FrozenScenes)
+            return not frozen and agent_share(self.manifest.scenario) > 0
+        return True
 
     def seconds(self, answer: Answer) -> float:
         """Return the seconds that an answer takes by the run's latency, a repair turn included.

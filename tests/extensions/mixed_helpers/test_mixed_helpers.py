@@ -1,6 +1,7 @@
 """Mixed swarms: the ego and its helpers have different models, prompts or answer modes."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 from evaluating import live_spec_of, run, same_decisions, spec_of
 from former import SCENARIO
-from run_on_disk import answers_of
+from run_on_disk import answers_of, damage
 
 from harness.backends import cards
 from harness.backends.base import Backend
@@ -100,6 +101,26 @@ def test_several_helper_models_take_the_helpers_in_turn(small: Dataset, tmp_path
         assert names == ["proxy", "proxy", "proxy-faulty", "proxy"][: len(names)]
     faulty = {a.viewer for a in made.answers if a.verdict != "strict"}
     assert faulty == {"v3"}
+
+
+@pytest.mark.slow
+def test_who_answered_is_held_to_who_was_asked(
+    small: Dataset, tmp_path: Path, harness: Callable[..., tuple[int, str, str]]
+) -> None:
+    """The answers of one helper model are not stated to be another's, nor the ego's a helper's."""
+    spec = mixed(small, helper(), helper("proxy-faulty"), ask="used")
+    out = run(spec, tmp_path / "run").out
+    assert {1, 2} <= {answer.agent for answer in answers_of(out)}
+    assert harness("run", "check", out)[0] == 0
+
+    def swapped(row: dict[str, Any]) -> None:
+        row["agent"] = {1: 2, 2: 1}.get(row["agent"], row["agent"])
+
+    damage(out, answer=swapped)
+    assert "another agent in" in harness("run", "check", out)[1]
+    damage(out, answer=lambda row: row.update(agent=2))
+    said = " ".join(harness("run", "check", out)[1].split())
+    assert re.search(r"agent 2 of \S+/v1, which states none or another", said)
 
 
 @pytest.mark.slow
