@@ -123,7 +123,7 @@ def test_a_plain_question_is_asked_greedily_and_answered(monkeypatch: pytest.Mon
     assert done.seconds is not None
     assert done.seconds > 0
     assert backend.identity() == {
-        "engine": "openai", "answers": 2, "server": "generic", "base_url": there.url + "/", "model": "m",
+        "engine": "openai", "answers": 3, "server": "generic", "base_url": there.url + "/", "model": "m",
         "listed": {"id": "m", "owned_by": "tests"},
     }  # fmt: skip
 

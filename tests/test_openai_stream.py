@@ -163,6 +163,11 @@ def test_a_server_that_refuses_to_stream_is_asked_for_the_whole_from_then_on() -
         ([{"choices": [{"delta": {"content": 3}}]}],
          "a piece of the stream is no part of a chat completion", 1),
         ([{"choices": "a"}], "a piece of the stream is no part of a chat completion", 1),
+        ([b"data: [DONE]\n\n"], CUT_OFF, 2),
+        ([{}, b"data: [DONE]\n\n"], CUT_OFF, 2),
+        (pieces("hel", finish_reason=None), CUT_OFF, 2),
+        ([{"choices": [{"text": "{}", "finish_reason": "stop"}]}],
+         "a piece of the stream is no part of a chat completion", 1),
         ([*pieces("hel", finish_reason=None)[:2], {"error": {"message": 
             "out of\nmemory", "code": 500}}],
          "the stream broke off: out of memory", 2),
@@ -178,6 +183,14 @@ def test_a_stream_that_goes_wrong_is_an_error(sent: list[Any], said: str, attemp
     assert (done.error, done.finish_reason, done.text) == (said, "error", "")
     assert (len(asked), done.retries) == (attempts, attempts - 1)
     assert (done.first_token_s, done.token_s) == (None, None)
+
+
+@pytest.mark.parametrize("before", [[], pieces("hel", finish_reason=None)[:2]])
+def test_a_whole_in_one_piece_is_the_answer(before: list[Any]) -> None:
+    """As a proxy sends it that does not stream."""
+    whole = completion("hello")
+    [done], _ = ask(lambda asked: asked.stream(*before, whole, b"data: [DONE]\n\n"))
+    assert (done.text, done.error, done.completion_tokens) == ("hello", None, 20)
 
 
 def test_a_stream_that_is_cut_off_is_asked_for_again() -> None:

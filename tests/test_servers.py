@@ -467,7 +467,7 @@ def test_which_servers_answer_is_no_part_of_the_models_identity() -> None:
     ):
         identities = [opened(*there, kind="vllm").identity() for there in ((one,), (other, one))]
     expected = {
-        "engine": "openai", "answers": 2, "server": "vllm", "model": "m", "listed": {"id": "m"},
+        "engine": "openai", "answers": 3, "server": "vllm", "model": "m", "listed": {"id": "m"},
         "version": "1",
     }  # fmt: skip
     assert identities == [expected, expected]

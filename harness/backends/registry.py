@@ -139,8 +139,9 @@ BUILT_IN: Mapping[str, Registration] = {
     "openai": Registration(
         "harness.backends.openai.backend:open",
         Capabilities(thinks="card", samples=True, adapts=True),
-        # 2: an answer that was broken off is none, a refusal and parts of a content are read
-        answers=2,
+        # 2: an answer that was broken off is none, a refusal and parts of a content are read;
+        # 3: so is a whole in a stream, whose end alone is none, and counts are bounded by thoughts
+        answers=3,
         card_keys=("vision", "system", "price"),
         required_keys=("weights", "server"),
     ),

@@ -156,7 +156,9 @@ def test_replies_of_a_server_are_read_as_its_version_did() -> None:
         f"broken off: {end}": fault_in(completion(half, end)) for end in ("error", "abort", "stop")
     }
     faults = {name: fault.words if fault else "none" for name, fault in broken.items()}
-    held("openai replies", BUILT_IN["openai"].answers, result | faults)
+    said = shapes.read(completion("{}", reasoning_content="Hm. " * 200), request)
+    counts = {"count of a thought": str(said.completion_tokens)}
+    held("openai replies", BUILT_IN["openai"].answers, result | faults | counts)
 
 
 def test_every_engine_but_those_of_stored_answers_is_pinned() -> None:

@@ -60,8 +60,7 @@ class Stream:
 
     def _event(self, text: str, at_s: float) -> None:
         if text == "[DONE]":
-            self.fault = None
-            return
+            return  # whoever cut an answer off on its way may end the stream so, too
         if self._kind == b"error":
             error: Any = text
             with suppress(ValueError, RecursionError):
@@ -85,8 +84,14 @@ class Stream:
         self._usage |= {k: v for k, v in (piece.get("usage") or {}).items() if type(v) is int}
         # the last piece may have token counts and no choice
         for choice in (piece.get("choices") or [])[:1]:
-            delta = in_texts(choice.get("delta") or {})
-            texts = {name: delta[name] for name in _TEXTS if delta.get(name) is not None}
+            whole = choice.get("message")
+            if whole is not None:  # in place of its parts
+                self._texts = {}
+            part = choice.get("delta") if whole is None else whole
+            if part is None and "text" in choice:
+                raise LookupError("a piece of a completion of another kind")
+            message = in_texts(part or {})
+            texts = {name: message[name] for name in _TEXTS if message.get(name) is not None}
             for name, text in texts.items():
                 self._texts[name] = self._texts.get(name, "") + text
             if any(texts.values()):
