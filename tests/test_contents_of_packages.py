@@ -228,7 +228,7 @@ def test_a_content_says_who_is_able_and_nothing_else(act: Callable[..., Any], to
         (np.full((1, 2), 8.0), "sizes of shape (1, 2)"),
         (np.full((1, 3), -8.0), "sizes that are not from 0 to 1e+12 bits"),
         (np.full((1, 3), np.nan), "sizes that are not from 0"),
-        (np.full((1, 3), 1e300), "sizes that are not from 0"),
+        (np.full((1, 3), 1e300), "sizes with 1e+300; allowed: up to 1e+12"),
         (8.0, "sizes of type float"),
     ],
 )

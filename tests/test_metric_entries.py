@@ -57,6 +57,8 @@ RAISES = bad("raises", lambda d: d["no such column"])
 EXITS = bad("exits", lambda d: exit(0))
 SHORT = bad("short", lambda d: d["entropy_nats"][1:])
 BELOW = bad("below", lambda d: d["entropy_nats"] - 1.0)
+VAST = bad("vast", lambda d: d["entropy_nats"] * 0 + 1e300)
+COMPLEX = bad("complex", lambda d: d["entropy_nats"] + 1j)
 WRITES = bad("writes", writes)
 WORDS = Metric("words", "", Unit(), "lower", episodes=lambda episode: "many")
 """
@@ -200,7 +202,9 @@ def test_a_metric_that_does_not_work_is_one_line(
         ("raises", "no such column"),
         ("exits", "ends the program (SystemExit: 0 at "),
         ("short", "it has values of shape (31,), not (32,)"),
-        ("below", "it has values beyond 0 to inf"),
+        ("below", "it has values beyond 0 to 1e+12"),
+        ("vast", "it has values beyond 0 to 1e+12"),
+        ("complex", "it has values of type complex128, not numbers"),
         ("writes", "read-only"),
         ("words", "could not convert string to float: 'many'"),
     ],

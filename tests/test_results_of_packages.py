@@ -127,6 +127,7 @@ def test_ints_and_float32_are_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
             "a delay that is negative, infinite or NaN",
         ),
         (DELIVERED._replace(delay_s=np.full((2, 1), 1.0, object)), "delays of type object"),
+        (DELIVERED._replace(delay_s=np.full((2, 1), 1e300)), "delays with 1e.300; allowed: up to"),
         (DELIVERED._replace(delay_s=0.5 * ONE), "a reply that ends 0.5 s after the request"),
         (DELIVERED._replace(loss=masked(np.full((2, 1), 9.0))), "losses of type MaskedArray"),
         (DELIVERED._replace(loss=np.full((2, 1), np.nan)), "a loss that is no probability"),
@@ -148,6 +149,10 @@ def test_a_channel_cannot_write_to_the_draws_of_others_when_it_is_asked_for_a_re
     for time_s in (-1.0, np.inf):
         with pytest.raises(ValueError, match="a request whose time is negative or infinite"):
             broadcast(Radio(asked=Broadcast(0.0, time_s)), 1.0, DRAWS)
+    vast: tuple[tuple[Any, str], ...] = ((1e300, "with 1e.300"), (1j, "of type complex128"))
+    for wrong, says in vast:
+        with pytest.raises(ValueError, match=f"times of a request {says}"):
+            broadcast(Radio(asked=Broadcast(0.0, wrong)), 1.0, DRAWS)
     assert np.isnan(broadcast(Radio(asked=Broadcast(np.nan, 0)), 1.0, DRAWS).heard_s)
 
 

@@ -17,6 +17,8 @@ Texts = NDArray[np.str_]
 Pixels = NDArray[np.uint8]  # of a picture, (height, width, 3) red, green and blue
 
 T = TypeVar("T")
+# of a number from another package, in its unit: no sum of some is beyond what tables may hold
+MOST = 1e12
 ROUNDING = 1e-6  # by which the probabilities of a distribution may miss a sum of 1
 
 
@@ -116,12 +118,16 @@ def numbers(name: str, values: Any, *allowed: tuple[int, ...]) -> Floats:
     """Return a copy, as floats, of an array that another package gave.
 
     Raises ValueError, which begins with `name`, unless `values` is an unmasked array of real
-    numbers of one of the `allowed` shapes.
+    numbers of one of the `allowed` shapes, each infinite or within `MOST`.
     """
     check_shape(name, values, *allowed)
     if values.dtype.kind not in "biuf":
         raise ValueError(f"{name} of type {values.dtype}, not numbers")
-    return np.array(values, dtype=np.float64)
+    copy = np.array(values, dtype=np.float64)
+    vast = copy[np.isfinite(copy) & (np.abs(copy) > MOST)]
+    if len(vast):
+        raise ValueError(f"{name} with {vast[0]:g}; allowed: up to {MOST:g}")
+    return copy
 
 
 def check_distributions(name: str, values: Floats, where: Bools) -> None:

@@ -110,7 +110,8 @@ def broadcast(channel: Channel, bits: Floats | float, draws: Draws) -> Broadcast
     if is_ours(channel):
         return channel.request(bits, draws)
     times = channel.request(bits, read_only(draws))
-    heard_s, airtime_s = (np.array(each, dtype=float) for each in (times.heard_s, times.airtime_s))
+    given = map(np.asarray, (times.heard_s, times.airtime_s))
+    heard_s, airtime_s = (numbers("times of a request", each, each.shape) for each in given)
     for each in (heard_s, airtime_s):
         if np.any((each < 0.0) | np.isinf(each)):
             raise ValueError("a request whose time is negative or infinite")

@@ -1,10 +1,11 @@
 """The values of metrics by episode, from decisions and from how episodes ended."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from harness.core.arrays import Bools, Floats, Ints
+from harness.core.arrays import MOST, Bools, Floats, Ints
 from harness.core.errors import one_line, printable
 from harness.core.plugins import say_once
 from harness.core.strangers import aside
@@ -62,7 +63,7 @@ def of_decisions(metric: Metric, decisions: Columns, places: Ints, n: int) -> Fl
     pieces = decisions.pieces() if isinstance(decisions, Decisions) else [decisions]
 
     def of_pieces() -> Floats:
-        of_each = [np.asarray(function(piece), dtype=float) for piece in pieces]
+        of_each = [_floats(function(piece)) for piece in pieces]
         return of_each[0] if len(of_each) == 1 else np.concatenate(of_each)
 
     values = _values(metric, of_pieces, len(places))
@@ -84,14 +85,23 @@ def _values(metric: Metric, values: Callable[[], Floats], n: int) -> Floats:
             numbers = values()
         if numbers.shape != (n,):
             raise ValueError(f"it has values of shape {numbers.shape}, not ({n},)")
-        if not ((numbers >= 0) & (numbers <= metric.most) | np.isnan(numbers)).all():
-            raise ValueError(f"it has values beyond 0 to {metric.most:g}")
+        most = min(metric.most, MOST)
+        if not ((numbers >= 0) & (numbers <= most) | np.isnan(numbers)).all():
+            raise ValueError(f"it has values beyond 0 to {most:g}")
     except Exception as error:  # a stranger's code
         reason = one_line(error).removeprefix(f"{what} ") or type(error).__name__
         # though figures are computed part by part
         say_once(f"{what}: {reason}; its figure is unknown")
         return np.full(n, np.nan)
     return numbers
+
+
+def _floats(values: Any) -> Floats:
+    """Return a metric's values as floats, (n,). Raises ValueError for complex numbers."""
+    array = np.asarray(values)
+    if array.dtype.kind == "c":
+        raise ValueError(f"it has values of type {array.dtype}, not numbers")
+    return array.astype(float)
 
 
 def by_danger(success: Floats, dangerous: Bools) -> dict[str, Floats]:
