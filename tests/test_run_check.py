@@ -142,6 +142,10 @@ IN_TABLES = {
     "delays of answers": (
         lambda run: damage(run, answer=hurried), "answers.jsonl has a delay of -0.1 s in 0000",
     ),
+    "times of tokens of an answer that was not timed": (
+        lambda run: damage(run, answer=lambda row: row.update(first_token_s=0.1)),
+            "answers.jsonl has times of tokens of 0000",
+    ),
     "who gave answers": (
         lambda run: damage(run, answer=lambda row: row.update(agent=1)),
             "answers.jsonl has agent 1 of 0000",
@@ -844,7 +848,9 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
 ) -> None:
     """A figure of a package, and younger figures that a run by older rules does not have."""
     run, stated = longer, json.loads((longer / "run.json").read_text())
-    configure(run, versions={**stated["versions"], "figures": "1", "decisions": "1"})
+    configure(
+        run, versions={**stated["versions"], "figures": "1", "decisions": "1", "harness": "0.3"}
+    )
     without("optimal_")(run)
     added("comfort", "episodes")(run)
     edited("answer_times", to={"ego": {"n": 9, "median_s": 1e-4, "p5_s": 1e-4, "p95_s": 1e-4}})(run)
@@ -853,6 +859,7 @@ def test_what_nobody_can_check_is_named_and_not_called_equal(
         "Not held, since its figures are by the rules of version 1: run.json has another "
         "answer_times than its answers took.",
         "comfort: as summary.csv states, and not checked, since",
+        "Not held: the sentence on each answer, that of harness 0.3.",
         "Its answers are decided by the rules of version 1, as run.json states, and here by those of "
         f"version {DECISIONS}.",
         "Its figures are made by the rules of version 1, as run.json states. It lacks "

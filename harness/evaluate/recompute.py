@@ -371,7 +371,7 @@ def _of_answers(run: Run, ours: Run) -> Iterator[str]:
     of_rules = [(a, b) for a, b in answer_pairs if b and run.agent(a)["model"]["engine"] in RULES]
     if wrong := sum(not close(a.slow_s, b.slow_s) for a, b in of_rules):
         yield f"answers.jsonl has another delay in {amount(wrong, 'answer')} than the rule here"
-    for name in ("prompt_tokens", "completion_tokens", "seconds"):
+    for name in ("prompt_tokens", "completion_tokens", "seconds", "first_token_s", "token_s"):
         if wrong := sum(getattr(a, name) != getattr(b, name) for a, b in of_rules):
             answers = amount(wrong, "answer")
             yield f"answers.jsonl has another {name} in {answers} than the rule here"

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import asdict
 
+from harness import __version__
 from harness.coordination.named_points import misnamed
 from harness.core.errors import UserError, printable
 from harness.core.figures import amount
@@ -248,6 +249,9 @@ def unchecked(run: Run) -> Iterator[str]:
             f"Its answers are decided by the rules of version {printable(decided_by)}, as run.json "
             f"states, and here by those of version {DECISIONS}."
         )
+    worded_by = run.manifest.versions.get("harness", "an earlier version")
+    if worded_by != __version__:
+        yield f"Not held: the sentence on each answer, that of harness {printable(worded_by)}."
     version = printable(run.manifest.versions.get("figures", "1"))
     for sentence in () if current(run) else by_later_rules(run, list(run.answers)):
         yield f"Not held, since its figures are by the rules of version {version}: {sentence}."

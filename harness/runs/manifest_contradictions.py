@@ -24,6 +24,10 @@ def of_manifest(run: Run, answers: Sequence[Answer]) -> Iterator[str]:
         in_manifest = getattr(run.manifest, name)
         if in_manifest != count:
             yield f"run.json has {name} {in_manifest}, and answers.jsonl has {count}"
+    untimed = (each for each in answers if each.seconds is None)
+    timed = (each for each in untimed if (each.first_token_s, each.token_s) != (None, None))
+    if (answer := next(timed, None)) is not None:
+        yield f"answers.jsonl has times of tokens of {printable(answer.id)}, and none of the whole"
     yield from _of_cost(run)
     for what, recorded, named in _records(run):
         for name in sorted(recorded.keys() - named):

@@ -726,6 +726,12 @@ def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str
                 f"{where}: {key} stands in a table; write {inner[0]} below a line [{table}] instead"
             )
         keys_by_table[""].add(table)
+        is_there = _is_in(tables.get(table) if inner else tables, each.path[-1])
+        if is_there and table != EXTENSIONS and _is_in(tables.get(EXTENSIONS), each.name):
+            raise UserError(
+                f"{where}: {'.'.join(each.path)} stands by name in [{EXTENSIONS}], too; leave one "
+                "of both out"
+            )
         if inner and table != EXTENSIONS:  # whose keys `check_extensions` looks at
             keys_by_table.setdefault(table, set()).add(inner[0])
     section = tables.get("world", {})
@@ -735,6 +741,10 @@ def _placed(tables: dict[str, Any], world: type[Struct], where: str) -> dict[str
         for table, keys in keys_by_table.items():
             _refuse_unknown(tables, table, keys, where)
     return {**tables, "world": {"kind": kind, **section}}
+
+
+def _is_in(table: Any, key: str) -> bool:
+    return isinstance(table, dict) and key in table
 
 
 def _refuse_unknown(tables: dict[str, Any], table: str, keys: set[str], where: str) -> None:

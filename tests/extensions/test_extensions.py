@@ -333,6 +333,10 @@ def test_a_key_that_is_mistyped_is_told_those_of_extensions(
     assert key in error.partition("known: ")[2].strip().split(", ")
     by_name = f"[extensions]\n{name}s = 1"
     (tmp_path / "typed.toml").write_text(by_name)
+    both = f"{text.replace(wrong, key)}\n[extensions]\n{name} = 1"
+    (tmp_path / "both.toml").write_text(both)
+    said = "stands by name in [extensions], too; leave one of both out"
+    assert said in harness("eval", tmp_path / "both.toml", "--dry-run")[2]
     assert f"did you mean {name!r}?" in harness("eval", tmp_path / "typed.toml", "--dry-run")[2]
 
 
