@@ -392,10 +392,8 @@ def _other_than_run(path: Path) -> str:
         return "no finished run, and the command that began it continues it"
     if path.is_file():
         return "a file; a run is a folder, made by `harness eval` or `harness drive`"
-    return (
-        "no finished run: it has no run.json; "
-        "give a folder made by `harness eval` or `harness drive`"
-    )
+    lack = "it has no run.json" if path.exists() else "there is no such folder"
+    return f"no finished run: {lack}; give a folder made by `harness eval` or `harness drive`"
 
 
 def _refuse_unlike(episodes: Sequence[Episode]) -> None:

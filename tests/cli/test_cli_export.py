@@ -187,7 +187,7 @@ def test_a_folder_that_is_no_run_or_broken_is_one_line(
 ) -> None:
     code, out, err = harness("run", "export", "nowhere", "--csv")
     assert (code, out) == (2, "")
-    assert "nowhere is no finished run: it has no run.json" in err
+    assert "nowhere is no finished run: there is no such folder" in err
     (run / "decisions.parquet").write_text("PAR1")
     code, out, err = harness("run", "export", run, "--csv")
     assert (code, out, err.count("\n")) == (2, "", 1)

@@ -449,7 +449,7 @@ def test_what_cannot_be_compared_is_refused(
         (two_run, "not of the same scenes (small "),
         (luck, "have different seeds ([0, 1] and [0, 2])"),
         (v2x, "have no condition in common (single-local, 6g and v2x)"),
-        (tmp_path / "nowhere", "is no finished run: it has no run.json"),
+        (tmp_path / "nowhere", "is no finished run: there is no such folder"),
         (tmp_path, "is a folder of 4 runs; give one, such as "),
     ):
         code, out, err = harness("compare", runs[0], run)
